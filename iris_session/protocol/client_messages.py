@@ -1,0 +1,250 @@
+"""Messages from a client to the session, version 1. One `msgspec` struct each; the tag field is `type`.
+
+On the control channel every one of them travels inside a `ClientEnvelope`. Units are SI, poses of samples and
+observations are in the sender's own tracking frame (the authority applies the alignment). Times are session time
+in integer nanoseconds unless a field says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from iris_session.protocol.common import Count, Name, Nanoseconds, Pose, Target, Text
+from iris_session.protocol.names import PROTOCOL_VERSION
+
+Joints = Annotated[tuple[float, ...], msgspec.Meta(max_length=64)]
+Targets = Annotated[tuple[Target, ...], msgspec.Meta(max_length=8)]
+Names = Annotated[tuple[Name, ...], msgspec.Meta(max_length=32)]
+
+
+class Message(msgspec.Struct, frozen=True, tag_field="type"):
+    """Base of all tagged messages."""
+
+
+class Hello(Message, frozen=True, tag="hello"):
+    """First message of a connection.
+
+    `secret`: client-made 128-bit secret that stands for the key on plain loopback. `resume_token`: from the last
+    `Welcome`, single use. `alignment`: `measured`, or `not_needed` for policies, leaders, desktop and remote VR.
+    """
+
+    role: Name
+    name: Name
+    software: Name = ""
+    devices: Names = ()
+    capabilities: Names = ()
+    alignment: Name = "measured"
+    secret: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
+    resume_token: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
+    join_code: Name = ""
+
+
+class Bye(Message, frozen=True, tag="bye"):
+    """Leaves at once: leases are released without grace."""
+
+    reason: Text = ""
+
+
+class Heartbeat(Message, frozen=True, tag="heartbeat"):
+    """Sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset lies on the table."""
+
+    worn: bool = True
+
+
+class ClockPing(Message, frozen=True, tag="clock_ping"):
+    """`t0_ns`: the client's own monotonic clock when it sent this. Answered by `ClockPong` from the front."""
+
+    t0_ns: Nanoseconds
+
+
+class GetSnapshot(Message, frozen=True, tag="get_snapshot"):
+    request_id: Count = 0
+
+
+class Sample(Message, frozen=True, tag="sample"):
+    """One input message of one device.
+
+    `capture_ns`: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
+    `pose`: `T_tracking_device`. `twist`: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
+    `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
+    `buttons`: bit mask. `hand_joints`: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). `q`, `qd`: a leader's
+    joint positions [rad or m] and velocities.
+    """
+
+    device: Name
+    kind: Name
+    seq: Count
+    capture_ns: Nanoseconds
+    scene_epoch: Count
+    tracking_epoch: Count
+    alignment_version: Count
+    targets: Targets = ()
+    tracked: bool = True
+    worn: bool = True
+    clutch: bool = False
+    gripper: float | None = None
+    buttons: Count = 0
+    pose: Pose | None = None
+    twist: tuple[float, float, float, float, float, float] | None = None
+    hand_joints: Annotated[tuple[float, ...], msgspec.Meta(max_length=182)] = ()
+    q: Joints = ()
+    qd: Joints = ()
+
+
+class Acquire(Message, frozen=True, tag="acquire"):
+    """Asks for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held."""
+
+    request_id: Count
+    robots: Names = ()
+    objects: Names = ()
+    wait: bool = False
+    weight: float = 1.0
+
+
+class Release(Message, frozen=True, tag="release"):
+    """Gives leases back. No targets: all of them, and leaves every queue."""
+
+    request_id: Count = 0
+    targets: Targets = ()
+
+
+class Consent(Message, frozen=True, tag="consent"):
+    """Answer of a holder or director to a `ConsentRequested` event (mode `request`)."""
+
+    request_id: Count
+    consent_id: Count
+    grant: bool
+
+
+class Assign(Message, frozen=True, tag="assign"):
+    """A director gives robots to a participant (empty: frees them), whoever holds them."""
+
+    request_id: Count
+    robots: Names
+    participant: Name = ""
+
+
+class SetMode(Message, frozen=True, tag="set_mode"):
+    """A director changes the lease mode of a robot, and the blending weights in mode `shared`."""
+
+    request_id: Count
+    robot: Name
+    mode: Name
+
+
+class Grasp(Message, frozen=True, tag="grasp"):
+    """A hand without a robot takes a free object. The lease on the object comes back in the `Reply`."""
+
+    request_id: Count
+    object: Name
+    device: Name
+
+
+class Observation(Message, frozen=True, tag="observation"):
+    """A headset (or camera) saw an anchor: `T_tracking_anchor`.
+
+    `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
+    share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+    """
+
+    anchor_id: Name
+    kind: Name
+    T_tracking_anchor: Pose
+    capture_ns: Nanoseconds
+    tracking_epoch: Count
+    viewpoint_id: Count = 0
+    size_m: float = 0.0
+    quality: float = 1.0
+    device: Name = "head"
+    covariance: Annotated[tuple[float, ...], msgspec.Meta(max_length=36)] = ()
+
+
+class PlaceAlignment(Message, frozen=True, tag="place_alignment"):
+    """A director aligns a participant by hand, or adds an offset to a measured alignment (`offset` true)."""
+
+    request_id: Count
+    participant: Name
+    T_world_tracking: Pose
+    offset: bool = False
+
+
+class TrackingEpoch(Message, frozen=True, tag="tracking_epoch"):
+    """The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void."""
+
+    tracking_epoch: Count
+
+
+class Episode(Message, frozen=True, tag="episode"):
+    """`EpisodeAction`: start, success, failure, discard, rerecord, reset."""
+
+    request_id: Count
+    action: Name
+    label: Text = ""
+
+
+class EStop(Message, frozen=True, tag="estop"):
+    """Anyone may stop everything. Latched. Not a safety-rated stop."""
+
+    reason: Text = ""
+
+
+class ClearEStop(Message, frozen=True, tag="clear_estop"):
+    request_id: Count
+
+
+class Control(Message, frozen=True, tag="control"):
+    """A director's `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset."""
+
+    request_id: Count
+    action: Name
+    ticks: Count = 1
+
+
+class Marker(Message, frozen=True, tag="marker"):
+    """A note in the recording, at the session time of its receipt."""
+
+    request_id: Count
+    text: Text
+
+
+ClientMessage = (
+    Hello
+    | Bye
+    | Heartbeat
+    | ClockPing
+    | GetSnapshot
+    | Sample
+    | Acquire
+    | Release
+    | Consent
+    | Assign
+    | SetMode
+    | Grasp
+    | Observation
+    | PlaceAlignment
+    | TrackingEpoch
+    | Episode
+    | EStop
+    | ClearEStop
+    | Control
+    | Marker
+)
+
+
+class ClientEnvelope(msgspec.Struct, frozen=True, array_like=True):
+    """One control-channel message from a client: `[version, connection_epoch, on_behalf_of, message]`.
+
+    `connection_epoch`: from `Welcome`; 0 in `hello`. `on_behalf_of`: only role `gateway` may set it.
+    """
+
+    version: int
+    connection_epoch: Count
+    on_behalf_of: Name
+    message: ClientMessage
+
+
+def envelope(message: ClientMessage, connection_epoch: int = 0, on_behalf_of: str = "") -> ClientEnvelope:
+    """Wraps `message` for the control channel of this protocol version."""
+    return ClientEnvelope(PROTOCOL_VERSION, connection_epoch, on_behalf_of, message)

@@ -1,0 +1,95 @@
+"""Value types shared by messages, entries and views: poses, targets, leases, denials."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+#: A name typed by a person: robot, object, participant, anchor.
+Name = Annotated[str, msgspec.Meta(max_length=64)]
+#: Free text shown to a person.
+Text = Annotated[str, msgspec.Meta(max_length=512)]
+#: Any counter, epoch, version or nanosecond count. Fits an int64 in every client language.
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Nanoseconds = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+#: Metres (or metres per second), x y z.
+Vec3 = tuple[float, float, float]
+#: Unit quaternion `[w, x, y, z]`.
+Quat = tuple[float, float, float, float]
+
+
+class Pose(msgspec.Struct, frozen=True, array_like=True):
+    """A rigid transform `T_a_b`: position `p` [m] of frame b in a, rotation `q` `[w, x, y, z]` from b to a."""
+
+    p: Vec3
+    q: Quat
+
+
+IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+class Target(msgspec.Struct, frozen=True, array_like=True):
+    """What a sample drives, under which lease. `lease_version` is the fencing token."""
+
+    name: Name
+    lease_version: Count
+    kind: Name = "robot"
+
+
+class Lease(msgspec.Struct, frozen=True):
+    """State of one lease as everyone sees it. `holder` is a participant id, empty when free.
+
+    `expires_ns` is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
+    `sub_holders` and `weights` are used in mode `shared` only and have the same length.
+    """
+
+    target: Name
+    kind: Name
+    mode: Name
+    holder: Name
+    lease_version: Count
+    expires_ns: Nanoseconds = 0
+    queue: tuple[Name, ...] = ()
+    sub_holders: tuple[Name, ...] = ()
+    weights: tuple[float, ...] = ()
+
+
+class Denial(msgspec.Struct, frozen=True):
+    """A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do."""
+
+    reason: Name
+    message: Text
+    advice: Text = ""
+    target: Name = ""
+    holder: Name = ""
+    holder_name: Name = ""
+
+
+class Alignment(msgspec.Struct, frozen=True):
+    """`T_world_tracking` of one participant, as accepted by the authority.
+
+    `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown.
+    `error_at_anchor_m`, `error_at_robot_m`: stated p95 of the position error at the anchor and at the robot.
+    """
+
+    version: Count
+    kind: Name
+    T_world_tracking: Pose
+    tracking_epoch: Count = 0
+    covariance: tuple[float, ...] = ()
+    error_at_anchor_m: float = 0.0
+    error_at_robot_m: float = 0.0
+    offset: bool = False
+
+
+class Applied(msgspec.Struct, frozen=True, array_like=True):
+    """The newest sample that entered the IK target behind the `ctrl` in use, for one robot. All times session time."""
+
+    robot: Name
+    participant: Name
+    device: Name
+    seq: Count
+    capture_ns: Nanoseconds
+    receive_ns: Nanoseconds
+    step_ns: Nanoseconds

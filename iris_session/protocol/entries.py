@@ -1,0 +1,171 @@
+"""What reaches the authority: one `Entry` per input of a step, exactly as it is journaled.
+
+Entries are made by the front (after schema and limit checks), or by the process that owns the session (`HOST`).
+They hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see DESIGN section 5.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Assign,
+    Bye,
+    ClearEStop,
+    Consent,
+    Control,
+    Episode,
+    EStop,
+    GetSnapshot,
+    Grasp,
+    Heartbeat,
+    Marker,
+    Message,
+    Observation,
+    PlaceAlignment,
+    Release,
+    Sample,
+    SetMode,
+    TrackingEpoch,
+)
+from iris_session.protocol.common import Count, Name, Nanoseconds, Pose, Text
+
+#: Connection number of the process that owns the session (its Python API). It acts with the rights of a director.
+HOST: Final = 0
+
+
+class Join(Message, frozen=True, tag="join"):
+    """A connection whose `hello` the front accepted. `key_id`: fingerprint of the authenticated key.
+
+    `resume_of`: participant id whose resume token the front has verified, else empty.
+    `gateway`: connection of the gateway that speaks for this one, else 0.
+    """
+
+    key_id: Name
+    role: Name
+    name: Name
+    software: Name = ""
+    devices: tuple[Name, ...] = ()
+    capabilities: tuple[Name, ...] = ()
+    alignment: Name = "measured"
+    resume_of: Name = ""
+    gateway: Count = 0
+
+
+class Lost(Message, frozen=True, tag="lost"):
+    """The front lost the connection (socket closed, heartbeats missing). The grace period begins."""
+
+    reason: Name = ""
+
+
+class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
+    """Result of the estimator in the front, for the participant of this entry's connection.
+
+    Covariance: 6x6 row-major at the anchor, order (x, y, z, rx, ry, rz), world frame. `advice` is set when the
+    estimator refuses (`refused` true): "step closer", "add a sheet near the robot".
+    `pivot_world`: the point that the covariance is stated at (the anchor).
+    """
+
+    T_world_tracking: Pose
+    tracking_epoch: Count
+    covariance: tuple[float, ...]
+    pivot_world: tuple[float, float, float]
+    error_at_anchor_m: float
+    residual_tilt_rad: float = 0.0
+    n_observations: Count = 0
+    n_viewpoints: Count = 0
+    refused: bool = False
+    advice: Text = ""
+
+
+class ExternalReset(Message, frozen=True, tag="external_reset"):
+    """The user's loop went back in time or replaced the state (host only)."""
+
+
+class StalledGap(Message, frozen=True, tag="stalled_gap"):
+    """No step was taken for `duration_ns` (host only): robots hold until clutched again."""
+
+    duration_ns: Nanoseconds
+
+
+class FrontRestarted(Message, frozen=True, tag="front_restarted"):
+    """The front process was replaced (host only): every connection is lost."""
+
+
+class RecordingGap(Message, frozen=True, tag="recording_gap"):
+    """The recorder's feed lost rows (host only)."""
+
+    rows: Count
+
+
+EntryMessage = (
+    Join
+    | Lost
+    | Bye
+    | Heartbeat
+    | GetSnapshot
+    | Sample
+    | Acquire
+    | Release
+    | Consent
+    | Assign
+    | SetMode
+    | Grasp
+    | Observation
+    | AlignmentProposal
+    | PlaceAlignment
+    | TrackingEpoch
+    | Episode
+    | EStop
+    | ClearEStop
+    | Control
+    | Marker
+    | ExternalReset
+    | StalledGap
+    | FrontRestarted
+    | RecordingGap
+)
+
+
+class Entry(msgspec.Struct, frozen=True, array_like=True):
+    """One input. `connection`: number of the connection it came by, unique in the session, growing, `HOST` for ours.
+
+    `connection_epoch`: the epoch that the sender claimed in its envelope (equal to `connection` when honest; the
+    authority rejects a mismatch). `receive_ns`: session time stamped by the front.
+    """
+
+    connection: Count
+    connection_epoch: Count
+    receive_ns: Nanoseconds
+    message: EntryMessage
+
+
+#: Messages of the urgent lane: handled before everything else in a step.
+URGENT: Final = (EStop, Release, Lost, Bye)
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(Entry)
+_list_decoder = msgspec.msgpack.Decoder(list[Entry])
+
+
+def encode_entry(entry: Entry) -> bytes:
+    """MessagePack bytes of one entry; `decode_entry(encode_entry(e)) == e`, floats exactly."""
+    return _encoder.encode(entry)
+
+
+def decode_entry(data: bytes) -> Entry:
+    """Inverse of `encode_entry`. Raises `msgspec.DecodeError` (or its subclass `ValidationError`)."""
+    return _decoder.decode(data)
+
+
+def encode_entries(entries: list[Entry]) -> bytes:
+    """MessagePack array of entries."""
+    return _encoder.encode(entries)
+
+
+def decode_entries(data: bytes) -> list[Entry]:
+    """Inverse of `encode_entries`."""
+    return _list_decoder.decode(data)

@@ -1,0 +1,220 @@
+"""Every open enumeration of the protocol: the known values, as plain strings.
+
+Enumerations on the wire are open. A value that is not listed here decodes without error and is answered by a typed
+denial (`DenialReason.UNKNOWN_VALUE`), so an old server and a new client can still talk.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+PROTOCOL_VERSION: Final = 1
+
+
+class Role:
+    """What a participant may do. Reserved for later message types: `camera`, `source`."""
+
+    OPERATOR: Final = "operator"
+    OBSERVER: Final = "observer"
+    DIRECTOR: Final = "director"
+    AGENT: Final = "agent"
+    LEADER: Final = "leader"
+    GATEWAY: Final = "gateway"
+    RECORDER: Final = "recorder"
+    CAMERA: Final = "camera"
+    SOURCE: Final = "source"
+    ALL: Final = frozenset(
+        {"operator", "observer", "director", "agent", "leader", "gateway", "recorder", "camera", "source"}
+    )
+    #: Roles that may hold a lease on a robot or object.
+    DRIVING: Final = frozenset({"operator", "director", "agent", "leader"})
+
+
+class Device:
+    """Tracked sources of input of one participant."""
+
+    HEAD: Final = "head"
+    CONTROLLER_LEFT: Final = "controller/left"
+    CONTROLLER_RIGHT: Final = "controller/right"
+    HAND_LEFT: Final = "hand/left"
+    HAND_RIGHT: Final = "hand/right"
+    JOINTS: Final = "joints"
+    GAZE: Final = "gaze"
+    DESKTOP: Final = "desktop"
+    TARGET: Final = "target"  # a policy's end-effector target
+    ALL: Final = frozenset(
+        {
+            "head",
+            "controller/left",
+            "controller/right",
+            "hand/left",
+            "hand/right",
+            "joints",
+            "gaze",
+            "desktop",
+            "target",
+        }
+    )
+
+
+class SampleKind:
+    """Which payload of a `Sample` is meant."""
+
+    POSE: Final = "pose"
+    TWIST: Final = "twist"
+    JOINTS: Final = "joints"
+    ALL: Final = frozenset({"pose", "twist", "joints"})
+
+
+class TargetKind:
+    ROBOT: Final = "robot"
+    OBJECT: Final = "object"
+
+
+class LeaseMode:
+    """How a robot's lease passes between participants."""
+
+    EXCLUSIVE: Final = "exclusive"
+    REQUEST: Final = "request"
+    TAKEOVER: Final = "takeover"
+    PRIORITY: Final = "priority"
+    SHARED: Final = "shared"
+    ALL: Final = frozenset({"exclusive", "request", "takeover", "priority", "shared"})
+
+
+class AssignmentPolicy:
+    CONFIG: Final = "config"
+    JOIN_ORDER: Final = "join-order"
+    NEAREST: Final = "nearest"
+    DIRECTOR: Final = "director"
+    ALL: Final = frozenset({"config", "join-order", "nearest", "director"})
+
+
+class AlignmentKind:
+    """How `T_world_tracking` of a participant came to be."""
+
+    NONE: Final = "none"
+    MEASURED: Final = "measured"
+    PLACED: Final = "placed"
+    NOT_NEEDED: Final = "not_needed"
+
+
+class AnchorKind:
+    QR: Final = "qr"
+    BOARD: Final = "board"
+    CONTROLLER: Final = "controller"
+    TOUCH: Final = "touch"
+    ALL: Final = frozenset({"qr", "board", "controller", "touch"})
+
+
+class SessionKind:
+    LIVE: Final = "live"
+    REPLAY: Final = "replay"
+
+
+class CommandKind:
+    HOLD: Final = "hold"
+    POSE: Final = "pose"
+    TWIST: Final = "twist"
+    JOINTS: Final = "joints"
+
+
+class HoldReason:
+    """Why a robot holds. Exactly one is given with every hold command."""
+
+    NO_LEASE: Final = "no_lease"
+    NO_SAMPLE: Final = "no_sample"  # a lease, but nothing counted yet
+    CLUTCH_OPEN: Final = "clutch_open"
+    STALE: Final = "stale"  # no counted sample within the freshness bound
+    NOT_WORN: Final = "not_worn"
+    UNTRACKED: Final = "untracked"
+    UNALIGNED: Final = "unaligned"
+    REJECTED: Final = "rejected"  # the engaged sender's own sample was rejected; clutch again
+    ESTOP: Final = "estop"
+    DISCONNECTED: Final = "disconnected"
+    GAP: Final = "gap"  # the session stood still; clutch again
+    SCENE_CHANGED: Final = "scene_changed"  # reset or new epoch; clutch again
+    REARM: Final = "rearm"  # engagement ended (release, takeover, new tracking epoch); clutch again
+
+
+class RejectReason:
+    """Why a sample was not counted. Counted per participant, device and reason."""
+
+    CONNECTION_EPOCH: Final = "connection_epoch"
+    SCENE_EPOCH: Final = "scene_epoch"
+    TRACKING_EPOCH: Final = "tracking_epoch"
+    LEASE_VERSION: Final = "lease_version"
+    NOT_HOLDER: Final = "not_holder"
+    ALIGNMENT_VERSION: Final = "alignment_version"
+    SEQ: Final = "seq"
+    STALE: Final = "stale"
+    FUTURE: Final = "future"
+    NOT_FINITE: Final = "not_finite"
+    NOT_UNIT: Final = "not_unit"
+    TOO_FAST: Final = "too_fast"
+    SHAPE: Final = "shape"  # payload missing, or of the wrong length for this robot
+    UNKNOWN_VALUE: Final = "unknown_value"
+    UNKNOWN_TARGET: Final = "unknown_target"
+    ROLE: Final = "role"
+    UNALIGNED: Final = "unaligned"
+    QUOTA: Final = "quota"
+    DEVICE: Final = "device"  # device not declared in hello, or does not fit the kind
+    LEADER_APART: Final = "leader_apart"
+
+
+class DenialReason:
+    """Why a request was denied."""
+
+    HELD: Final = "held"  # someone else has the lease
+    CONSENT_PENDING: Final = "consent_pending"
+    CONSENT_REFUSED: Final = "consent_refused"
+    ROLE: Final = "role"
+    UNKNOWN_TARGET: Final = "unknown_target"
+    UNKNOWN_PARTICIPANT: Final = "unknown_participant"
+    UNKNOWN_REQUEST: Final = "unknown_request"
+    UNKNOWN_VALUE: Final = "unknown_value"
+    LEASE_VERSION: Final = "lease_version"
+    NOT_HOLDER: Final = "not_holder"
+    NOT_JOINED: Final = "not_joined"
+    ALREADY_JOINED: Final = "already_joined"
+    ESTOP: Final = "estop"
+    UNALIGNED: Final = "unaligned"
+    ALIGNMENT_REFUSED: Final = "alignment_refused"
+    EPISODE_STATE: Final = "episode_state"
+    QUEUE_FULL: Final = "queue_full"
+    QUOTA: Final = "quota"
+    SESSION_FULL: Final = "session_full"
+    USER_OWNED: Final = "user_owned"  # e.g. pause or reset of a loop that the user drives
+    POLICY: Final = "policy"  # the assignment policy leaves this to the configuration or a director
+    INVALID: Final = "invalid"  # values out of range (non-finite pose, n_ticks < 1, ...)
+
+
+class RefusalCode:
+    """Why a `hello` was refused by the front, before the authority saw it."""
+
+    VERSION: Final = "version"
+    IDENTITY: Final = "identity"
+    MALFORMED: Final = "malformed"
+    TOO_LARGE: Final = "too_large"
+    RATE: Final = "rate"
+    GATEWAY_ONLY: Final = "gateway_only"
+    RESUME_TOKEN: Final = "resume_token"
+    FULL: Final = "full"
+
+
+class EpisodeAction:
+    START: Final = "start"
+    SUCCESS: Final = "success"
+    FAILURE: Final = "failure"
+    DISCARD: Final = "discard"
+    RERECORD: Final = "rerecord"
+    RESET: Final = "reset"
+    ALL: Final = frozenset({"start", "success", "failure", "discard", "rerecord", "reset"})
+
+
+class ControlAction:
+    PAUSE: Final = "pause"
+    RESUME: Final = "resume"
+    STEP: Final = "step"
+    RESET: Final = "reset"
+    ALL: Final = frozenset({"pause", "resume", "step", "reset"})

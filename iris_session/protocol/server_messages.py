@@ -1,0 +1,384 @@
+"""Messages from the session to a client, version 1. The tag field is `type`; events carry their kind in `event`.
+
+On the control channel every one of them travels inside a `ServerEnvelope`. Everything is in the world frame:
+right-handed, Z up, metres, `[w, x, y, z]`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from iris_session.protocol.client_messages import Message
+from iris_session.protocol.common import Alignment, Applied, Count, Denial, Lease, Name, Nanoseconds, Pose, Text
+from iris_session.protocol.names import PROTOCOL_VERSION
+
+
+class Endpoints(msgspec.Struct, frozen=True):
+    """Ports of the other channels on the host that the client already talks to."""
+
+    state: Count = 0
+    media: Count = 0
+    assets: Count = 0
+    web: Count = 0
+
+
+class Welcome(Message, frozen=True, tag="welcome"):
+    """Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once."""
+
+    session_id: Name
+    session_name: Name
+    kind: Name
+    participant_id: Name
+    connection_epoch: Count
+    role: Name
+    resume_token: bytes
+    resumed: bool
+    session_time: Nanoseconds
+    heartbeat_ns: Nanoseconds
+    tick_period_ns: Nanoseconds
+    state_period_ns: Nanoseconds
+    endpoints: Endpoints
+    key_fingerprint: Name = ""
+
+
+class Refused(Message, frozen=True, tag="refused"):
+    """A `hello` that the front did not let through (`RefusalCode`), or that the authority denied (`DenialReason`)."""
+
+    code: Name
+    message: Text
+    advice: Text = ""
+    supported_versions: tuple[int, ...] = (PROTOCOL_VERSION,)
+
+
+class ProtocolFault(Message, frozen=True, tag="protocol_fault"):
+    """A message that could not be taken (malformed, too large, too fast). `code` as in `RefusalCode`."""
+
+    code: Name
+    message: Text
+
+
+class ClockPong(Message, frozen=True, tag="clock_pong"):
+    """`t0_ns` echoed; `t1_ns`, `t2_ns`: session time of receipt and of sending."""
+
+    t0_ns: Nanoseconds
+    t1_ns: Nanoseconds
+    t2_ns: Nanoseconds
+
+
+class Reply(Message, frozen=True, tag="reply"):
+    """Answer to a request: leases as they are now, or a denial (then nothing has changed)."""
+
+    request_id: Count
+    ok: bool
+    denial: Denial | None = None
+    leases: tuple[Lease, ...] = ()
+
+
+class Feedback(Message, frozen=True, tag="feedback"):
+    """To the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
+
+    `state`: the command kind in force, `hold_reason` when it is `hold`. `limits`: joints or bounds that are active.
+    `rejected`: counts by `RejectReason` for this participant since it joined. `contact_n`: force on the gripper [N].
+    """
+
+    robot: Name
+    state: Name
+    hold_reason: Name = ""
+    contact_n: float = 0.0
+    limits: tuple[Name, ...] = ()
+    rejected: dict[str, int] = msgspec.field(default_factory=dict)
+
+
+class ParticipantInfo(msgspec.Struct, frozen=True):
+    """One row of the roster."""
+
+    id: Name
+    name: Name
+    role: Name
+    connected: bool
+    devices: tuple[Name, ...] = ()
+    worn: bool = True
+    tracking_epoch: Count = 0
+    alignment: Alignment | None = None
+
+
+class RobotInfo(msgspec.Struct, frozen=True):
+    """A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`."""
+
+    name: Name
+    joints: tuple[Name, ...]
+    base_body: Count
+    site_body: Count
+    T_body_site: Pose
+    gripper: bool
+
+
+class BodyInfo(msgspec.Struct, frozen=True, array_like=True):
+    """One streamed rigid body: its index in state frames is its position in `Snapshot.bodies`."""
+
+    id: Count
+    name: Name
+    moving: bool
+    object: bool = False
+
+
+# --- events: the shared history, numbered without gaps by `event_seq` -----------------------------------------------
+
+
+class EventBody(msgspec.Struct, frozen=True, tag_field="event"):
+    """Base of all event bodies."""
+
+
+class ParticipantJoined(EventBody, frozen=True, tag="participant_joined"):
+    participant: ParticipantInfo
+    resumed: bool = False
+
+
+class ParticipantChanged(EventBody, frozen=True, tag="participant_changed"):
+    participant: ParticipantInfo
+
+
+class ParticipantLeft(EventBody, frozen=True, tag="participant_left"):
+    """`grace` true: the connection is lost, leases are kept until `Lease.expires_ns`."""
+
+    participant: Name
+    reason: Name
+    grace: bool = False
+
+
+class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
+    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode."""
+
+    lease: Lease
+    cause: Name
+    previous_holder: Name = ""
+
+
+class ConsentRequested(EventBody, frozen=True, tag="consent_requested"):
+    consent_id: Count
+    target: Name
+    requester: Name
+    holder: Name
+
+
+class Intervention(EventBody, frozen=True, tag="intervention"):
+    """Mode `priority`: a human took the robot from an agent (`active`), or gave it back."""
+
+    robot: Name
+    human: Name
+    agent: Name
+    active: bool
+
+
+class EngagementChanged(EventBody, frozen=True, tag="engagement_changed"):
+    robot: Name
+    participant: Name
+    engaged: bool
+    reason: Name = ""
+
+
+class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
+    participant: Name
+    alignment: Alignment
+
+
+class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
+    """`cause`: reset, new_scene, patch, external (the user's loop went back in time)."""
+
+    scene_epoch: Count
+    scene_revision: Count
+    cause: Name
+
+
+class EStopChanged(EventBody, frozen=True, tag="estop_changed"):
+    active: bool
+    participant: Name
+    reason: Text = ""
+
+
+class PauseChanged(EventBody, frozen=True, tag="pause_changed"):
+    paused: bool
+    participant: Name = ""
+
+
+class EpisodeChanged(EventBody, frozen=True, tag="episode_changed"):
+    """`state`: running, success, failure, discarded. `number` counts episodes from 1."""
+
+    number: Count
+    state: Name
+    label: Text = ""
+    participant: Name = ""
+
+
+class ObjectGrasped(EventBody, frozen=True, tag="object_grasped"):
+    object: Name
+    participant: Name
+    device: Name
+    grasped: bool
+
+
+class Handover(EventBody, frozen=True, tag="handover"):
+    """An object passed from one robot to another through contact alone. `duration_ns`: both grippers touched it."""
+
+    object: Name
+    giver: Name
+    receiver: Name
+    giver_participant: Name
+    receiver_participant: Name
+    duration_ns: Nanoseconds
+
+
+class MarkerAdded(EventBody, frozen=True, tag="marker_added"):
+    participant: Name
+    text: Text
+
+
+class SamplesRejected(EventBody, frozen=True, tag="samples_rejected"):
+    """First rejection of a kind, then at most one per second and (participant, device, reason)."""
+
+    participant: Name
+    device: Name
+    reason: Name
+    count: Count
+
+
+class Gap(EventBody, frozen=True, tag="gap"):
+    """`kind`: `stalled` (no step for `duration_ns`) or `recording` (rows lost; verification restarts)."""
+
+    kind: Name
+    duration_ns: Nanoseconds
+
+
+class Notice(EventBody, frozen=True, tag="notice"):
+    """Something an operator should read. `level`: info, warning, error."""
+
+    level: Name
+    text: Text
+
+
+EventKind = (
+    ParticipantJoined
+    | ParticipantChanged
+    | ParticipantLeft
+    | LeaseChanged
+    | ConsentRequested
+    | Intervention
+    | EngagementChanged
+    | AlignmentChanged
+    | SceneChanged
+    | EStopChanged
+    | PauseChanged
+    | EpisodeChanged
+    | ObjectGrasped
+    | Handover
+    | MarkerAdded
+    | SamplesRejected
+    | Gap
+    | Notice
+)
+
+
+class Event(Message, frozen=True, tag="event"):
+    """One entry of the shared history. A gap in `event_seq` means: ask for a new snapshot."""
+
+    event_seq: Count
+    step: Count
+    session_time: Nanoseconds
+    body: EventKind
+
+
+class Snapshot(Message, frozen=True, tag="snapshot"):
+    """Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
+
+    Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
+    `state_seq`.
+    """
+
+    request_id: Count
+    event_seq: Count
+    scene_epoch: Count
+    scene_revision: Count
+    scene_hash: Name
+    tick: Count
+    sim_time: float
+    session_time: Nanoseconds
+    participants: tuple[ParticipantInfo, ...]
+    leases: tuple[Lease, ...]
+    robots: tuple[RobotInfo, ...] = ()
+    bodies: tuple[BodyInfo, ...] = ()
+    paused: bool = False
+    estop: bool = False
+    episode: EpisodeChanged | None = None
+    state_seq: Count = 0
+
+
+ServerMessage = Welcome | Refused | ProtocolFault | ClockPong | Reply | Feedback | Event | Snapshot
+
+
+class ServerEnvelope(msgspec.Struct, frozen=True, array_like=True):
+    """`[version, connection_epoch, message]`. `connection_epoch` is that of the connection it is meant for."""
+
+    version: int
+    connection_epoch: Count
+    message: ServerMessage
+
+
+# --- state channel ----------------------------------------------------------------------------------------------------
+
+
+class StateHeader(msgspec.Struct, frozen=True, array_like=True):
+    """First payload frame of a rigid-state message; topic frame before it, encoded poses after it.
+
+    `session_time`: end of the tick that this state belongs to. `published_ns`: session time when handed to the socket.
+    `base_seq`: a client that holds any frame >= `base_seq` of this `scene_epoch` has every body within the bound after
+    this one; an older client asks for a snapshot. `ticks` are counted within the epoch.
+    """
+
+    scene_epoch: Count
+    scene_revision: Count
+    tick: Count
+    sim_time: float
+    session_time: Nanoseconds
+    published_ns: Nanoseconds
+    state_seq: Count
+    base_seq: Count
+    applied: tuple[Applied, ...] = ()
+
+
+class PresenceItem(msgspec.Struct, frozen=True, array_like=True):
+    """A device of a participant in the world. Only of participants that are aligned."""
+
+    participant: Name
+    device: Name
+    pose: Pose
+    capture_ns: Nanoseconds = 0
+
+
+class Presence(msgspec.Struct, frozen=True, array_like=True):
+    """Message on topic `presence`: heads and hands of everyone, latest value."""
+
+    session_time: Nanoseconds
+    published_ns: Nanoseconds
+    items: tuple[PresenceItem, ...]
+
+
+class Beacon(msgspec.Struct, frozen=True):
+    """UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned."""
+
+    protocol: Annotated[int, msgspec.Meta(ge=0)]
+    session_id: Name
+    session_name: Name
+    kind: Name
+    host: Name
+    control: Count
+    state: Count
+    media: Count
+    assets: Count
+    web: Count
+    key_fingerprint: Name = ""
+
+
+TOPIC_RIGID = b"rigid"
+TOPIC_PRESENCE = b"presence"
