@@ -1,0 +1,139 @@
+"""The gravity-aligned estimator: exact without noise, robust, honest about its error, refuses with advice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentConfig, AlignmentEstimator, position_error_p95
+from anchors.pose import PoseTuple, apply, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+
+SHEET: PoseTuple = ((0.1, -0.4, 0.02), quat_from_rotvec((0.0, 0.0, 0.3)))
+WALL: PoseTuple = ((1.2, 0.5, 0.8), quat_from_rotvec((math.pi / 2, 0.0, 0.0)))
+
+
+def _noisy(rng: np.random.Generator, pose: PoseTuple, sigma_m: float, sigma_rad: float) -> PoseTuple:
+    dp = rng.normal(0.0, sigma_m, 3)
+    dr = rng.normal(0.0, sigma_rad, 3)
+    q = compose(((0.0, 0.0, 0.0), quat_from_rotvec((dr[0], dr[1], dr[2]))), ((0.0, 0.0, 0.0), pose[1]))[1]
+    return ((pose[0][0] + dp[0], pose[0][1] + dp[1], pose[0][2] + dp[2]), q)
+
+
+@pytest.mark.parametrize("yaw", [-3.1, -1.0, 0.0, 2.0, math.pi])
+def test_exact_without_noise(yaw: float) -> None:
+    T_world_tracking: PoseTuple = ((3.0, -2.0, 0.1), quat_from_yaw(yaw))
+    estimator = AlignmentEstimator({"sheet": SHEET, "wall": WALL})
+    for i in range(10):
+        anchor_id, T_world_anchor = ("sheet", SHEET) if i % 2 else ("wall", WALL)
+        assert estimator.add(anchor_id, compose(inverse(T_world_tracking), T_world_anchor), i, 0, viewpoint_id=i // 5)
+    got = estimator.estimate()
+    assert not got.refused
+    assert distance(got.T_world_tracking[0], T_world_tracking[0]) < 1e-9
+    assert quat_angle(got.T_world_tracking[1], T_world_tracking[1]) < 1e-9
+    assert got.residual_tilt_rad < 1e-7
+
+
+def test_mirrored_and_wrong_detections_are_outvoted() -> None:
+    rng = np.random.default_rng(4)
+    T_world_tracking: PoseTuple = ((1.0, 0.5, -0.2), quat_from_yaw(1.1))
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    true = compose(inverse(T_world_tracking), SHEET)
+    for i in range(60):
+        seen = _noisy(rng, true, 0.003, math.radians(0.5))
+        if i % 10 == 3:
+            seen = compose(seen, ((0.0, 0.0, 0.0), quat_from_rotvec((math.pi, 0.0, 0.4))))
+        if i % 10 == 7:
+            seen = ((seen[0][0] + 0.4, seen[0][1], seen[0][2]), seen[1])
+        estimator.add("sheet", seen, i, 0, viewpoint_id=i // 20)
+    got = estimator.estimate()
+    assert not got.refused
+    at_sheet = distance(apply(got.T_world_tracking, true[0]), SHEET[0])
+    assert at_sheet < 0.004
+    assert quat_angle(got.T_world_tracking[1], T_world_tracking[1]) < math.radians(0.6)
+
+
+def test_stated_error_holds_for_the_model_it_assumes() -> None:
+    """Half of each variance constant per viewpoint: the stated p95 must cover 90-99 % of 300 headsets."""
+    rng = np.random.default_rng(7)
+    sigma_m, sigma_rad = 0.004, math.radians(0.5)
+    inside = 0
+    for _ in range(300):
+        T_world_tracking: PoseTuple = (
+            (float(rng.normal()), float(rng.normal()), float(rng.normal(0, 0.1))),
+            quat_from_yaw(float(rng.uniform(-math.pi, math.pi))),
+        )
+        true = compose(inverse(T_world_tracking), SHEET)
+        estimator = AlignmentEstimator(
+            {"sheet": SHEET}, AlignmentConfig(position_sigma_m=sigma_m, rotation_sigma_rad=sigma_rad)
+        )
+        for viewpoint in range(3):
+            common = _noisy(rng, true, sigma_m * math.sqrt(0.5), sigma_rad * math.sqrt(0.5))
+            for i in range(20):
+                estimator.add("sheet", _noisy(rng, common, sigma_m * math.sqrt(0.5), sigma_rad * math.sqrt(0.5)),
+                              i, 0, viewpoint_id=viewpoint)  # fmt: skip
+        got = estimator.estimate()
+        point_world = SHEET[0]
+        error = distance(apply(got.T_world_tracking, apply(inverse(T_world_tracking), point_world)), point_world)
+        inside += error <= position_error_p95(got.covariance, got.pivot_world, point_world)
+    assert 0.90 <= inside / 300 <= 0.99, inside / 300
+
+
+def test_error_grows_with_the_lever_arm() -> None:
+    cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 1e-5])
+    flat = tuple(float(v) for v in cov.ravel())
+    near = position_error_p95(flat, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    far = position_error_p95(flat, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+    assert near == pytest.approx(0.001 * 2.795, rel=0.01)  # chi with 3 degrees of freedom
+    assert far > 4.0 * near
+
+
+def test_refusals_say_what_to_do() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    assert estimator.estimate().refused
+    assert "look at the anchor" in estimator.estimate().advice
+    rng = np.random.default_rng(1)
+    for i in range(20):
+        estimator.add("sheet", _noisy(rng, SHEET, 0.1, 0.4), i, 0, quality=0.05)
+    got = estimator.estimate()
+    assert got.refused
+    assert got.advice
+
+
+def test_bad_observations_are_counted_not_used() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    assert not estimator.add("nobody", SHEET, 0, 0)
+    assert not estimator.add("sheet", ((math.nan, 0.0, 0.0), SHEET[1]), 0, 0)
+    assert not estimator.add("sheet", (SHEET[0], (0.0, 0.0, 0.0, 0.0)), 0, 0)
+    assert not estimator.add("sheet", (SHEET[0], (2.0, 0.0, 0.0, 0.0)), 0, 0)
+    assert (estimator.unknown_anchors, estimator.invalid) == (1, 3)
+
+
+def test_new_tracking_epoch_starts_anew_and_old_ones_are_refused() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    for i in range(10):
+        estimator.add("sheet", SHEET, i, 1)
+    assert not estimator.estimate().refused
+    assert estimator.add("sheet", SHEET, 11, 2)
+    assert estimator.estimate().refused
+    assert not estimator.add("sheet", SHEET, 12, 1)
+    assert estimator.stale_epochs == 1
+
+
+def test_memory_is_bounded() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET}, AlignmentConfig(max_observations=50))
+    for i in range(120):
+        estimator.add("sheet", SHEET, i, 0)
+    assert estimator.estimate().n_observations == 50
+    assert estimator.forgotten == 70
+
+
+def test_tilted_headset_is_warned_about() -> None:
+    T_world_tracking: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((math.radians(2.0), 0.0, 0.0)))
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    for i in range(10):
+        estimator.add("sheet", compose(inverse(T_world_tracking), SHEET), i, 0)
+    got = estimator.estimate()
+    assert got.residual_tilt_rad == pytest.approx(math.radians(2.0), abs=1e-3)
+    assert "vertical" in got.advice
