@@ -1,0 +1,111 @@
+"""Estimate of session time from four-timestamp exchanges. Pure: the caller passes its own monotonic clock in.
+
+Each exchange gives an offset `((t1 - t0) + (t2 - t3)) / 2` whose error is at most half its round trip, whatever the
+path's asymmetry. The estimate is the median offset of the quickest quarter of a window. After the first exchange it is slewed and never
+stepped, so that session time read from it never runs backwards.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from statistics import median
+from typing import NamedTuple
+
+WINDOW = 32  # exchanges; half a minute at one per second
+MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
+SLEW = 0.01  # the estimate moves at most 10 ms per second: invisible in 150 ms freshness, monotonic
+DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
+BURST = 8  # exchanges at the start and after a reset ...
+BURST_PERIOD_NS = 25_000_000  # ... at this period, then
+PERIOD_NS = 1_000_000_000  # at this one
+
+
+class Exchange(NamedTuple):
+    """One exchange: `at_ns` on the client's clock, offset session - client clock, round trip without server time."""
+
+    at_ns: int
+    offset_ns: int
+    rtt_ns: int
+
+
+class ClockSync:
+    """Maps the client's monotonic clock to session time.
+
+    All `local_ns` arguments are nanoseconds of one monotonic clock of the caller.
+    """
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything: another session, or the machine slept."""
+        self._window: deque[Exchange] = deque(maxlen=WINDOW)
+        self._target = 0
+        self._offset = 0
+        self._offset_at = 0
+        self._rtt = 0
+        self._best_at = 0
+        self._next_ping = 0
+        self._sent = 0
+
+    @property
+    def synced(self) -> bool:
+        """At least one exchange has been counted."""
+        return bool(self._window)
+
+    @property
+    def rtt_ns(self) -> int:
+        """Shortest round trip in the window [ns], 0 before the first exchange."""
+        return self._rtt
+
+    def ping_due(self, local_ns: int) -> bool:
+        """True when a `ClockPing` is to be sent now; counts it as sent."""
+        if local_ns < self._next_ping:
+            return False
+        self._sent += 1
+        self._next_ping = local_ns + (BURST_PERIOD_NS if self._sent < BURST else PERIOD_NS)
+        return True
+
+    @property
+    def next_ping_ns(self) -> int:
+        """When the next ping is due [local ns]."""
+        return self._next_ping
+
+    def pong(self, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> None:
+        """Counts one exchange: `t0`, `t3` on the client's clock, `t1`, `t2` in session time.
+
+        Impossible ones (time runs backwards, or the server held it longer than the round trip) are rejected.
+        """
+        rtt = (t3_ns - t0_ns) - (t2_ns - t1_ns)
+        if t3_ns < t0_ns or t2_ns < t1_ns or rtt < 0:
+            self.rejected += 1
+            return
+        offset = ((t1_ns - t0_ns) + (t2_ns - t3_ns)) // 2
+        first = not self._window
+        now_offset = offset if first else self._slewed(t3_ns)
+        self._window.append(Exchange(t3_ns, offset, rtt))
+        fresh = [e for e in self._window if t3_ns - e.at_ns <= MAX_AGE_NS]
+        fresh.sort(key=lambda e: e.rtt_ns)
+        quickest = fresh[: max(1, len(fresh) // 4)]
+        self._target = int(median(e.offset_ns for e in quickest))
+        self._rtt = quickest[0].rtt_ns
+        self._best_at = quickest[0].at_ns
+        self._offset, self._offset_at = now_offset, t3_ns
+
+    def session_ns(self, local_ns: int) -> int:
+        """Session time [ns] at `local_ns`. Meaningless before `synced`."""
+        return local_ns + self._slewed(local_ns)
+
+    def local_ns(self, session_ns: int) -> int:
+        """The client's clock at session time `session_ns`, by the estimate as it stands."""
+        return session_ns - self._target
+
+    def error_bound_ns(self, local_ns: int) -> int:
+        """Bound of the error of `session_ns(local_ns)`: half the round trip, drift since, and slew still to do."""
+        drift = int(DRIFT * abs(local_ns - self._best_at))
+        return self._rtt // 2 + drift + abs(self._target - self._slewed(local_ns))
+
+    def _slewed(self, local_ns: int) -> int:
+        room = int(SLEW * max(0, local_ns - self._offset_at))
+        return self._offset + max(-room, min(room, self._target - self._offset))

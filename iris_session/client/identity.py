@@ -1,0 +1,90 @@
+"""Who a client is across connections and restarts: a secret and the last resume token.
+
+On plain loopback the 128-bit secret in `hello` stands for the key; with CURVE the key itself does. In memory by
+default: then a new process is a new participant. With a file, a killed and restarted process resumes its leases.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from pathlib import Path
+
+import msgspec
+
+from iris_session.client.errors import IdentityError
+
+SECRET_BYTES = 16  # 128 bits
+
+
+class _Stored(msgspec.Struct, frozen=True):
+    secret: bytes
+    resume_token: bytes = b""
+
+
+class Identity:
+    """Secret and resume token. `path` set: every change is written there at once, readable by its owner only."""
+
+    def __init__(self, secret: bytes, resume_token: bytes = b"", path: Path | None = None) -> None:
+        if len(secret) != SECRET_BYTES:
+            raise IdentityError(f"an identity needs a secret of {SECRET_BYTES} bytes, got {len(secret)}")
+        self.secret = secret
+        self.path = path
+        self._resume_token = resume_token
+
+    @classmethod
+    def in_memory(cls) -> Identity:
+        """A new identity that ends with the process."""
+        return cls(secrets.token_bytes(SECRET_BYTES))
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Identity:
+        """Reads the identity at `path`, or makes one there.
+
+        Raises `IdentityError` when the file is damaged, or may be read by other users.
+        """
+        path = Path(path)
+        try:
+            data = path.read_bytes()
+            mode = stat.S_IMODE(path.stat().st_mode)
+        except FileNotFoundError:
+            identity = cls(secrets.token_bytes(SECRET_BYTES), path=path)
+            identity._write()
+            return identity
+        except OSError as error:
+            raise IdentityError(f"identity file {path} cannot be read: {error.strerror}") from error
+        if os.name == "posix" and mode & 0o077:
+            raise IdentityError(f"identity file {path} may be read by others (mode {mode:o}): run chmod 600 on it")
+        try:
+            stored = msgspec.json.decode(data, type=_Stored)
+        except msgspec.MsgspecError as error:
+            raise IdentityError(f"identity file {path} is damaged ({error}): delete it to start anew") from error
+        return cls(stored.secret, stored.resume_token, path)
+
+    @property
+    def resume_token(self) -> bytes:
+        """Token of the last `Welcome`, single use; empty: join as somebody new."""
+        return self._resume_token
+
+    @resume_token.setter
+    def resume_token(self, token: bytes) -> None:
+        if token != self._resume_token:
+            self._resume_token = token
+            if self.path is not None:
+                self._write()
+
+    def _write(self) -> None:
+        """Replaces the file in one step, so that a kill leaves the old or the new one."""
+        assert self.path is not None
+        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            try:
+                os.write(handle, msgspec.json.encode(_Stored(self.secret, self._resume_token)))
+            finally:
+                os.close(handle)
+            temporary.replace(self.path)
+        except OSError as error:
+            raise IdentityError(f"identity file {self.path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,173 @@
+"""The client's copy of the shared session state, built from one snapshot and the events after it. Pure.
+
+`SessionMirror` never guesses: a gap in `event_seq` makes it ask for a new snapshot, and until that comes it keeps the
+newer events aside (bounded). Two clients with equal `event_seq` have equal `mirror_hash()`, whenever they joined.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Alignment, Lease
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    BodyInfo,
+    EpisodeChanged,
+    EStopChanged,
+    Event,
+    LeaseChanged,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PauseChanged,
+    RobotInfo,
+    SceneChanged,
+    Snapshot,
+)
+
+MAX_HELD_EVENTS: Final = 256  # kept while a snapshot is on its way; more than that and the next snapshot covers them
+_encoder = msgspec.msgpack.Encoder(order="deterministic")
+
+
+class SessionMirror:
+    """Roster, leases, alignments, robots and bodies as the session says they are.
+
+    `synced` is false before the first snapshot and after a gap; the other attributes then show the last known state.
+    Counters: `gaps`, `discarded` (events older than the snapshot or repeated), `held_overflow`.
+    """
+
+    def __init__(self) -> None:
+        self.gaps = 0
+        self.discarded = 0
+        self.held_overflow = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the session, keeps the counters."""
+        self.synced = False
+        self.event_seq = 0
+        self.scene_epoch = 0
+        self.scene_revision = 0
+        self.scene_hash = ""
+        self.paused = False
+        self.estop = False
+        self.episode: EpisodeChanged | None = None
+        self.participants: dict[str, ParticipantInfo] = {}
+        self.leases: dict[str, Lease] = {}
+        self.robots: dict[str, RobotInfo] = {}
+        self.bodies: tuple[BodyInfo, ...] = ()
+        self.body_index: dict[str, int] = {}
+        self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
+
+    def apply_snapshot(self, snapshot: Snapshot) -> list[Event]:
+        """Takes over a snapshot and the held events after it. Returns those events in order.
+
+        An older snapshot than what is already known (`event_seq`) is discarded unless a gap is open.
+        """
+        if self.synced and snapshot.event_seq < self.event_seq:
+            self.discarded += 1
+            return []
+        self.event_seq = snapshot.event_seq
+        self.scene_epoch = snapshot.scene_epoch
+        self.scene_revision = snapshot.scene_revision
+        self.scene_hash = snapshot.scene_hash
+        self.paused = snapshot.paused
+        self.estop = snapshot.estop
+        self.episode = snapshot.episode
+        self.participants = {p.id: p for p in snapshot.participants}
+        self.leases = {lease.target: lease for lease in snapshot.leases}
+        self.robots = {robot.name: robot for robot in snapshot.robots}
+        self.bodies = snapshot.bodies
+        self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
+        self.synced = True
+        held, self._held = self._held, deque(maxlen=MAX_HELD_EVENTS)
+        return [event for event in held if self.apply_event(event)]
+
+    def apply_event(self, event: Event) -> bool:
+        """Applies the next event. False: it was discarded, or held until a snapshot comes (`synced` is then false)."""
+        if not self.synced:
+            self._hold(event)
+            return False
+        if event.event_seq <= self.event_seq:
+            self.discarded += 1
+            return False
+        if event.event_seq != self.event_seq + 1:
+            self.gaps += 1
+            self.synced = False
+            self._hold(event)
+            return False
+        self.event_seq = event.event_seq
+        self._apply(event)
+        return True
+
+    def alignment(self, participant: str) -> Alignment | None:
+        """The alignment of one participant, `None` while it has none."""
+        info = self.participants.get(participant)
+        return None if info is None else info.alignment
+
+    def lease_version(self, target: str, participant: str) -> int | None:
+        """The fencing token of `target` when `participant` holds it (alone or with others), else `None`."""
+        lease = self.leases.get(target)
+        if lease is None or not (lease.holder == participant or participant in lease.sub_holders):
+            return None
+        return lease.lease_version
+
+    def mirror_hash(self) -> str:
+        """Digest (32 hex digits) of everything shared, independent of when and how this client learned it."""
+        state = (
+            self.event_seq,
+            self.scene_epoch,
+            self.scene_revision,
+            self.scene_hash,
+            self.paused,
+            self.estop,
+            self.episode,
+            [self.participants[key] for key in sorted(self.participants)],
+            [self.leases[key] for key in sorted(self.leases)],
+            [self.robots[key] for key in sorted(self.robots)],
+            self.bodies,
+        )
+        return hashlib.blake2b(_encoder.encode(state), digest_size=16).hexdigest()
+
+    def _hold(self, event: Event) -> None:
+        if len(self._held) == MAX_HELD_EVENTS:
+            self.held_overflow += 1
+        self._held.append(event)
+
+    def _apply(self, event: Event) -> None:
+        match event.body:
+            case ParticipantJoined(participant=info) | ParticipantChanged(participant=info):
+                self.participants[info.id] = info
+            case ParticipantLeft(participant=name, grace=grace):
+                self._leave(name, grace)
+            case LeaseChanged(lease=lease):
+                self.leases[lease.target] = lease
+            case AlignmentChanged(participant=name, alignment=alignment):
+                info_or_none = self.participants.get(name)
+                if info_or_none is not None:
+                    self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
+            case SceneChanged(scene_epoch=epoch, scene_revision=revision):
+                self.scene_epoch = epoch
+                self.scene_revision = revision
+            case EStopChanged(active=active):
+                self.estop = active
+            case PauseChanged(paused=paused):
+                self.paused = paused
+            case EpisodeChanged() as episode:
+                self.episode = episode
+            case _:  # history only: nothing of it is in a snapshot
+                pass
+
+    def _leave(self, participant: str, grace: bool) -> None:
+        info = self.participants.get(participant)
+        if info is None:
+            return
+        if grace:
+            self.participants[participant] = msgspec.structs.replace(info, connected=False)
+        else:
+            del self.participants[participant]
