@@ -1,1 +1,4 @@
-"""streams"""
+"""Encoders of the broadcast streams: bytes in, bytes out, with a stated error bound. No sockets, no clocks, no MuJoCo.
+
+`rigid` (poses of rigid bodies), `quantise` (the number formats it uses), `errors`.
+"""

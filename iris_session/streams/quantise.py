@@ -1,0 +1,90 @@
+"""Number formats of the state stream: positions on a fixed world lattice, rotations as smallest three in 40 bits.
+
+Both are normative (`docs/protocol.md`, "Quantisation") and carry their worst-case error as a constant beside them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from iris_session.streams.errors import StreamError
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Words = npt.NDArray[np.uint64]
+
+#: Edge of the position lattice [m], 0.1068 mm. A binary fraction: `index * LATTICE_M` is exact in float64, and
+#: 2**48 cells are 343 m^3, so that six bytes hold any position in a 10 x 10 x 3 m room.
+LATTICE_M: Final = 7.0 / 65536.0
+#: Farthest that a point can be from its lattice node: half the space diagonal of a cell [m], 0.0925 mm.
+POSITION_QUANTUM_ERROR_M: Final = LATTICE_M * math.sqrt(3.0) / 2.0
+
+#: Levels per component of a smallest-three quaternion. The largest odd number (so that 0 is a level, and the identity
+#: is exact) with 4 * levels**3 <= 2**40.
+ROTATION_LEVELS: Final = 6501
+ROTATION_BYTES: Final = 5
+_HALF: Final = (ROTATION_LEVELS - 1) // 2
+_PER_UNIT: Final = _HALF * math.sqrt(2.0)
+#: Largest angle between a rotation and its code [rad], 0.0432 deg: 2 |dq|, |dq| <= |d| / q_max, q_max >= 1/2 and
+#: |d| <= sqrt(3) half steps (proof in docs/protocol.md; the factor covers the second-order term).
+ROTATION_QUANTUM_ERROR_RAD: Final = 1.001 * 2.0 * 2.0 * math.sqrt(3.0) * 0.5 / _PER_UNIT
+#: Sum of squares of the three sent components: at most 3/4 before rounding. Above this no encoder made the code.
+_MAX_SQUARES: Final = 0.76
+
+#: Components that are sent when component `i` is the largest.
+_OTHERS: Final = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def rotation_codes(q: Floats) -> Words:
+    """Codes (m,) of unit quaternions `q` (m, 4) `[w, x, y, z]`.
+
+    code = largest + 4 * (a + 6501 * (b + 6501 * c)): the index of the component of largest magnitude, and the other
+    three in their order, with the sign that makes the largest positive, rounded to steps of sqrt(2) / 6500.
+    """
+    rows = np.arange(len(q))
+    largest = np.abs(q).argmax(axis=1)
+    scale = np.where(q[rows, largest] < 0.0, -_PER_UNIT, _PER_UNIT)
+    levels = np.rint(q[rows[:, None], _OTHERS[largest]] * scale[:, None]).astype(np.int64)
+    np.clip(levels, -_HALF, _HALF, out=levels)
+    levels += _HALF
+    packed = levels[:, 0] + ROTATION_LEVELS * (levels[:, 1] + ROTATION_LEVELS * levels[:, 2])
+    codes: Words = (largest + 4 * packed).astype(np.uint64)
+    return codes
+
+
+def rotations(codes: Words) -> Floats:
+    """Unit quaternions (m, 4) of `codes` (m,). Raises `StreamError` for a code that stands for no rotation."""
+    largest = (codes & np.uint64(3)).astype(np.int64)
+    rest = (codes >> np.uint64(2)).astype(np.int64)
+    high, a = np.divmod(rest, ROTATION_LEVELS)
+    c, b = np.divmod(high, ROTATION_LEVELS)
+    components = np.empty((len(codes), 3))
+    components[:, 0] = a
+    components[:, 1] = b
+    components[:, 2] = c
+    components -= _HALF
+    components /= _PER_UNIT
+    squares = np.einsum("ij,ij->i", components, components)
+    if len(codes) and not (squares.max() <= _MAX_SQUARES and c.max() < ROTATION_LEVELS):
+        raise StreamError("a rotation code stands for no unit quaternion")
+    q = np.empty((len(codes), 4))
+    rows = np.arange(len(codes))
+    q[rows[:, None], _OTHERS[largest]] = components
+    q[rows, largest] = np.sqrt(1.0 - squares)
+    return q
+
+
+def pack_words(words: npt.NDArray[Any], n_bytes: int) -> bytes:
+    """The low `n_bytes` (1 to 8) of each non-negative integer, little-endian, one after the other."""
+    return np.ascontiguousarray(words, dtype="<u8").view(np.uint8).reshape(-1, 8)[:, :n_bytes].tobytes()
+
+
+def unpack_words(data: bytes | memoryview, n_bytes: int) -> Words:
+    """Inverse of `pack_words`; `len(data)` must be a multiple of `n_bytes`."""
+    wide = np.zeros((len(data) // n_bytes, 8), np.uint8)
+    wide[:, :n_bytes] = np.frombuffer(data, np.uint8).reshape(-1, n_bytes)
+    return wide.view("<u8").reshape(-1).astype(np.uint64, copy=False)
