@@ -1,0 +1,220 @@
+"""Bytes to messages and back: the trust boundary. MessagePack by `msgspec`, checked against the schema and the sizes.
+
+Every `decode_*` raises a `ProtocolError` and nothing else, whatever the bytes are. What it lets through on purpose:
+unknown fields (ignored, so that a version can grow), unknown values of open enumerations and non-finite floats (the
+authority answers them with typed reasons).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, TypeVar, get_args
+
+import msgspec
+
+from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage, Message
+from iris_session.protocol.errors import MalformedError, ProtocolError, TooLargeError, VersionError
+from iris_session.protocol.limits import (
+    LIMITS,
+    MAX_BEACON_BYTES,
+    MAX_CLIENT_BYTES,
+    MAX_PRESENCE_BYTES,
+    MAX_SERVER_BYTES,
+    MAX_STATE_HEADER_BYTES,
+    SERVER_LIMITS,
+)
+from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.server_messages import (
+    Beacon,
+    EventBody,
+    EventKind,
+    Presence,
+    ServerEnvelope,
+    ServerMessage,
+    StateHeader,
+)
+
+Bytes = bytes | bytearray | memoryview
+T = TypeVar("T")
+
+
+def tag_of(kind: type[msgspec.Struct]) -> str:
+    """Wire name of a message or event type: `Sample` -> `"sample"`."""
+    return str(kind.__struct_config__.tag)
+
+
+#: Types by wire name, in the order of their definition.
+CLIENT_TYPES: Final[dict[str, type[Message]]] = {tag_of(kind): kind for kind in get_args(ClientMessage)}
+SERVER_TYPES: Final[dict[str, type[Message]]] = {tag_of(kind): kind for kind in get_args(ServerMessage)}
+EVENT_TYPES: Final[dict[str, type[EventBody]]] = {tag_of(kind): kind for kind in get_args(EventKind)}
+
+
+class _Version(msgspec.Struct, array_like=True):
+    """Envelope of any version: an array whose first element is the version."""
+
+    version: int
+
+
+class _BeaconVersion(msgspec.Struct):
+    protocol: int
+
+
+class _Event(msgspec.Struct):
+    event: str = ""
+
+
+class _Tags(msgspec.Struct):
+    """The tags of a message, whatever its other fields are."""
+
+    type: str = ""
+    body: _Event = _Event()
+
+
+class _ClientTags(msgspec.Struct, array_like=True):
+    version: int
+    connection_epoch: msgspec.Raw
+    on_behalf_of: msgspec.Raw
+    message: _Tags
+
+
+class _ServerTags(msgspec.Struct, array_like=True):
+    version: int
+    connection_epoch: msgspec.Raw
+    message: _Tags
+
+
+_encoder: Final = msgspec.msgpack.Encoder()
+_client: Final = msgspec.msgpack.Decoder(ClientEnvelope)
+_server: Final = msgspec.msgpack.Decoder(ServerEnvelope)
+_version: Final = msgspec.msgpack.Decoder(_Version)
+_beacon_version: Final = msgspec.msgpack.Decoder(_BeaconVersion)
+_client_tags: Final = msgspec.msgpack.Decoder(_ClientTags)
+_server_tags: Final = msgspec.msgpack.Decoder(_ServerTags)
+_state_header: Final = msgspec.msgpack.Decoder(StateHeader)
+_presence: Final = msgspec.msgpack.Decoder(Presence)
+_beacon: Final = msgspec.msgpack.Decoder(Beacon)
+
+#: What `msgspec` raises for bytes of a stranger: schema and syntax (`DecodeError`), text that is not UTF-8, nesting.
+_BAD_BYTES: Final = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError)
+
+
+def encode_client(envelope: ClientEnvelope) -> bytes:
+    """MessagePack bytes of a message to the session."""
+    return _encoder.encode(envelope)
+
+
+def decode_client(data: Bytes) -> ClientEnvelope:
+    """Inverse of `encode_client`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    _check_size("message", data, MAX_CLIENT_BYTES)
+    try:
+        envelope = _client.decode(data)
+    except _BAD_BYTES as error:
+        raise _explain(error, data, _client_tags, CLIENT_TYPES) from None
+    if envelope.version != PROTOCOL_VERSION:
+        raise VersionError(envelope.version)
+    kind = type(envelope.message)
+    _check_size(tag_of(kind), data, LIMITS[kind].max_bytes)
+    return envelope
+
+
+def encode_server(envelope: ServerEnvelope) -> bytes:
+    """MessagePack bytes of a message to a client."""
+    return _encoder.encode(envelope)
+
+
+def decode_server(data: Bytes) -> ServerEnvelope:
+    """Inverse of `encode_server`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    _check_size("message", data, MAX_SERVER_BYTES)
+    try:
+        envelope = _server.decode(data)
+    except _BAD_BYTES as error:
+        raise _explain(error, data, _server_tags, SERVER_TYPES) from None
+    if envelope.version != PROTOCOL_VERSION:
+        raise VersionError(envelope.version)
+    kind = type(envelope.message)
+    _check_size(tag_of(kind), data, SERVER_LIMITS[kind].max_bytes)
+    return envelope
+
+
+def peek_version(data: Bytes) -> int:
+    """Protocol version of an envelope whose other elements may be of any schema. Raises `MalformedError`."""
+    try:
+        return _version.decode(data).version
+    except _BAD_BYTES as error:
+        raise MalformedError(
+            f"no envelope: {error}; expected a MessagePack array that starts with the version"
+        ) from None
+
+
+def encode_state_header(header: StateHeader) -> bytes:
+    """Second frame of a rigid-state message; the topic before it, the payload after it."""
+    return _encoder.encode(header)
+
+
+def decode_state_header(data: Bytes) -> StateHeader:
+    """Inverse of `encode_state_header`. Raises `TooLargeError` or `MalformedError`."""
+    return _decode("state header", _state_header, data, MAX_STATE_HEADER_BYTES)
+
+
+def encode_presence(presence: Presence) -> bytes:
+    """Second frame of a presence message, after the topic."""
+    return _encoder.encode(presence)
+
+
+def decode_presence(data: Bytes) -> Presence:
+    """Inverse of `encode_presence`. Raises `TooLargeError` or `MalformedError`."""
+    return _decode("presence", _presence, data, MAX_PRESENCE_BYTES)
+
+
+def encode_beacon(beacon: Beacon) -> bytes:
+    """One discovery datagram."""
+    return _encoder.encode(beacon)
+
+
+def decode_beacon(data: Bytes) -> Beacon:
+    """Inverse of `encode_beacon`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    _check_size("beacon", data, MAX_BEACON_BYTES)
+    try:
+        version = _beacon_version.decode(data).protocol
+    except _BAD_BYTES as error:
+        raise MalformedError(f"no beacon: {error}") from None
+    if version != PROTOCOL_VERSION:
+        raise VersionError(version)
+    return _decode("beacon", _beacon, data, MAX_BEACON_BYTES)
+
+
+def _decode(what: str, decoder: msgspec.msgpack.Decoder[T], data: Bytes, limit: int) -> T:
+    _check_size(what, data, limit)
+    try:
+        return decoder.decode(data)
+    except _BAD_BYTES as error:
+        raise MalformedError(f"no {what}: {error}") from None
+
+
+def _check_size(what: str, data: Bytes, limit: int) -> None:
+    if len(data) > limit:
+        raise TooLargeError(what, len(data), limit)
+
+
+def _explain(
+    error: Exception,
+    data: Bytes,
+    tags: msgspec.msgpack.Decoder[_ClientTags] | msgspec.msgpack.Decoder[_ServerTags],
+    known: Mapping[str, type[Message]],
+) -> ProtocolError:
+    """What to raise for an envelope that did not decode with `error`: wrong version first, then unknown type."""
+    try:
+        version = peek_version(data)
+    except MalformedError as no_envelope:
+        return no_envelope
+    if version != PROTOCOL_VERSION:
+        return VersionError(version)
+    try:
+        message = tags.decode(data).message
+    except _BAD_BYTES:
+        return MalformedError(str(error))
+    if message.type and message.type not in known:
+        return MalformedError(f"unknown message type {message.type[:64]!r}, expected one of {', '.join(known)}")
+    if message.type == "event" and message.body.event and message.body.event not in EVENT_TYPES:
+        return MalformedError(f"unknown event {message.body.event[:64]!r}, expected one of {', '.join(EVENT_TYPES)}")
+    return MalformedError(f"{message.type or 'message'}: {error}")

@@ -1,0 +1,136 @@
+"""Size and rate limits of every message, and the token bucket that applies the rates.
+
+Sizes are checked by `codec` when it decodes. Rates are per connection and message type; the front applies them with a
+`RateLimiter` and counts what it drops. A limit is generous for an honest client: it bounds memory and work, not use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Assign,
+    Bye,
+    ClearEStop,
+    ClockPing,
+    Consent,
+    Control,
+    Episode,
+    EStop,
+    GetSnapshot,
+    Grasp,
+    Heartbeat,
+    Hello,
+    Marker,
+    Message,
+    Observation,
+    PlaceAlignment,
+    Release,
+    Sample,
+    SetMode,
+    TrackingEpoch,
+)
+from iris_session.protocol.server_messages import (
+    ClockPong,
+    Event,
+    Feedback,
+    ProtocolFault,
+    Refused,
+    Reply,
+    Snapshot,
+    Welcome,
+)
+
+
+class Limit(msgspec.Struct, frozen=True):
+    """`max_bytes`: whole encoded envelope. `per_second`, `burst`: token bucket per connection; 0: no rate limit."""
+
+    max_bytes: int
+    per_second: float = 0.0
+    burst: int = 0
+
+
+#: What a person or program asks for: clicks and commands, not a stream. A list of 32 names of 64 characters (4 bytes
+#: each in the worst case) fits.
+_REQUEST: Final = Limit(max_bytes=20_000, per_second=20, burst=40)
+
+#: From clients. A sample: five devices at 90 Hz with reserve; its size holds 26 hand joints and 64 + 64 joint values.
+LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
+    {
+        Hello: Limit(40_000, 2, 10),
+        Bye: Limit(4_000, 2, 4),
+        Heartbeat: Limit(256, 20, 40),
+        ClockPing: Limit(256, 20, 40),
+        GetSnapshot: Limit(256, 2, 10),
+        Sample: Limit(8_000, 600, 200),
+        Acquire: _REQUEST,
+        Release: _REQUEST,
+        Consent: _REQUEST,
+        Assign: _REQUEST,
+        SetMode: _REQUEST,
+        Grasp: _REQUEST,
+        Observation: Limit(2_000, 60, 120),
+        PlaceAlignment: _REQUEST,
+        TrackingEpoch: Limit(256, 5, 10),
+        Episode: Limit(4_000, 5, 10),
+        EStop: Limit(4_000, 20, 40),
+        ClearEStop: Limit(256, 5, 10),
+        Control: Limit(1_000, 20, 40),
+        Marker: Limit(4_000, 20, 40),
+    }
+)
+#: Largest message of any type from a client: what the socket may take at all (`ZMQ_MAXMSGSIZE`).
+MAX_CLIENT_BYTES: Final = max(limit.max_bytes for limit in LIMITS.values())
+
+#: From the server, checked by clients. A snapshot names every body: 65,535 of them.
+SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
+    {
+        Welcome: Limit(4_000),
+        Refused: Limit(8_000),
+        ProtocolFault: Limit(4_000),
+        ClockPong: Limit(256),
+        Reply: Limit(1_000_000),
+        Feedback: Limit(64_000),
+        Event: Limit(64_000),
+        Snapshot: Limit(32_000_000),
+    }
+)
+MAX_SERVER_BYTES: Final = max(limit.max_bytes for limit in SERVER_LIMITS.values())
+MAX_STATE_HEADER_BYTES: Final = 128_000
+MAX_PRESENCE_BYTES: Final = 256_000
+#: One UDP datagram without fragmentation on Ethernet.
+MAX_BEACON_BYTES: Final = 1_400
+
+
+class RateLimiter:
+    """Token buckets of one connection, one per message type. Pure: the time is given.
+
+    Integer arithmetic in nano-tokens, so that it is exact: a bucket gains `per_second` nano-tokens per nanosecond.
+    """
+
+    __slots__ = ("_buckets", "_limits")
+
+    def __init__(self, limits: Mapping[type[Message], Limit] = LIMITS) -> None:
+        self._limits = limits
+        self._buckets: dict[type[Message], tuple[int, int]] = {}  # type -> (nano-tokens, time of last use)
+
+    def allow(self, kind: type[Message], now_ns: int) -> bool:
+        """Whether one more message of type `kind` may pass at `now_ns`; takes its token. Time may stand still.
+
+        Raises `KeyError` for a type without a limit.
+        """
+        limit = self._limits[kind]
+        if not limit.burst:
+            return True
+        full = limit.burst * 1_000_000_000
+        tokens, used_ns = self._buckets.get(kind, (full, now_ns))
+        elapsed_ns = max(0, now_ns - used_ns)
+        tokens = min(full, tokens + int(elapsed_ns * limit.per_second))
+        allowed = tokens >= 1_000_000_000
+        self._buckets[kind] = (tokens - 1_000_000_000 if allowed else tokens, max(now_ns, used_ns))
+        return allowed
