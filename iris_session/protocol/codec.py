@@ -59,7 +59,7 @@ class _BeaconVersion(msgspec.Struct):
     protocol: int
 
 
-class _Event(msgspec.Struct):
+class _Event(msgspec.Struct, frozen=True):
     event: str = ""
 
 
