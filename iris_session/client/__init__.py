@@ -1,1 +1,39 @@
-"""client"""
+"""The Python client: what policies, leader robots, emulators and tests join a session with.
+
+A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interpolation`) and a thin ZeroMQ shell
+(`client`, `sockets`). Errors are drawn in `errors`.
+"""
+
+from iris_session.client.client import Client, poll_all
+from iris_session.client.errors import (
+    ClientError,
+    DeniedError,
+    IdentityError,
+    NotConnectedError,
+    RefusedError,
+    RequestTimeoutError,
+    VersionError,
+)
+from iris_session.client.identity import Identity
+from iris_session.client.interpolation import PoseBuffer, Shown
+from iris_session.client.session_state import SessionMirror
+from iris_session.client.sockets import CurveKeys
+from iris_session.client.state_stream import SceneState
+
+__all__ = [
+    "Client",
+    "CurveKeys",
+    "Identity",
+    "PoseBuffer",
+    "SceneState",
+    "SessionMirror",
+    "Shown",
+    "poll_all",
+    "ClientError",
+    "DeniedError",
+    "IdentityError",
+    "NotConnectedError",
+    "RefusedError",
+    "RequestTimeoutError",
+    "VersionError",
+]

@@ -1,8 +1,8 @@
 """Estimate of session time from four-timestamp exchanges. Pure: the caller passes its own monotonic clock in.
 
 Each exchange gives an offset `((t1 - t0) + (t2 - t3)) / 2` whose error is at most half its round trip, whatever the
-path's asymmetry. The estimate is the median offset of the quickest quarter of a window. After the first exchange it is slewed and never
-stepped, so that session time read from it never runs backwards.
+path's asymmetry. The estimate is the median offset of the quickest quarter of a window. After the first exchange it is
+slewed and never stepped, so that session time read from it never runs backwards.
 """
 
 from __future__ import annotations

@@ -29,7 +29,8 @@ class RefusedError(ClientError):
     """The session refused `hello`. `code` is a `RefusalCode` or a `DenialReason`."""
 
     def __init__(self, refused: Refused) -> None:
-        super().__init__(f"refused ({refused.code}): {refused.message}" + (f" {refused.advice}" * bool(refused.advice)))
+        advice = f" {refused.advice}" if refused.advice else ""
+        super().__init__(f"refused ({refused.code}): {refused.message}{advice}")
         self.code = refused.code
         self.message = refused.message
         self.advice = refused.advice
@@ -48,7 +49,8 @@ class DeniedError(ClientError):
 
     def __init__(self, denial: Denial) -> None:
         who = f" (holder: {denial.holder_name or denial.holder})" if denial.holder else ""
-        super().__init__(f"denied ({denial.reason}): {denial.message}{who}" + (f" {denial.advice}" * bool(denial.advice)))
+        advice = f" {denial.advice}" if denial.advice else ""
+        super().__init__(f"denied ({denial.reason}): {denial.message}{who}{advice}")
         self.denial = denial
 
 

@@ -31,6 +31,8 @@ from iris_session.protocol.server_messages import (
 )
 
 MAX_HELD_EVENTS: Final = 256  # kept while a snapshot is on its way; more than that and the next snapshot covers them
+#: Causes of `SceneChanged` that leave robots and bodies as they are; after any other a new snapshot tells them.
+SAME_BODIES: Final = frozenset({"reset", "patch", "external"})
 _encoder = msgspec.msgpack.Encoder(order="deterministic")
 
 
@@ -151,9 +153,10 @@ class SessionMirror:
                 info_or_none = self.participants.get(name)
                 if info_or_none is not None:
                     self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
-            case SceneChanged(scene_epoch=epoch, scene_revision=revision):
+            case SceneChanged(scene_epoch=epoch, scene_revision=revision, cause=cause):
                 self.scene_epoch = epoch
                 self.scene_revision = revision
+                self.synced = cause in SAME_BODIES
             case EStopChanged(active=active):
                 self.estop = active
             case PauseChanged(paused=paused):

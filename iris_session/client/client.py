@@ -1,0 +1,380 @@
+"""The client: the thin shell of `Connection` with sockets and a clock, and the calls people use.
+
+It has no thread of its own: `poll` drives everything, and every waiting call polls. `start` is for those who want a
+thread: from then on only that thread touches the sockets, and callbacks run in it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Self
+
+import zmq
+
+from anchors.pose import PoseTuple
+from iris_session.client.connection import Connection
+from iris_session.client.errors import ClientError, DeniedError, NotConnectedError, RequestTimeoutError
+from iris_session.client.identity import Identity
+from iris_session.client.requests import Requests
+from iris_session.client.scene_view import SceneView
+from iris_session.client.sockets import ClientSockets, CurveKeys, parse_address
+from iris_session.client.state_stream import SceneState
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import ClientMessage, Hello, Sample
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.names import AlignmentKind, Role, SampleKind
+from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault, Reply
+
+#: Roles that have no headset, so nothing to align.
+UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER})
+DEFAULT_TIMEOUT_S = 5.0
+
+
+class Client(SceneView, Requests):
+    """A participant of a session.
+
+    `address`: `HOST:PORT` of the control channel. `devices`: tracked sources of input that samples will name.
+    `alignment`: `measured` or `not_needed` (default: by role). `identity`: an `Identity`, a file that keeps one across
+    restarts, or `None` for this process only. `curve`: needed for every address but loopback.
+    `on_state(state)`, `on_event(event)`, `on_feedback(feedback)`: called from `poll` (or the thread of `start`).
+
+        with Client("127.0.0.1:7721", role="agent", name="policy", devices=("target",)) as client:
+            client.acquire(["left"])
+            client.send_sample("target", pose, robots=["left"], clutch=True)
+    """
+
+    def __init__(
+        self,
+        address: str = "127.0.0.1:7721",
+        *,
+        role: str = Role.OPERATOR,
+        name: str = "",
+        devices: Sequence[str] = (),
+        capabilities: Sequence[str] = (),
+        alignment: str | None = None,
+        identity: Identity | str | os.PathLike[str] | None = None,
+        curve: CurveKeys | None = None,
+        join_code: str = "",
+        software: str = "iris-session",
+        on_state: Callable[[SceneState], None] | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        on_feedback: Callable[[Feedback], None] | None = None,
+    ) -> None:
+        self.address = address
+        host, port = parse_address(address)
+        if alignment is None:
+            alignment = AlignmentKind.NOT_NEEDED if role in UNALIGNED_ROLES else AlignmentKind.MEASURED
+        if identity is None:
+            identity = Identity.in_memory()
+        elif not isinstance(identity, Identity):
+            identity = Identity.from_file(os.fspath(identity))
+        hello = Hello(
+            role=role,
+            name=name or role,
+            software=software,
+            devices=tuple(devices),
+            capabilities=tuple(capabilities),
+            alignment=alignment,
+            join_code=join_code,
+        )
+        self.connection = Connection(hello, identity)
+        self.on_state = on_state
+        self.on_event = on_event
+        self.on_feedback = on_feedback
+        self.tracking_epoch = 0
+        self.feedback: dict[str, Feedback] = {}
+        self._state: SceneState | None = None
+        self._seq: dict[str, int] = {}
+        self._generation = 0
+        self._sockets = ClientSockets(host, port, curve)
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._crash: BaseException | None = None
+
+    # --- life ---------------------------------------------------------------------------------------------------------
+
+    def connect(self, timeout_s: float = DEFAULT_TIMEOUT_S) -> Self:
+        """Joins the session and waits for snapshot and clock.
+
+        Raises `RefusedError` (or `VersionError`) when the session says no, `NotConnectedError` when nobody answers.
+        """
+        with self._lock:
+            if self.connection.phase is Phase.CLOSED:
+                raise NotConnectedError(self.connection.describe())
+            if self.connection.phase in (Phase.IDLE, Phase.REFUSED):
+                self.connection.open(time.monotonic_ns())
+        if not self.wait_for(lambda client: client.ready, timeout_s):
+            raise NotConnectedError(
+                f"no session let us in at {self.address} within {timeout_s:g} s: is `iris-session serve` running there?"
+            )
+        return self
+
+    def close(self) -> None:
+        """Leaves at once: leases are released without grace. Stops the thread of `start`."""
+        with self._lock:
+            self._stopping = True
+            thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            self._sockets.wake()
+            thread.join()
+        with self._lock:
+            if self.connection.phase is not Phase.CLOSED:
+                self.connection.close()
+                self._flush()
+                self._sockets.close()
+            self._changed.notify_all()
+
+    def __enter__(self) -> Self:
+        return self if self.ready else self.connect()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self) -> Self:
+        """Starts the only thread there is: it polls until `close`. `poll` must not be called from then on."""
+        with self._lock:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=f"iris-client-{self.name}", daemon=True)
+                self._thread.start()
+        return self
+
+    # --- driving ------------------------------------------------------------------------------------------------------
+
+    def poll(self, timeout_s: float = 0.0) -> bool:
+        """Receives, answers, keeps the connection alive. Waits up to `timeout_s` for something to come.
+
+        True when anything came. Raises `RefusedError` after the session refused us for good.
+        """
+        if self._thread is not None and threading.current_thread() is not self._thread:
+            raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
+        deadline = time.monotonic_ns() + int(timeout_s * 1e9)
+        while True:
+            progressed = self._pump()
+            now = time.monotonic_ns()
+            if progressed or now >= deadline:
+                break
+            self._wait(min(deadline, self.connection.next_deadline_ns(now)) - now)
+        if self.connection.failure is not None:
+            raise self.connection.failure
+        return progressed
+
+    def wait_for(self, condition: Callable[[Self], bool], timeout_s: float = DEFAULT_TIMEOUT_S) -> bool:
+        """Polls (or waits for the thread) until `condition(client)` is true; false after `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while not condition(self):
+            remaining = deadline - time.monotonic()
+            if remaining <= 0.0:
+                return False
+            if self._thread is None or threading.current_thread() is self._thread:
+                self.poll(remaining)
+                continue
+            with self._changed:
+                if self._crash is not None:
+                    raise self._crash
+                if self.connection.failure is not None:
+                    raise self.connection.failure
+                self._changed.wait(min(remaining, 0.1))
+        return True
+
+    @property
+    def ready(self) -> bool:
+        """Joined, with snapshot and clock. False while reconnecting."""
+        return self.connection.phase is Phase.READY
+
+    @property
+    def name(self) -> str:
+        return self.connection.hello.name
+
+    @property
+    def worn(self) -> bool:
+        """Whether somebody wears the headset. Set it; heartbeats and samples tell it."""
+        return self.connection.worn
+
+    @worn.setter
+    def worn(self, worn: bool) -> None:
+        self.connection.worn = worn
+
+    # --- sending ------------------------------------------------------------------------------------------------------
+
+    def send(self, message: ClientMessage) -> bool:
+        """Sends any message. Samples without a connection are dropped and counted (false); others then raise."""
+        with self._lock:
+            queued = self.connection.send(message)
+            self._send_soon()
+            return queued
+
+    def send_sample(
+        self,
+        device: str,
+        pose: PoseTuple | None = None,
+        *,
+        robots: Iterable[str] = (),
+        objects: Iterable[str] = (),
+        kind: str = SampleKind.POSE,
+        capture_ns: int | None = None,
+        tracking_epoch: int | None = None,
+        **fields: Any,
+    ) -> bool:
+        """Sends one sample of `device`; epochs, versions, tokens and `seq` are filled in.
+
+        `pose`: `T_tracking_device`. `robots`, `objects`: what it drives; those that are not ours are left out, so the
+        sample is mere presence when none is. `capture_ns`: session time of capture, default now. `fields`: the other
+        fields of `Sample` (`clutch`, `gripper`, `q`, `twist`, ...).
+        """
+        with self._lock:
+            targets = [*self._targets(robots, "robot"), *self._targets(objects, "object")]
+            seq = self._seq[device] = self._seq.get(device, 0) + 1
+            alignment = self.alignment
+            sample = Sample(
+                device=device,
+                kind=kind,
+                seq=seq,
+                capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
+                scene_epoch=self.connection.mirror.scene_epoch,
+                tracking_epoch=self.tracking_epoch if tracking_epoch is None else tracking_epoch,
+                alignment_version=0 if alignment is None else alignment.version,
+                targets=tuple(targets),
+                worn=fields.pop("worn", self.worn),
+                pose=None if pose is None else Pose(*pose),
+                **fields,
+            )
+            return self.send(sample)
+
+    def request(self, message: Any, timeout_s: float = DEFAULT_TIMEOUT_S) -> Reply:
+        """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
+
+        Raises `DeniedError`, `RequestTimeoutError`, or `NotConnectedError` when the connection is lost meanwhile.
+        """
+        with self._lock:
+            request_id = self.connection.request(message)
+            generation = self.connection.generation
+            self._send_soon()
+        replies: list[Reply] = []
+
+        def answered(client: Client) -> bool:
+            with client._lock:
+                reply = client.connection.take_reply(request_id)
+                if reply is not None:
+                    replies.append(reply)
+                return reply is not None or client.connection.generation != generation or not client.connection.joined
+
+        self.wait_for(answered, timeout_s)
+        with self._lock:
+            self.connection.forget(request_id)
+        kind = type(message).__name__
+        if not replies:
+            if self.connection.generation != generation or not self.connection.joined:
+                raise NotConnectedError(f"connection lost while waiting for the answer to {kind}")
+            raise RequestTimeoutError(f"no answer to {kind} within {timeout_s:g} s")
+        if replies[0].denial is not None:
+            raise DeniedError(replies[0].denial)
+        return replies[0]
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _targets(self, names: Iterable[str], kind: str) -> list[Target]:
+        tokens = ((name, self.connection.lease_version(name)) for name in names)
+        return [Target(name, token, kind) for name, token in tokens if token is not None]
+
+    def _send_soon(self) -> None:
+        if self._thread is None or threading.current_thread() is self._thread:
+            self._flush()
+        else:
+            self._sockets.wake()
+
+    def _pump(self) -> bool:
+        """One round without waiting: state first, then control, timers, sending, callbacks."""
+        with self._lock:
+            if self.connection.phase is Phase.CLOSED:
+                raise NotConnectedError(self.connection.describe())
+            now = time.monotonic_ns()
+            state, progressed = self._drain_state()
+            if self._sockets.disconnected() and self._generation == self.connection.generation:
+                self.connection.lost(now)
+            progressed |= self._drain_control(now)
+            self.connection.tick(now)
+            self._flush()
+            inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
+            for message in inbox:
+                if isinstance(message, Feedback):
+                    self.feedback[message.robot] = message
+        if state is not None and self.on_state is not None:
+            self.on_state(state)
+        for message in inbox:
+            self._call_back(message)
+        return progressed
+
+    def _drain_state(self) -> tuple[SceneState | None, bool]:
+        messages = self._sockets.drain_state()
+        state = self.connection.stream.drain(messages, self.session_now_ns())
+        if state is not None:
+            self._state = state
+        return state, bool(messages)
+
+    def _drain_control(self, now_ns: int) -> bool:
+        messages = self._sockets.drain_control()
+        for frames in messages:
+            self.connection.receive(frames, now_ns)
+        if self.connection.joined and self.connection.welcome is not None:
+            self._sockets.open_state(self.connection.welcome.endpoints.state)
+        return bool(messages)
+
+    def _flush(self) -> None:
+        if self._generation != self.connection.generation:
+            self._sockets.open_control()
+            self._generation = self.connection.generation
+        while (item := self.connection.peek_outgoing()) is not None:
+            droppable, data = item
+            sent = self._sockets.send_control(data)
+            if not sent and not droppable:
+                return
+            self.connection.pop_outgoing(sent=sent)
+
+    def _call_back(self, message: Event | Feedback | ProtocolFault) -> None:
+        if isinstance(message, Event) and self.on_event is not None:
+            self.on_event(message)
+        elif isinstance(message, Feedback) and self.on_feedback is not None:
+            self.on_feedback(message)
+
+    def _wait(self, timeout_ns: int) -> None:
+        poller = zmq.Poller()
+        self._sockets.register(poller)
+        poller.poll(_milliseconds(timeout_ns))
+        self._sockets.clear_wake()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                self.poll(0.1)
+                with self._changed:
+                    self._changed.notify_all()
+        except BaseException as error:  # whatever ends the thread is raised where somebody waits
+            with self._changed:
+                self._crash = error
+                self._changed.notify_all()
+
+
+def poll_all(clients: Sequence[Client], timeout_s: float) -> None:
+    """Polls several clients that have no thread: waits until one has something to do, at most `timeout_s`."""
+    now = time.monotonic_ns()
+    deadline = now + int(timeout_s * 1e9)
+    poller = zmq.Poller()
+    progressed = False
+    for client in clients:
+        progressed |= client.poll(0.0)
+        deadline = min(deadline, client.connection.next_deadline_ns(now))
+        client._sockets.register(poller)
+    if not progressed and deadline > (now := time.monotonic_ns()):
+        poller.poll(_milliseconds(deadline - now))
+        for client in clients:
+            client.poll(0.0)
+
+
+def _milliseconds(nanoseconds: int) -> int:
+    """Rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
+    return max(0, -(-nanoseconds // 1_000_000))

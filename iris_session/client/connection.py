@@ -1,0 +1,384 @@
+"""Sans-I/O core of the client: bytes and times in, bytes out. It owns no socket, clock or thread.
+
+    IDLE --open()--> JOINING --Welcome--> SYNCING --snapshot and clock--> READY
+    JOINING, SYNCING, READY --silence, lost(), session_ended--> WAITING --back-off--> JOINING
+    JOINING --Refused--> REFUSED (`failure` says why)          any --close()--> CLOSED
+
+The shell opens a fresh control socket whenever `generation` changes, passes received frames to `receive`, calls `tick`
+at the latest at `next_deadline_ns`, and sends what `peek_outgoing` shows. All `now_ns` are one monotonic clock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from iris_session.client.clock import ClockSync
+from iris_session.client.errors import NotConnectedError, RefusedError, VersionError
+from iris_session.client.identity import Identity
+from iris_session.client.session_state import SessionMirror
+from iris_session.client.state_stream import Poses, StateStream
+from iris_session.client.status import ConnectionCounters, Phase
+from iris_session.protocol.client_messages import (
+    Bye,
+    ClientMessage,
+    ClockPing,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Release,
+    Sample,
+    envelope,
+)
+from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.common import Lease
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.names import DenialReason, RefusalCode
+from iris_session.protocol.server_messages import (
+    ClockPong,
+    Event,
+    Feedback,
+    ParticipantLeft,
+    ProtocolFault,
+    Refused,
+    Reply,
+    Snapshot,
+    Welcome,
+)
+
+HELLO_TIMEOUT_NS: Final = 1_000_000_000
+BACKOFF_MIN_NS: Final = 100_000_000
+BACKOFF_MAX_NS: Final = 2_000_000_000
+SNAPSHOT_RETRY_NS: Final = 500_000_000
+SILENT_HEARTBEATS: Final = 3  # this many heartbeat periods without a word from the front: the connection is gone
+MAX_OUTGOING: Final = 256
+MAX_INBOX: Final = 1024
+MAX_PENDING: Final = 64
+
+#: Refusals that pass: somebody who was in before keeps trying.
+TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
+
+
+class Connection:
+    """One participant's connection, over any number of sockets."""
+
+    def __init__(self, hello: Hello, identity: Identity) -> None:
+        self.hello = hello
+        self.identity = identity
+        self.phase = Phase.IDLE
+        self.generation = 0
+        self.welcome: Welcome | None = None
+        self.failure: RefusedError | None = None
+        self.stalled = False
+        self.worn = True
+        self.mirror = SessionMirror()
+        self.clock = ClockSync()
+        self.stream = StateStream()
+        self.counters = ConnectionCounters()
+        self.inbox: deque[Event | Feedback | ProtocolFault] = deque()
+        self._outgoing: deque[tuple[bool, bytes]] = deque()
+        self._pending: set[int] = set()
+        self._replies: dict[int, Reply] = {}
+        self._granted: dict[str, Lease] = {}
+        self._next_request = 1
+        self._backoff_ns = BACKOFF_MIN_NS
+        self._hello_at = 0
+        self._retry_at = 0
+        self._heard_at = 0
+        self._heartbeat_at = 0
+        self._snapshot_at = 0
+
+    # --- life ---------------------------------------------------------------------------------------------------------
+
+    def open(self, now_ns: int) -> None:
+        """Starts joining, also after a refusal."""
+        self.failure = None
+        self._backoff_ns = BACKOFF_MIN_NS
+        self._say_hello(now_ns)
+
+    def close(self) -> None:
+        """Says bye; leases are released at once. What `peek_outgoing` still shows should be sent."""
+        if self.welcome is not None:
+            self._queue(Bye())
+            self.identity.resume_token = b""
+        self.phase = Phase.CLOSED
+
+    def lost(self, now_ns: int) -> None:
+        """The socket lost its peer, or the session fell silent: join again, soon."""
+        if self.phase in (Phase.SYNCING, Phase.READY):
+            self.counters.reconnects += 1
+            self._backoff_ns = BACKOFF_MIN_NS
+            self._wait(now_ns)
+
+    @property
+    def joined(self) -> bool:
+        """The session accepted us, and the connection stands as far as we know."""
+        return self.phase in (Phase.SYNCING, Phase.READY)
+
+    @property
+    def participant_id(self) -> str:
+        return "" if self.welcome is None else self.welcome.participant_id
+
+    @property
+    def connection_epoch(self) -> int:
+        return 0 if self.welcome is None else self.welcome.connection_epoch
+
+    def tick(self, now_ns: int) -> None:
+        """Everything that depends on time: hello, back-off, clock, heartbeat, snapshot, silence."""
+        if self.phase is Phase.WAITING and now_ns >= self._retry_at:
+            self._say_hello(now_ns)
+        elif self.phase is Phase.JOINING and now_ns >= self._hello_at + HELLO_TIMEOUT_NS:
+            self._wait(now_ns)
+        elif self.joined:
+            self._keep_up(now_ns)
+
+    def next_deadline_ns(self, now_ns: int) -> int:
+        """When `tick` must be called at the latest."""
+        if self.phase is Phase.WAITING:
+            return self._retry_at
+        if self.phase is Phase.JOINING:
+            return self._hello_at + HELLO_TIMEOUT_NS
+        if self.joined:
+            due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)
+            return due if not self._snapshot_wanted else min(due, self._snapshot_at)
+        return now_ns + 1_000_000_000
+
+    # --- sending ------------------------------------------------------------------------------------------------------
+
+    def send(self, message: ClientMessage) -> bool:
+        """Queues a message. Samples are never kept: false (and counted) when there is no connection."""
+        if not self.joined:
+            if isinstance(message, Sample):
+                self.counters.samples_not_sent += 1
+                return False
+            raise NotConnectedError(self.describe())
+        return self._queue(message)
+
+    def request(self, message: Any) -> int:
+        """Queues a request under a fresh `request_id`, which is returned."""
+        if not self.joined:
+            raise NotConnectedError(self.describe())
+        request_id = self._next_request
+        self._next_request += 1
+        if len(self._pending) >= MAX_PENDING:
+            self._pending.discard(min(self._pending))
+        self._pending.add(request_id)
+        self._queue(msgspec.structs.replace(message, request_id=request_id))
+        return request_id
+
+    def take_reply(self, request_id: int) -> Reply | None:
+        """The answer to a request, once."""
+        return self._replies.pop(request_id, None)
+
+    def forget(self, request_id: int) -> None:
+        """Nobody waits for this answer any more."""
+        self._pending.discard(request_id)
+        self._replies.pop(request_id, None)
+
+    def peek_outgoing(self) -> tuple[bool, bytes] | None:
+        """The next message to send: (may be dropped when the socket is full, bytes)."""
+        return self._outgoing[0] if self._outgoing else None
+
+    def pop_outgoing(self, *, sent: bool) -> None:
+        """The message of `peek_outgoing` is done with: sent, or dropped."""
+        self._outgoing.popleft()
+        if sent:
+            self.counters.sent += 1
+        else:
+            self.counters.samples_not_sent += 1
+
+    def lease_version(self, target: str) -> int | None:
+        """Our fencing token for `target`, by events or by a reply that came before its event."""
+        granted, known = self._granted.get(target), self.mirror.leases.get(target)
+        if granted is not None and (known is None or granted.lease_version > known.lease_version):
+            ours = granted.holder == self.participant_id or self.participant_id in granted.sub_holders
+            return granted.lease_version if ours else None
+        return self.mirror.lease_version(target, self.participant_id)
+
+    def describe(self) -> str:
+        """One line for people: why there is no connection now."""
+        match self.phase:
+            case Phase.IDLE:
+                return "not connected: call connect() first"
+            case Phase.CLOSED:
+                return "this client was closed"
+            case Phase.REFUSED:
+                return str(self.failure)
+            case Phase.WAITING | Phase.JOINING:
+                return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
+            case _:
+                return "connected"
+
+    # --- receiving ----------------------------------------------------------------------------------------------------
+
+    def receive(self, frames: Sequence[bytes], now_ns: int) -> None:
+        """One message of the control channel: `[envelope, *bulk]`. Anything that does not fit is counted."""
+        try:
+            wrapped = decode_server(frames[0])
+        except (ProtocolError, IndexError):
+            self.counters.malformed += 1
+            return
+        message = wrapped.message
+        self.counters.received += 1
+        self._heard_at = now_ns
+        if isinstance(message, Welcome):
+            self._welcomed(message, now_ns)
+        elif isinstance(message, Refused):
+            self._refused(message, now_ns)
+        elif isinstance(message, ProtocolFault):
+            self._fault(message, now_ns)
+        elif not self.joined or wrapped.connection_epoch != self.connection_epoch:
+            self.counters.other_connection += 1
+        elif isinstance(message, ClockPong):
+            self.clock.pong(message.t0_ns, message.t1_ns, message.t2_ns, now_ns)
+            self._maybe_ready()
+        elif isinstance(message, Reply):
+            self._reply(message)
+        elif isinstance(message, Event):
+            if self.mirror.apply_event(message):
+                self.stream.scene_epoch = self.mirror.scene_epoch
+                self._deliver(message)
+        elif isinstance(message, Snapshot):
+            self._snapshot(message, frames[1:])
+        else:
+            self._deliver(message)
+
+    def _welcomed(self, welcome: Welcome, now_ns: int) -> None:
+        if self.phase is not Phase.JOINING:
+            self.counters.other_connection += 1
+            return
+        if self.welcome is None or welcome.session_id != self.welcome.session_id:
+            self.mirror.reset()
+            self.clock.reset()
+        self.mirror.synced = False
+        self.stream.reset()
+        self.welcome = welcome
+        self.identity.resume_token = welcome.resume_token
+        self.phase = Phase.SYNCING
+        self._backoff_ns = BACKOFF_MIN_NS
+        self._heartbeat_at = now_ns + welcome.heartbeat_ns // 2
+        self._snapshot_at = now_ns
+        self._keep_up(now_ns)
+
+    def _refused(self, refused: Refused, now_ns: int) -> None:
+        if self.phase is not Phase.JOINING:
+            return
+        if refused.code == RefusalCode.RESUME_TOKEN and self.identity.resume_token:
+            self.identity.resume_token = b""  # used up or forgotten: join as somebody new
+            self._say_hello(now_ns)
+        elif refused.code in TRANSIENT and self.welcome is not None:
+            self._wait(now_ns)
+        else:
+            self.phase = Phase.REFUSED
+            self.failure = (VersionError if refused.code == RefusalCode.VERSION else RefusedError)(refused)
+
+    def _fault(self, fault: ProtocolFault, now_ns: int) -> None:
+        self.counters.faults[fault.code] = self.counters.faults.get(fault.code, 0) + 1
+        self._deliver(fault)
+        if fault.code in ("stalled", "recovered"):
+            self.stalled = fault.code == "stalled"
+        elif fault.code in ("session_ended", "not_joined", "dropped", "slow"):
+            self.lost(now_ns)
+
+    def _reply(self, reply: Reply) -> None:
+        self._granted.update((lease.target, lease) for lease in reply.leases)
+        if reply.request_id in self._pending:
+            self._pending.discard(reply.request_id)
+            self._replies[reply.request_id] = reply
+        elif reply.request_id:
+            self.counters.unexpected_replies += 1
+
+    def _snapshot(self, snapshot: Snapshot, bulk: Sequence[bytes]) -> None:
+        poses = _poses(bulk[0] if bulk else b"", len(snapshot.bodies))
+        if poses is None:
+            self.counters.malformed += 1
+            return
+        self.counters.snapshots += 1
+        for event in self.mirror.apply_snapshot(snapshot):
+            self._deliver(event)
+        self.stream.scene_epoch = self.mirror.scene_epoch
+        self.stream.load_keyframe(snapshot.state_seq, poses)
+        self._maybe_ready()
+
+    def _maybe_ready(self) -> None:
+        if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.synced:
+            self.phase = Phase.READY
+
+    def _deliver(self, message: Event | Feedback | ProtocolFault) -> None:
+        if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
+            self.stream.forget_presence(message.body.participant)
+        if len(self.inbox) >= MAX_INBOX:
+            self.inbox.popleft()
+            self.counters.inbox_dropped += 1
+        self.inbox.append(message)
+
+    # --- timers -------------------------------------------------------------------------------------------------------
+
+    @property
+    def _silence_ns(self) -> int:
+        return SILENT_HEARTBEATS * max(self.welcome.heartbeat_ns if self.welcome else 0, 500_000_000)
+
+    @property
+    def _snapshot_wanted(self) -> bool:
+        return not self.mirror.synced or self.stream.wants_snapshot
+
+    def _keep_up(self, now_ns: int) -> None:
+        assert self.welcome is not None
+        if now_ns - self._heard_at >= self._silence_ns:
+            self.lost(now_ns)
+            return
+        if self.clock.ping_due(now_ns):
+            self._queue(ClockPing(now_ns))
+        if now_ns >= self._heartbeat_at:
+            self._heartbeat_at = now_ns + self.welcome.heartbeat_ns // 2
+            self._queue(Heartbeat(self.worn))
+        if self._snapshot_wanted and now_ns >= self._snapshot_at:
+            self._snapshot_at = now_ns + SNAPSHOT_RETRY_NS
+            self._queue(GetSnapshot())
+
+    def _say_hello(self, now_ns: int) -> None:
+        """A fresh socket and a new hello: nothing meant for an earlier connection can reach the session."""
+        self.generation += 1
+        self.phase = Phase.JOINING
+        self.stalled = False
+        self._hello_at = now_ns
+        self._heard_at = now_ns
+        self._outgoing.clear()
+        self._granted.clear()
+        self._pending.clear()
+        self._replies.clear()
+        hello = msgspec.structs.replace(
+            self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
+        )
+        self._outgoing.append((False, encode_client(envelope(hello))))
+
+    def _wait(self, now_ns: int) -> None:
+        self.phase = Phase.WAITING
+        self._outgoing.clear()
+        self._retry_at = now_ns + self._backoff_ns
+        self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)
+
+    def _queue(self, message: ClientMessage) -> bool:
+        droppable = isinstance(message, Sample)
+        if len(self._outgoing) >= MAX_OUTGOING:
+            self.counters.samples_not_sent += droppable
+            self.counters.outgoing_dropped += not droppable
+            return False
+        item = (droppable, encode_client(envelope(message, self.connection_epoch)))
+        if isinstance(message, EStop | Release):
+            self._outgoing.appendleft(item)
+        else:
+            self._outgoing.append(item)
+        return True
+
+
+def _poses(data: bytes, n_bodies: int) -> Poses | None:
+    """Bulk frame of a snapshot as (n, 7) float64; `None` when it is not that."""
+    if len(data) != n_bodies * 7 * 8:
+        return None
+    return np.frombuffer(data, dtype="<f8").reshape(n_bodies, 7).astype(np.float64)

@@ -1,0 +1,92 @@
+"""What a client knows: mixin of `Client` that reads the mirror, the newest state, presence, clock and counters."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+from anchors.pose import PoseTuple, compose
+from iris_session.client.connection import Connection
+from iris_session.client.session_state import SessionMirror
+from iris_session.client.state_stream import Poses, SceneState
+from iris_session.protocol.common import Alignment
+from iris_session.protocol.server_messages import PresenceItem
+
+
+def pose_at(poses: Poses, index: int) -> PoseTuple:
+    """Row `index` of poses (n, 7) `x y z qw qx qy qz` as a pose."""
+    x, y, z, qw, qx, qy, qz = poses[index].tolist()
+    return ((x, y, z), (qw, qx, qy, qz))
+
+
+class SceneView:
+    """Everything is in the world frame. Nothing here waits or sends."""
+
+    connection: Connection
+    _state: SceneState | None
+
+    @property
+    def participant_id(self) -> str:
+        """Our id in this session, empty before the first welcome."""
+        return self.connection.participant_id
+
+    @property
+    def mirror(self) -> SessionMirror:
+        """The shared session state: `participants`, `leases`, `robots`, `bodies`, `paused`, `estop`, `event_seq`."""
+        return self.connection.mirror
+
+    @property
+    def state(self) -> SceneState | None:
+        """The newest scene: header, poses (n, 7) in the world, age where it was handed over."""
+        return self._state
+
+    @property
+    def presence(self) -> dict[tuple[str, str], PresenceItem]:
+        """Heads and hands of everyone by `(participant, device)`."""
+        return self.connection.stream.presence
+
+    @property
+    def alignment(self) -> Alignment | None:
+        """Our own `T_world_tracking` as accepted by the session, `None` before."""
+        return self.connection.mirror.alignment(self.participant_id)
+
+    def session_now_ns(self) -> int:
+        """Session time now [ns], by our estimate; its error is at most `clock_error_ns()`."""
+        return self.connection.clock.session_ns(time.monotonic_ns())
+
+    def clock_error_ns(self) -> int:
+        """Bound of the error of `session_now_ns()` [ns]."""
+        return self.connection.clock.error_bound_ns(time.monotonic_ns())
+
+    def body_pose(self, body: str) -> PoseTuple | None:
+        """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet."""
+        state, index = self._state, self.connection.mirror.body_index.get(body)
+        if state is None or index is None or index >= len(state.poses):
+            return None
+        return pose_at(state.poses, index)
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        """`T_world_site` of a robot's end effector in the newest scene."""
+        state, info = self._state, self.connection.mirror.robots.get(robot)
+        if state is None or info is None or info.site_body >= len(state.poses):
+            return None
+        return compose(pose_at(state.poses, info.site_body), (info.T_body_site.p, info.T_body_site.q))
+
+    def lease_version(self, target: str) -> int | None:
+        """Our fencing token for a robot or object, `None` when it is not ours."""
+        return self.connection.lease_version(target)
+
+    def counters(self) -> dict[str, Any]:
+        """Every count of something received, dropped, rejected or lost, by part."""
+        connection, mirror = self.connection, self.connection.mirror
+        return {
+            "control": dataclasses.asdict(connection.counters),
+            "state": dataclasses.asdict(connection.stream.counters),
+            "events": {
+                "gaps": mirror.gaps,
+                "discarded": mirror.discarded,
+                "held_overflow": mirror.held_overflow,
+            },
+            "clock": {"rejected": connection.clock.rejected, "rtt_ns": connection.clock.rtt_ns},
+        }

@@ -1,0 +1,174 @@
+"""ZeroMQ sockets of one client: control (DEALER), state (SUB), and what they need to be noticed. No protocol here."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from dataclasses import dataclass
+from typing import Any, Final
+
+import zmq
+
+from iris_session.client.errors import ClientError
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+
+DEFAULT_CONTROL_PORT: Final = 7721
+STATE_HWM: Final = 2
+#: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
+STATE_RCVBUF: Final = 16_384
+CONTROL_HWM: Final = 64
+MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
+MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
+LINGER_MS: Final = 200
+
+
+@dataclass(frozen=True, slots=True)
+class CurveKeys:
+    """CURVE keys, Z85 text (40 characters) as bytes: the server's public key, and our own pair."""
+
+    server_public: bytes
+    public: bytes
+    secret: bytes
+
+
+def parse_address(address: str) -> tuple[str, int]:
+    """`host`, `host:port`, `[ipv6]:port` or the same after `tcp://`, as `(host, port)`."""
+    text = address.removeprefix("tcp://").rstrip("/")
+    host, separator, port = text.rpartition(":")
+    if not separator or (text.count(":") > 1 and not text.startswith("[")) or text.endswith("]"):
+        host, port = text, str(DEFAULT_CONTROL_PORT)
+    if not host.strip("[]") or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ClientError(f"address {address!r} is not HOST:PORT, for example 127.0.0.1:{DEFAULT_CONTROL_PORT}")
+    return host.strip("[]"), int(port)
+
+
+class ClientSockets:
+    """Opens, drains and closes. All methods but `wake` belong to one thread."""
+
+    def __init__(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
+        self._host = f"[{host}]" if ":" in host else host
+        self._control_port = control_port
+        self._curve = curve
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self._control: zmq.Socket[bytes] | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
+        self._state: zmq.Socket[bytes] | None = None
+        self._state_port = 0
+        self._wake_out, self._wake_in = socket.socketpair()
+        self._wake_out.setblocking(False)
+        self._wake_in.setblocking(False)
+
+    def open_control(self) -> None:
+        """A fresh control socket; the old one goes at once with everything in it."""
+        self._close_control(linger_ms=0)
+        control = self._new_socket(zmq.DEALER)
+        control.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a peer that is not there
+        control.setsockopt(zmq.SNDHWM, CONTROL_HWM)
+        control.setsockopt(zmq.RCVHWM, 1024)  # events; a slow reader is disconnected by the front, never silently cut
+        control.setsockopt(zmq.RECONNECT_IVL, 50)
+        control.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+        self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        control.connect(f"tcp://{self._host}:{self._control_port}")
+        self._control = control
+
+    def open_state(self, port: int) -> None:
+        """Subscribes to the state channel. Does nothing when that port is connected already."""
+        if self._state is not None and self._state_port == port:
+            return
+        if self._state is not None:
+            self._state.close(linger=0)
+        state = self._new_socket(zmq.SUB)
+        state.setsockopt(zmq.RCVHWM, STATE_HWM)
+        state.setsockopt(zmq.RCVBUF, STATE_RCVBUF)
+        state.setsockopt(zmq.RECONNECT_IVL, 50)
+        state.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+        state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
+        state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
+        state.connect(f"tcp://{self._host}:{port}")
+        self._state, self._state_port = state, port
+
+    def send_control(self, data: bytes) -> bool:
+        """Sends without waiting. False: the socket cannot take it now."""
+        if self._control is None:
+            return False
+        try:
+            self._control.send(data, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def drain_control(self) -> list[list[bytes]]:
+        """What came on the control channel, in order, at most `MAX_DRAIN` messages."""
+        return _drain(self._control)
+
+    def drain_state(self) -> list[list[bytes]]:
+        """What came on the state channel, oldest first."""
+        return _drain(self._state)
+
+    def disconnected(self) -> bool:
+        """True once after the control socket lost its peer."""
+        lost = False
+        while self._monitor is not None:
+            try:
+                self._monitor.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            lost = True
+        return lost
+
+    def register(self, poller: zmq.Poller) -> None:
+        """Adds everything that can wake this client to `poller`."""
+        poller.register(self._wake_in, zmq.POLLIN)
+        for sock in (self._control, self._monitor, self._state):
+            if sock is not None:
+                poller.register(sock, zmq.POLLIN)
+
+    def wake(self) -> None:
+        """Ends a wait on these sockets, from any thread."""
+        with contextlib.suppress(BlockingIOError):  # full: it is awake already
+            self._wake_out.send(b"\0")
+
+    def clear_wake(self) -> None:
+        """Takes back what `wake` left."""
+        with contextlib.suppress(BlockingIOError):
+            while self._wake_in.recv(4096):
+                pass
+
+    def close(self) -> None:
+        """Closes everything; a last bye still has `LINGER_MS` to leave."""
+        self._close_control(linger_ms=LINGER_MS)
+        if self._state is not None:
+            self._state.close(linger=0)
+            self._state = None
+        self._wake_out.close()
+        self._wake_in.close()
+
+    def _close_control(self, linger_ms: int) -> None:
+        if self._control is None:
+            return
+        self._control.disable_monitor()
+        if self._monitor is not None:
+            self._monitor.close(linger=0)
+            self._monitor = None
+        self._control.close(linger=linger_ms)
+        self._control = None
+
+    def _new_socket(self, kind: int) -> zmq.Socket[bytes]:
+        sock: zmq.Socket[bytes] = self._context.socket(kind)
+        sock.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        sock.setsockopt(zmq.IPV6, int(self._host.startswith("[")))
+        if self._curve is not None:
+            sock.curve_serverkey = self._curve.server_public
+            sock.curve_publickey = self._curve.public
+            sock.curve_secretkey = self._curve.secret
+        return sock
+
+
+def _drain(sock: Any) -> list[list[bytes]]:
+    messages: list[list[bytes]] = []
+    while sock is not None and len(messages) < MAX_DRAIN:
+        try:
+            messages.append(sock.recv_multipart(zmq.NOBLOCK))
+        except zmq.Again:
+            break
+    return messages

@@ -1,0 +1,166 @@
+"""State channel of a client: frames in, the newest scene out. Pure: bytes and times are passed in.
+
+Bounded staleness: the caller drains its socket and passes everything that was there; only the newest rigid frame is
+decoded. After the client itself stood still, frames that waited in queues are thrown away until fresh ones come, so
+the first frame handed out is a fresh one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.codec import decode_presence, decode_state_header
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, PresenceItem, StateHeader
+from iris_session.streams.errors import StreamError
+from iris_session.streams.rigid import RigidDecoder
+
+Poses = NDArray[np.float64]
+
+STALLED_NS: Final = 50_000_000  # not drained for this long: what is queued may be old
+QUEUED_NS: Final = 60_000_000  # a frame published this long ago waited in a queue ...
+FLUSH_NS: Final = 150_000_000  # ... but after this long without a fresher one it is the newest there is (slow link)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneState:
+    """The newest decoded state.
+
+    `poses`: (n, 7) float64, world frame, `x y z qw qx qy qz`, in the order of `Snapshot.bodies`, read only.
+    `received_ns`: session time when it was handed to the application; `age_ns`: that minus the end of its tick.
+    """
+
+    header: StateHeader
+    poses: Poses
+    received_ns: int
+    age_ns: int
+
+
+@dataclass(slots=True)
+class StateCounters:
+    """Where state frames went. Every frame that came is either `delivered` or counted in exactly one other field."""
+
+    delivered: int = 0
+    superseded: int = 0  # a newer one was there in the same drain
+    queued_old: int = 0  # waited in a queue while this client stood still
+    out_of_order: int = 0
+    before_snapshot: int = 0
+    other_epoch: int = 0  # of a scene that events have not told of yet, or of the one before
+    undecodable: int = 0  # base frame missing: a snapshot was asked for
+    malformed: int = 0
+    unknown_topic: int = 0
+    bytes_received: int = 0
+    presence: int = 0
+
+
+class StateStream:
+    """Decodes the newest of each drain. `wants_snapshot` becomes true when the deltas have lost their base.
+
+    `scene_epoch`: the epoch that the application knows by events or snapshot; frames of another one are decoded, and
+    counted, but not handed out, because their bodies may be other ones.
+    """
+
+    def __init__(self) -> None:
+        self.counters = StateCounters()
+        self.presence: dict[tuple[str, str], PresenceItem] = {}
+        self.presence_ns = 0
+        self.scene_epoch = 0
+        self.wants_snapshot = False
+        self._decoder: RigidDecoder | None = None
+        self._drained_ns = -1
+        self._flush_until = 0
+
+    def reset(self) -> None:
+        """Another connection: frames may be numbered anew, nothing held is of use."""
+        self._decoder = None
+        self.presence = {}
+        self.presence_ns = 0
+        self.wants_snapshot = False
+
+    def load_keyframe(self, state_seq: int, poses: Poses) -> None:
+        """Takes the poses (n, 7) of a snapshot; poses that came in newer frames are kept."""
+        if self._decoder is None or self._decoder.n_bodies != len(poses):
+            self._decoder = RigidDecoder(len(poses))
+        self._decoder.load_keyframe(state_seq, poses)
+        self.wants_snapshot = False
+
+    def drain(self, messages: Sequence[Sequence[bytes]], now_ns: int) -> SceneState | None:
+        """Takes every message that was waiting, oldest first; returns the newest scene if there is one.
+
+        `now_ns`: session time now. Call it also when nothing waited, so that standing still is noticed.
+        """
+        if self._drained_ns >= 0 and now_ns - self._drained_ns > STALLED_NS:
+            self._flush_until = now_ns + FLUSH_NS
+        self._drained_ns = now_ns
+        newest: tuple[StateHeader, bytes] | None = None
+        for frames in messages:
+            self.counters.bytes_received += sum(map(len, frames))
+            if frames[0] == TOPIC_PRESENCE and len(frames) == 2:
+                self._take_presence(frames[1])
+            elif frames[0] == TOPIC_RIGID and len(frames) == 3:
+                try:
+                    header = decode_state_header(frames[1])
+                except ProtocolError:
+                    self.counters.malformed += 1
+                    continue
+                self.counters.superseded += newest is not None
+                newest = header, frames[2]
+            elif frames[0] in (TOPIC_RIGID, TOPIC_PRESENCE):
+                self.counters.malformed += 1
+            else:
+                self.counters.unknown_topic += 1
+        return None if newest is None else self._decode(*newest, now_ns)
+
+    def forget_presence(self, participant: str) -> None:
+        """This participant left: nothing of it is shown any more."""
+        for key in [key for key in self.presence if key[0] == participant]:
+            del self.presence[key]
+
+    def _decode(self, header: StateHeader, payload: bytes, now_ns: int) -> SceneState | None:
+        if now_ns < self._flush_until:
+            if now_ns - header.published_ns > QUEUED_NS:
+                self.counters.queued_old += 1
+                return None
+            self._flush_until = 0
+        decoder = self._decoder
+        if decoder is None:
+            self.counters.before_snapshot += 1
+            return None
+        if header.state_seq <= decoder.state_seq:
+            self.counters.out_of_order += 1
+            return None
+        try:
+            complete = decoder.apply(header.state_seq, header.base_seq, payload)
+        except StreamError:
+            self.counters.malformed += 1
+            self.wants_snapshot = True  # perhaps the bodies changed
+            return None
+        if header.scene_epoch != self.scene_epoch:
+            self.counters.other_epoch += 1
+            return None
+        if not complete:
+            self.counters.undecodable += 1
+            self.wants_snapshot = True
+            return None
+        self.counters.delivered += 1
+        poses = decoder.poses.copy()
+        poses.flags.writeable = False
+        return SceneState(header, poses, now_ns, now_ns - header.session_time)
+
+    def _take_presence(self, data: bytes) -> None:
+        try:
+            presence = decode_presence(data)
+        except ProtocolError:
+            self.counters.malformed += 1
+            return
+        if presence.session_time < self.presence_ns:
+            self.counters.out_of_order += 1
+            return
+        self.counters.presence += 1
+        self.presence_ns = presence.session_time
+        self.presence.update(((item.participant, item.device), item) for item in presence.items)

@@ -1,0 +1,35 @@
+"""Where a connection stands, and what happened on it."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+
+class Phase(enum.Enum):
+    """Where the connection stands, see `connection`."""
+
+    IDLE = "idle"
+    JOINING = "joining"
+    SYNCING = "syncing"
+    READY = "ready"
+    WAITING = "waiting"
+    REFUSED = "refused"
+    CLOSED = "closed"
+
+
+@dataclass(slots=True)
+class ConnectionCounters:
+    """What happened on the control channel, since the client was made."""
+
+    sent: int = 0
+    received: int = 0
+    samples_not_sent: int = 0  # no connection, or the socket was full: late samples are worthless, they are not kept
+    outgoing_dropped: int = 0  # the bounded queue of control messages was full
+    malformed: int = 0  # frames that do not fit the protocol
+    other_connection: int = 0  # addressed to an earlier connection of ours
+    unexpected_replies: int = 0
+    inbox_dropped: int = 0  # events and feedback that the application did not fetch
+    snapshots: int = 0
+    reconnects: int = 0
+    faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`
