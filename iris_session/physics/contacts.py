@@ -1,0 +1,133 @@
+"""Who touches what: contact arrays of MuJoCo to `ObjectContact`s and gripper forces, vectorised.
+
+Lookup tables are made once per model. A contact counts when its distance is within `includemargin`, the condition
+under which MuJoCo makes a constraint of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.physics.names import body_names, element_id, element_name
+from iris_session.physics.tree import Tree
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import ObjectContact
+
+_NONE = -1
+_PYRAMIDAL = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+
+
+class ContactTables:
+    """Geom -> object, body -> robot and finger, for one model. Geom index -1 (a flex) hits the last table row."""
+
+    def __init__(
+        self, model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec], tree: Tree
+    ) -> None:
+        names = body_names(model)
+        id_of = {name: index for index, name in enumerate(names)}
+        body_object = [_NONE] * model.nbody
+        for index, spec in enumerate(objects):
+            for body in tree.subtree(element_id(model, "body", spec.body, f"object {spec.name!r}: ")):
+                body_object[body] = index
+        #: Robot index of each body; of nested robots the deeper one.
+        self.body_robot = [_NONE] * model.nbody
+        #: Rigid finger of each body: the id of the body it is welded to, -1 for what is no finger.
+        self.body_finger = [_NONE] * model.nbody
+        bases = [element_id(model, "body", spec.base_body, f"robot {spec.name!r}: ") for spec in robots]
+        for index in sorted(range(len(robots)), key=lambda i: len(tree.ancestors(bases[i]))):
+            for body in tree.subtree(bases[index]):
+                self.body_robot[body] = index
+        self._fingers_of: list[int] = []
+        geom_finger_robot = np.full(model.ngeom + 1, _NONE, np.int64)
+        for index, spec in enumerate(robots):
+            fingers = [id_of[n] for n in spec.finger_bodies if n in id_of]
+            for body in fingers:
+                self.body_finger[body] = tree.weld[body]
+                first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+                geom_finger_robot[first : first + count if count else first] = index
+            self._fingers_of.append(len({tree.weld[b] for b in fingers}))
+        self._geom_finger_robot = geom_finger_robot
+        geom_body: NDArray[np.int64] = np.append(model.geom_bodyid, 0).astype(np.int64)
+        self._geom_object: NDArray[np.int64] = np.append(np.array(body_object, np.int64)[geom_body[:-1]], _NONE)
+        self._geom_partner = geom_body
+        self._n_partners = model.nbody + model.nflex
+        self._flex_first = model.nbody if model.nflex else 0
+        flex_names = [element_name(model, "flex", f) or f"flex_{f}" for f in range(model.nflex)]
+        self._partner_names = (*names, *flex_names)
+        self._robot_names = tuple(spec.name for spec in robots)
+        self._object_names = tuple(spec.name for spec in objects)
+        self.has_fingers = bool((geom_finger_robot >= 0).any())
+
+    def object_contacts(self, data: Any) -> tuple[ObjectContact, ...]:
+        """Objects that touch anything, in the order of the objects; names within in the order of ids."""
+        if not data.ncon or not self._object_names:
+            return ()
+        contact = data.contact
+        geom = contact.geom
+        objects = self._geom_object[geom]
+        partners = self._geom_partner[geom]
+        if self._flex_first:
+            partners = np.where(geom < 0, self._flex_first + contact.flex, partners)
+        active = contact.dist < contact.includemargin
+        keys = np.where(objects >= 0, objects * self._n_partners + partners[:, ::-1], _NONE)[active]
+        found: list[ObjectContact] = []
+        pairs = sorted(set(keys.ravel().tolist()) - {_NONE})
+        start = 0
+        while start < len(pairs):
+            index = pairs[start] // self._n_partners
+            end = start
+            while end < len(pairs) and pairs[end] // self._n_partners == index:
+                end += 1
+            found.append(self._one_object(index, [p - index * self._n_partners for p in pairs[start:end]]))
+            start = end
+        return tuple(found)
+
+    def _one_object(self, index: int, partners: list[int]) -> ObjectContact:
+        touching: dict[int, set[int]] = {}
+        others: list[str] = []
+        for partner in partners:
+            robot = self.body_robot[partner] if partner < len(self.body_robot) else _NONE
+            if robot == _NONE:
+                if self._partner_names[partner] != self._object_names[index]:
+                    others.append(self._partner_names[partner])
+                continue
+            touching.setdefault(robot, set()).add(self.body_finger[partner])
+        robots = sorted(touching)
+        grippers = tuple(self._robot_names[r] for r in robots if self._holds(r, touching[r]))
+        return ObjectContact(
+            self._object_names[index], grippers, tuple(self._robot_names[r] for r in robots), tuple(others)
+        )
+
+    def _holds(self, robot: int, fingers: set[int]) -> bool:
+        touched = len(fingers - {_NONE})
+        return touched >= 2 or (touched == 1 and self._fingers_of[robot] == 1)
+
+    def gripper_forces(self, model: mujoco.MjModel, data: Any) -> tuple[float, ...]:
+        """Per robot: sum of the normal contact forces on its finger bodies [N], from solved constraints.
+
+        Only valid between `mj_step2` (or `mj_forward`) and the next `mj_step1`. A contact between two fingers of one
+        robot counts once.
+        """
+        forces = [0.0] * len(self._robot_names)
+        if not data.ncon or not self.has_fingers:
+            return tuple(forces)
+        contact = data.contact
+        robots = self._geom_finger_robot[contact.geom]
+        address = contact.efc_address
+        rows = np.nonzero((robots.max(axis=1) >= 0) & (address >= 0))[0]
+        if not len(rows):
+            return tuple(forces)
+        efc_force = data.efc_force
+        pyramidal = int(model.opt.cone) == _PYRAMIDAL
+        for (a, b), adr, dim in zip(robots[rows].tolist(), address[rows].tolist(), contact.dim[rows].tolist()):
+            # A pyramidal contact has 2 (dim - 1) edge forces whose sum is the normal force.
+            width = 2 * (dim - 1) if pyramidal and dim > 1 else 1
+            normal = float(efc_force[adr]) if width == 1 else float(sum(efc_force[adr : adr + width].tolist()))
+            for robot in {a, b} - {_NONE}:
+                forces[robot] += normal
+        return tuple(forces)

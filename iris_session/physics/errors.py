@@ -1,0 +1,80 @@
+"""Errors of the physics room: one line each, saying what is wrong and what would have been right.
+
+PhysicsError
+├── ModelNotFoundError        the file does not exist or has an unknown suffix
+├── ModelInvalidError         MuJoCo refuses the file or the bytes
+├── ModelUnsupportedError     MuJoCo runs the model, but not so that it can be replayed bit for bit
+├── UnknownNameError          a joint, actuator, site, body or keyframe that the model does not have
+├── RobotsFileError           a mistake in a robots TOML
+├── AmbiguousModelError       robots cannot be found without help; `.toml` is a ready-to-edit description
+├── SnapshotError             bytes that are no snapshot, or one of another model
+├── NotOwnerError             the world belongs to the user's loop (or to ours), and the other one called
+└── SimulationDivergedError   the state became NaN, infinite or huge
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class PhysicsError(Exception):
+    """Base of every error of this room."""
+
+
+class ModelNotFoundError(PhysicsError):
+    """The model file does not exist, or is not one that MuJoCo loads."""
+
+
+class ModelInvalidError(PhysicsError):
+    """MuJoCo refuses the model; the text is MuJoCo's message on one line."""
+
+
+class ModelUnsupportedError(PhysicsError):
+    """The model uses a feature whose state MuJoCo cannot save and restore exactly."""
+
+
+class UnknownNameError(PhysicsError):
+    """A name that the model does not have. `available`: the names that would have been right."""
+
+    def __init__(self, kind: str, name: str, available: Iterable[str], where: str = "") -> None:
+        self.kind = kind
+        self.name = name
+        self.available = tuple(available)
+        listed = ", ".join(self.available) or "none"
+        super().__init__(f"{where}{kind} {name!r} does not exist in the model. Available {kind}s: {listed}.")
+
+
+class RobotsFileError(PhysicsError):
+    """A robots TOML that cannot be used: syntax, unknown key, wrong type, joint of two robots."""
+
+
+class AmbiguousModelError(PhysicsError):
+    """What `find_robots` cannot decide. The text is one line; `toml` describes what was found, to be completed."""
+
+    def __init__(self, message: str, toml: str) -> None:
+        super().__init__(f"{one_line(message)}. Complete the robots file below and pass it with the model.")
+        self.toml = toml
+
+
+class SnapshotError(PhysicsError):
+    """Bytes that are no snapshot of this world."""
+
+
+class NotOwnerError(PhysicsError):
+    """`tick`, `reset` and `restore` are for our own loop, `after_user_step` is for a user's loop."""
+
+
+class SimulationDivergedError(PhysicsError):
+    """The simulation produced NaN, infinite or huge numbers; the world must be reset or restored.
+
+    `tick`: the tick that diverged. MuJoCo may already have put the default state in place of the broken one.
+    """
+
+    def __init__(self, tick: int, sim_time: float, what: str) -> None:
+        self.tick = tick
+        super().__init__(f"the simulation diverged at tick {tick} ({sim_time:.4f} s): {what}")
+
+
+def one_line(text: object) -> str:
+    """MuJoCo's messages and other texts on one line."""
+    return " ".join(str(text).split())

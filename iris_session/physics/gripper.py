@@ -1,0 +1,126 @@
+"""Grippers: which actuator moves the fingers of an arm, and which of its ctrl values is open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.physics.names import element_name
+from iris_session.physics.tree import Tree
+
+#: Fingers without a joint range are tried this far from their reference [m or rad].
+_TRIAL = 0.02
+#: Smallest change of the aperture between the two ends that decides which one is open [m].
+_MIN_CHANGE = 1e-4
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """Ids in the model. `open` and `closed` are ctrl values; None when they could not be told apart."""
+
+    actuators: tuple[int, ...]
+    finger_bodies: tuple[int, ...]
+    range: tuple[float, float] | None
+    open: float | None
+    closed: float | None
+
+
+def find_gripper(tree: Tree, palm: int, finger_roots: list[int], site: int | None) -> Gripper | None:
+    """The gripper on the link `palm`; `finger_roots` are the moving bodies right below it. None when nothing drives it.
+
+    An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm.
+    """
+    bodies = [b for root in finger_roots for b in tree.subtree(root)]
+    below = set(bodies)
+    actuators = tuple(
+        a for a, driven in enumerate(tree.driven) if driven and all(tree.joint_body[j] in below for j in driven)
+    )
+    if not actuators:
+        return None
+    with_geoms = tuple(b for b in bodies if int(tree.model.body_geomnum[b]))
+    ctrl_range = _ctrl_range(tree, actuators[0])
+    larger_opens = _larger_ctrl_opens(tree, actuators[0], palm, finger_roots, site)
+    if len(actuators) > 1 or ctrl_range is None or larger_opens is None:
+        return Gripper(actuators, with_geoms, ctrl_range, None, None)
+    low, high = ctrl_range
+    return Gripper(actuators, with_geoms, ctrl_range, *((high, low) if larger_opens else (low, high)))
+
+
+def _ctrl_range(tree: Tree, actuator: int) -> tuple[float, float] | None:
+    model = tree.model
+    if int(model.actuator_ctrllimited[actuator]):
+        low, high = model.actuator_ctrlrange[actuator].tolist()
+        return low, high
+    driven = tree.driven[actuator]
+    if len(driven) == 1:
+        ((joint, gear),) = driven.items()
+        position = float(model.actuator_gainprm[actuator, 0]) == -float(model.actuator_biasprm[actuator, 1])
+        if position and gear == 1.0 and int(model.jnt_limited[joint]):
+            low, high = model.jnt_range[joint].tolist()
+            return low, high
+    return None
+
+
+def _directions(tree: Tree, actuator: int) -> dict[int, float]:
+    """How each finger joint moves when ctrl grows: driven joints, and those coupled to them by equalities."""
+    sign = 1.0 if float(tree.model.actuator_gainprm[actuator, 0]) >= 0.0 else -1.0
+    moves = {joint: sign * ratio for joint, ratio in tree.driven[actuator].items() if ratio}
+    for _ in tree.couplings:  # a chain of n couplings is complete after n passes
+        for dependent, leading, slope in tree.couplings:
+            if leading in moves and dependent not in moves and slope:
+                moves[dependent] = slope * moves[leading]
+            elif dependent in moves and leading not in moves and slope:
+                moves[leading] = moves[dependent] / slope
+    return moves
+
+
+def _larger_ctrl_opens(tree: Tree, actuator: int, palm: int, finger_roots: list[int], site: int | None) -> bool | None:
+    """Compares the aperture at both ends of the finger joints. None: it does not change."""
+    model = tree.model
+    data = mujoco.MjData(model)
+    apertures = []
+    for end in (-1.0, 1.0):
+        data.qpos[:] = model.qpos0
+        for joint, direction in _directions(tree, actuator).items():
+            address = int(model.jnt_qposadr[joint])
+            if int(model.jnt_limited[joint]):
+                data.qpos[address] = model.jnt_range[joint][int(direction * end > 0.0)]
+            else:
+                data.qpos[address] += _TRIAL * np.sign(direction * end)
+        mujoco.mj_kinematics(model, data)
+        apertures.append(_aperture(tree, data, palm, finger_roots, site))
+    change = apertures[1] - apertures[0]
+    return None if abs(change) < _MIN_CHANGE else change > 0.0
+
+
+def _aperture(tree: Tree, data: mujoco.MjData, palm: int, finger_roots: list[int], site: int | None) -> float:
+    """Mean distance [m] of the fingers' centres; of a single finger to the end-effector site or the palm."""
+    centres = [_centre(tree, data, root) for root in finger_roots]
+    if len(centres) == 1:
+        centres.append(data.site_xpos[site] if site is not None else data.xpos[palm])
+    pairs = [(a, b) for i, a in enumerate(centres) for b in centres[i + 1 :]]
+    return float(np.mean([np.linalg.norm(a - b) for a, b in pairs]))
+
+
+def _centre(tree: Tree, data: mujoco.MjData, root: int) -> NDArray[np.float64]:
+    """Mean position [m] of the geoms below `root`, of its body frames when it has none."""
+    bodies = tree.subtree(root)
+    geoms = np.flatnonzero(np.isin(tree.model.geom_bodyid, bodies))
+    points = data.geom_xpos[geoms] if len(geoms) else data.xpos[bodies]
+    centre: NDArray[np.float64] = points.mean(axis=0)
+    return centre
+
+
+def describe(tree: Tree, gripper: Gripper) -> str:
+    """What is undecided about the gripper, empty when nothing is."""
+    names = [element_name(tree.model, "actuator", a) or f"number {a}" for a in gripper.actuators]
+    if len(names) > 1:
+        return f"{len(names)} actuators move its gripper ({', '.join(names)})"
+    if gripper.range is None:
+        return f"gripper actuator {names[0]!r} has no ctrlrange"
+    if gripper.open is None:
+        return f"it cannot be told which end of gripper actuator {names[0]!r} is open"
+    return ""

@@ -1,0 +1,72 @@
+"""Models in and out: files (MJCF, URDF, MJB) and bytes (MJB), with one-line errors.
+
+The bytes of a model are MuJoCo's own binary format with the asset paths blanked, because those name folders of the
+machine that compiled it. MJB is readable by the same MuJoCo version only; recordings keep that version beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from iris_session.physics.errors import ModelInvalidError, ModelNotFoundError, one_line
+
+TEXT_SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
+_BUFFER_NAME: Final = "model.mjb"
+
+
+def load_model(path: str | Path) -> mujoco.MjModel:
+    """Compiles an MJCF or URDF file, or loads an MJB.
+
+    Raises `ModelNotFoundError` for a missing file or unknown suffix, `ModelInvalidError` with MuJoCo's message.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise ModelNotFoundError(f"model file {str(path)!r} does not exist{_siblings(path)}")
+    try:
+        if path.suffix.lower() in TEXT_SUFFIXES:
+            return mujoco.MjModel.from_xml_path(str(path))
+        if path.suffix.lower() == ".mjb":
+            return mujoco.MjModel.from_binary_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelInvalidError(f"{path.name}: {one_line(error)}") from error
+    raise ModelNotFoundError(f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}")
+
+
+def _siblings(path: Path) -> str:
+    """The model files beside a path that does not exist, for the error text."""
+    if not path.parent.is_dir():
+        return f"; neither does its folder {str(path.parent)!r}"
+    found = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in (*TEXT_SUFFIXES, ".mjb"))
+    return f"; its folder has {', '.join(found) or 'no model file'}"
+
+
+def model_bytes(model: mujoco.MjModel) -> bytes:
+    """MJB bytes of `model`, asset paths blanked. Same model, same MuJoCo, same lengths of paths: same bytes."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    data = buffer.tobytes()
+    paths = bytes(model.paths)
+    if not paths.strip(b"\0"):
+        return data
+    # The paths are one of the last of the model's arrays, so the last occurrence is the array itself.
+    return bytes(len(paths)).join(data.rsplit(paths, 1))
+
+
+def model_from_bytes(data: bytes) -> mujoco.MjModel:
+    """Inverse of `model_bytes`. Raises `ModelInvalidError` for bytes of another format or MuJoCo version."""
+    try:
+        return mujoco.MjModel.from_binary_path(_BUFFER_NAME, assets={_BUFFER_NAME: data})
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelInvalidError(
+            f"these {len(data)} bytes are no model of MuJoCo {mujoco.__version__}: {one_line(error)}"
+        ) from error
+
+
+def scene_hash(data: bytes) -> str:
+    """Identity of a scene: BLAKE2b of its model bytes, 32 hex characters."""
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -1,0 +1,71 @@
+"""Names of model elements: MuJoCo allows none at all, the wire needs one for everything, at most 64 characters.
+
+Unnamed bodies get `body_<id>`, which is stable for a model; a generated or shortened name that is already taken gets
+`~2`, `~3`, ... Joints, actuators and sites of robots must be named in the model.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import mujoco
+
+from iris_session.physics.errors import UnknownNameError
+
+#: Longest name on the wire (`protocol.common.Name`).
+MAX_NAME: Final = 64
+
+_TYPES: Final = {
+    kind: (int(getattr(mujoco.mjtObj, f"mjOBJ_{constant}")), count)
+    for kind, constant, count in (
+        ("body", "BODY", "nbody"),
+        ("joint", "JOINT", "njnt"),
+        ("actuator", "ACTUATOR", "nu"),
+        ("site", "SITE", "nsite"),
+        ("keyframe", "KEY", "nkey"),
+        ("flex", "FLEX", "nflex"),
+    )
+}
+
+
+def element_name(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """Name in the model, empty when it has none. `kind`: body, joint, actuator, site, keyframe or flex."""
+    return mujoco.mj_id2name(model, _TYPES[kind][0], index) or ""
+
+
+def element_names(model: mujoco.MjModel, kind: str) -> tuple[str, ...]:
+    """All names of one kind, by id; empty strings for unnamed elements."""
+    return tuple(element_name(model, kind, i) for i in range(getattr(model, _TYPES[kind][1])))
+
+
+def element_id(model: mujoco.MjModel, kind: str, name: str, where: str = "") -> int:
+    """Id of a named element. Raises `UnknownNameError`, which lists the names there are; `where` begins its text."""
+    index = int(mujoco.mj_name2id(model, _TYPES[kind][0], name)) if name else -1
+    if index < 0:
+        raise UnknownNameError(kind, name, (n for n in element_names(model, kind) if n), where)
+    return index
+
+
+def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """A unique name of at most 64 characters for every body, by id. Named bodies keep theirs."""
+    given = element_names(model, "body")
+    taken = {name for name in given if name and len(name) <= MAX_NAME}
+    names = []
+    for index, name in enumerate(given):
+        if name and len(name) <= MAX_NAME:
+            names.append(name)
+            continue
+        unique = stem = (name or f"body_{index}")[:MAX_NAME]
+        number = 1
+        while unique in taken:
+            number += 1
+            suffix = f"~{number}"
+            unique = stem[: MAX_NAME - len(suffix)] + suffix
+        taken.add(unique)
+        names.append(unique)
+    return tuple(names)
+
+
+def wire_name(name: str) -> bool:
+    """Whether a name can stand on the wire as it is."""
+    return 0 < len(name) <= MAX_NAME

@@ -1,0 +1,107 @@
+"""The kinematic tree of a model as Python lists: parents, children, joints, and which actuators drive which joints."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+_TRN_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_TRN_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
+_WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
+_EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
+
+
+class Tree:
+    """Read-only view of the bodies, joints and actuators of `model`. All numbers are MuJoCo ids."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+        self.parent: list[int] = model.body_parentid.tolist()
+        self.weld: list[int] = model.body_weldid.tolist()
+        self.children: list[list[int]] = [[] for _ in range(model.nbody)]
+        for body in range(1, model.nbody):
+            self.children[self.parent[body]].append(body)
+        self.joint_body: list[int] = model.jnt_bodyid.tolist()
+        self.joint_type: list[int] = model.jnt_type.tolist()
+        self.free_bodies = tuple(self.joint_body[j] for j in range(model.njnt) if self.joint_type[j] == _FREE)
+        #: Per actuator: the joints it drives, with the ratio d(transmission length)/d(joint position).
+        self.driven: list[dict[int, float]] = [self._driven_joints(a) for a in range(model.nu)]
+        #: Per joint: actuators with a joint transmission on it.
+        self.actuators_of_joint: list[list[int]] = [[] for _ in range(model.njnt)]
+        for actuator in range(model.nu):
+            if int(model.actuator_trntype[actuator]) in _TRN_JOINTS:
+                self.actuators_of_joint[int(model.actuator_trnid[actuator, 0])].append(actuator)
+        #: Joint equalities as (dependent joint, leading joint, slope at the reference).
+        self.couplings = tuple(
+            (int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), float(model.eq_data[e, 1]))
+            for e in range(model.neq)
+            if int(model.eq_type[e]) == _EQ_JOINT and int(model.eq_obj2id[e]) >= 0
+        )
+
+    def _driven_joints(self, actuator: int) -> dict[int, float]:
+        model = self.model
+        kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+        gear = float(model.actuator_gear[actuator, 0])
+        if kind in _TRN_JOINTS:
+            return {target: gear}
+        if kind != _TRN_TENDON:
+            return {}
+        wraps = range(int(model.tendon_adr[target]), int(model.tendon_adr[target]) + int(model.tendon_num[target]))
+        return {
+            int(model.wrap_objid[w]): gear * float(model.wrap_prm[w])
+            for w in wraps
+            if int(model.wrap_type[w]) == _WRAP_JOINT
+        }
+
+    def joints_of(self, body: int) -> range:
+        """Joint ids of one body, in order."""
+        first = int(self.model.body_jntadr[body])
+        return range(first, first + int(self.model.body_jntnum[body])) if first >= 0 else range(0)
+
+    def scalar_joints_of(self, body: int) -> list[int]:
+        """Hinges and slides of one body."""
+        return [j for j in self.joints_of(body) if self.joint_type[j] not in (_FREE, _BALL)]
+
+    def subtree(self, body: int) -> list[int]:
+        """`body` and everything below it, parents first, by id among siblings."""
+        found = [body]
+        for b in found:
+            found.extend(self.children[b])
+        return found
+
+    def ancestors(self, body: int) -> list[int]:
+        """`body` and its ancestors up to and without the world."""
+        found = []
+        while body > 0:
+            found.append(body)
+            body = self.parent[body]
+        return found
+
+    def jointed_below(self, body: int) -> list[int]:
+        """The nearest bodies below `body` that have hinges or slides: what branches off here."""
+        found: list[int] = []
+        for child in self.children[body]:
+            found.extend([child] if self.scalar_joints_of(child) else self.jointed_below(child))
+        return found
+
+    def flex_vertex_bodies(self) -> frozenset[int]:
+        """Bodies that MuJoCo made for the vertices or nodes of a flex: three slides, no geom, no child.
+
+        Pinned and rigid vertices belong to ordinary bodies, which are not among them.
+        """
+        model = self.model
+        listed: set[int] = set()
+        for array in ("flex_vertbodyid", "flex_nodebodyid"):
+            if model.nflex and hasattr(model, array):
+                listed.update(np.unique(getattr(model, array)).tolist())
+        return frozenset(
+            b
+            for b in listed
+            if b > 0
+            and not self.children[b]
+            and int(model.body_geomnum[b]) == 0
+            and int(model.body_jntnum[b]) == 3
+            and len(self.scalar_joints_of(b)) == 3
+        )

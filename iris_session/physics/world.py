@@ -1,0 +1,324 @@
+"""`World`: the plant of a session. One MuJoCo model and its data, advanced tick by tick, saved and restored exactly.
+
+A tick is `mj_step2` then `mj_step1`: the same arithmetic as `mj_step` shifted by half a step, so that after a tick every
+derived quantity (poses, contacts) belongs to the new state. Write `ctrl` and `xfrc_applied` between ticks as usual.
+Mocap poses and `eq_active` enter MuJoCo's position stage: after writing those between ticks, call `refresh`.
+
+In a user's loop the user's `MjData` is only read: the view shows a private copy that `after_user_step` brings up to
+date, because after `mj_step` the user's own derived quantities are those of the state before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import msgspec
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.physics.contacts import ContactTables
+from iris_session.physics.errors import (
+    ModelUnsupportedError,
+    NotOwnerError,
+    SimulationDivergedError,
+    SnapshotError,
+)
+from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.physics.names import body_names, element_id, element_names
+from iris_session.physics.tree import Tree
+from iris_session.physics.view import LiveView
+from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import BodyInfo, RobotInfo
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+
+STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+HOME: Final = "home"
+
+#: Integrators whose `mj_step2` does exactly what `mj_step` does; the others (RK4, future ones) take `mj_step` + `mj_step1`.
+_SPLIT_INTEGRATORS: Final = frozenset(
+    int(getattr(mujoco.mjtIntegrator, name))
+    for name in ("mjINT_EULER", "mjINT_IMPLICIT", "mjINT_IMPLICITFAST", "mjINT_DISCRETE")
+    if hasattr(mujoco.mjtIntegrator, name)
+)
+_BAD: Final = tuple(
+    (int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")), text)
+    for name, text in (
+        ("BADQPOS", "positions are NaN or huge"),
+        ("BADQVEL", "velocities are NaN or huge"),
+        ("BADQACC", "accelerations are NaN or huge"),
+        ("BADCTRL", "ctrl is NaN or huge, MuJoCo used zero instead"),
+    )
+)
+_FULL: Final = {
+    "contacts dropped, memory is full": int(mujoco.mjtWarning.mjWARN_CONTACTFULL),
+    "constraints dropped, memory is full": int(mujoco.mjtWarning.mjWARN_CNSTRFULL),
+}
+
+
+class _Saved(msgspec.Struct, frozen=True, array_like=True):
+    """Wire form of a snapshot: everything that a tick or the view depends on beyond the model."""
+
+    scene_hash: str
+    tick: int
+    forces: tuple[float, ...]
+    state: bytes
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(_Saved)
+
+
+class World:
+    """The simulated scene. `data` given: it belongs to a user's loop (`after_user_step`), else to ours (`tick`).
+
+    `keyframe`: the initial state by name; empty takes `home`, else the first keyframe, else the model's default state.
+    Raises `UnknownNameError` for specs that do not fit the model, and `ModelUnsupportedError` for sleeping islands in
+    our own loop, whose hidden state MuJoCo cannot restore. The model must not be changed afterwards.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        robots: Sequence[RobotSpec],
+        objects: Sequence[ObjectSpec],
+        data: mujoco.MjData | None = None,
+        keyframe: str = "",
+    ) -> None:
+        self.model = model
+        self.user_owned = data is not None
+        if not self.user_owned:
+            _require_exact(model)
+        self._shown: Any = mujoco.MjData(model)
+        #: What control writes to: the user's data, or ours.
+        self.data: Any = data if self.user_owned else self._shown
+        self._keyframe = _initial_keyframe(model, keyframe)
+        self._split = int(model.opt.integrator) in _SPLIT_INTEGRATORS
+        self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(model, STATE))
+        tree = Tree(model)
+        self._tables = ContactTables(model, robots, objects, tree)
+        self._view = LiveView(model, self._shown, robots, objects, self._tables)
+        self.bodies = _body_infos(model, tree, objects)
+        self._body_ids: NDArray[np.int64] = np.array([b.id for b in self.bodies], np.int64)
+        self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
+        self.tick_period_ns = round(float(model.opt.timestep) * 1e9)
+        self._model_bytes = b""
+        self._scene_hash = ""
+        self._tick = 0
+        self._forces: tuple[float, ...] = (0.0,) * len(robots)
+        #: Empty while all is well, else what went wrong; cleared by `reset` and `restore`.
+        self.diverged = ""
+        if self.user_owned:
+            self._user_time = float(self.data.time)
+            self.after_user_step()
+            self._set_tick(0)
+        else:
+            self.reset()
+
+    # --- our own loop -------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Back to the initial keyframe (or default state), tick 0."""
+        self._require_owner(user=False)
+        if self._keyframe >= 0:
+            mujoco.mj_resetDataKeyframe(self.model, self._shown, self._keyframe)
+        else:
+            mujoco.mj_resetData(self.model, self._shown)
+        mujoco.mj_step1(self.model, self._shown)
+        self._forces = (0.0,) * len(self._forces)
+        self.diverged = ""
+        self._set_tick(0)
+
+    def tick(self) -> None:
+        """One timestep with the present `ctrl` and applied forces.
+
+        Raises `SimulationDivergedError`, again and again until `reset` or `restore`.
+        """
+        model, data = self.model, self._shown
+        if self.user_owned or self.diverged:
+            self._require_owner(user=False)
+            raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
+        if self._split:
+            mujoco.mj_step2(model, data)
+        else:
+            mujoco.mj_step(model, data)
+        # Contact forces exist only until mj_step1 rebuilds the constraints.
+        self._forces = self._tables.gripper_forces(model, data)
+        mujoco.mj_step1(model, data)
+        self._set_tick(self._tick + 1)
+        self._check(data)
+
+    def refresh(self) -> None:
+        """Recomputes what follows from the state after mocap poses, `eq_active` or `qpos` were written between ticks."""
+        self._require_owner(user=False)
+        mujoco.mj_step1(self.model, self._shown)
+        self._set_tick(self._tick)
+
+    # --- a user's loop ------------------------------------------------------------------------------------------------
+
+    def after_user_step(self) -> None:
+        """Takes over the state of the user's data. Time that goes back counts as a reset: tick 0.
+
+        Raises `SimulationDivergedError` for numbers that are not finite.
+        """
+        self._require_owner(user=True)
+        mujoco.mj_getState(self.model, self.data, self._state, STATE)
+        back = float(self.data.time) < self._user_time
+        self._user_time = float(self.data.time)
+        tick = 0 if back else self._tick + 1
+        self._show(tick)
+
+    def set_state_bytes(self, state: bytes) -> None:
+        """Shows a plant that is advanced elsewhere (`state_bytes` of the same model). The tick follows from its time.
+
+        Everything the view shows afterwards, contact forces included, is a function of `state` alone.
+        """
+        self._require_owner(user=False)
+        self._load_state(state)
+        self._show(round(float(self._state[0]) / float(self.model.opt.timestep)))
+
+    def _show(self, tick: int) -> None:
+        """`_state` into the shown data with everything derived, contact forces too; the state itself stays as it is."""
+        model, data = self.model, self._shown
+        self.diverged = "" if np.isfinite(self._state).all() else "the state holds numbers that are not finite"
+        if self.diverged:
+            raise SimulationDivergedError(tick, float(self._state[0]), self.diverged)
+        mujoco.mj_setState(model, data, self._state, STATE)
+        mujoco.mj_forward(model, data)
+        self._forces = self._tables.gripper_forces(model, data)
+        mujoco.mj_setState(model, data, self._state, STATE)  # mj_forward moved the solver's warm start
+        self._set_tick(tick)
+
+    # --- what others see ----------------------------------------------------------------------------------------------
+
+    def view(self) -> LiveView:
+        """The world after the last tick; one live object, see `LiveView`."""
+        return self._view
+
+    @property
+    def ctrl(self) -> NDArray[np.float64]:
+        """Actuator inputs, shape (nu,), writable."""
+        array: NDArray[np.float64] = self.data.ctrl
+        return array
+
+    def poses(self, out: NDArray[np.float64]) -> None:
+        """Writes world poses of `bodies`, `x y z qw qx qy qz`, into `out`, shape (len(bodies), 7)."""
+        out[:, :3] = self._shown.xpos[self._body_ids]
+        out[:, 3:] = self._shown.xquat[self._body_ids]
+
+    @property
+    def trouble(self) -> dict[str, int]:
+        """How often MuJoCo ran out of room since the last reset, by what it dropped. Empty when never."""
+        counts = self.data.warning.number.tolist()
+        return {text: counts[i] for text, i in _FULL.items() if counts[i]}
+
+    def model_bytes(self) -> bytes:
+        """The model as MJB, asset paths blanked (see `load.model_bytes`); computed once."""
+        if not self._model_bytes:
+            self._model_bytes = model_bytes(self.model)
+        return self._model_bytes
+
+    @property
+    def scene_hash(self) -> str:
+        """BLAKE2b of the model bytes, 32 hex characters."""
+        if not self._scene_hash:
+            self._scene_hash = scene_hash(self.model_bytes())
+        return self._scene_hash
+
+    # --- saving -------------------------------------------------------------------------------------------------------
+
+    def state_bytes(self) -> bytes:
+        """`mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, activations, warm start, inputs."""
+        mujoco.mj_getState(self.model, self._shown, self._state, STATE)
+        return self._state.tobytes()
+
+    def snapshot(self) -> bytes:
+        """Everything that later ticks and the view depend on."""
+        return _encoder.encode(_Saved(self.scene_hash, self._tick, self._forces, self.state_bytes()))
+
+    def restore(self, snapshot: bytes) -> None:
+        """Inverse of `snapshot`, bit for bit. Raises `SnapshotError` for other bytes or another model's."""
+        self._require_owner(user=False)
+        try:
+            saved = _decoder.decode(snapshot)
+        except msgspec.DecodeError as error:
+            raise SnapshotError(f"these {len(snapshot)} bytes are no world snapshot: {error}") from error
+        if saved.scene_hash != self.scene_hash:
+            raise SnapshotError(f"snapshot of scene {saved.scene_hash}, but this world is scene {self.scene_hash}")
+        if len(saved.forces) != len(self._forces):
+            raise SnapshotError(f"snapshot with {len(saved.forces)} robots, but this world has {len(self._forces)}")
+        self._load_state(saved.state)
+        mujoco.mj_resetData(self.model, self._shown)  # clears warnings and whatever is outside the state
+        mujoco.mj_setState(self.model, self._shown, self._state, STATE)
+        mujoco.mj_step1(self.model, self._shown)
+        self._forces = saved.forces
+        self.diverged = ""
+        self._set_tick(saved.tick)
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _load_state(self, state: bytes) -> None:
+        if len(state) != self._state.nbytes:
+            raise SnapshotError(f"state of {len(state)} bytes, but this model's has {self._state.nbytes}")
+        self._state[:] = np.frombuffer(state, np.float64)
+
+    def _set_tick(self, tick: int) -> None:
+        self._tick = tick
+        self._view.advance(tick, self._forces)
+
+    def _check(self, data: Any) -> None:
+        """Raises when MuJoCo met bad numbers in this tick. It resets `data` by itself then, warnings aside."""
+        counts = data.warning.number.tolist()
+        found = [text for index, text in _BAD if counts[index]]
+        if found:
+            self.diverged = "; ".join(found)
+            raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
+
+    def _require_owner(self, *, user: bool) -> None:
+        if user and not self.user_owned:
+            raise NotOwnerError("this world has its own loop: call tick(), not after_user_step()")
+        if not user and self.user_owned:
+            raise NotOwnerError(
+                "the data of this world belongs to the user's loop: step or reset it there, then after_user_step()"
+            )
+
+
+def _require_exact(model: mujoco.MjModel) -> None:
+    """Refuses what cannot be restored bit for bit: sleeping islands keep timers outside every `mjtState`."""
+    sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", None)
+    if sleep is not None and int(model.opt.enableflags) & int(sleep):
+        raise ModelUnsupportedError(
+            'sleeping islands cannot be saved and restored exactly: remove <flag sleep="enable"/> from the model'
+        )
+
+
+def _initial_keyframe(model: mujoco.MjModel, name: str) -> int:
+    if name:
+        return element_id(model, "keyframe", name)
+    names = element_names(model, "keyframe")
+    return names.index(HOME) if HOME in names else min(0, model.nkey - 1)
+
+
+def _body_infos(model: mujoco.MjModel, tree: Tree, objects: Sequence[ObjectSpec]) -> tuple[BodyInfo, ...]:
+    """All bodies but the world and the vertices of flexes, by id."""
+    vertices = tree.flex_vertex_bodies()
+    taken = {spec.body for spec in objects}
+    return tuple(
+        BodyInfo(id=index, name=name, moving=tree.weld[index] != 0, object=name in taken)
+        for index, name in enumerate(body_names(model))
+        if index and index not in vertices
+    )
+
+
+def _robot_info(model: mujoco.MjModel, spec: RobotSpec) -> RobotInfo:
+    site = element_id(model, "site", spec.site, f"robot {spec.name!r}: ")
+    (x, y, z), (w, i, j, k) = model.site_pos[site].tolist(), model.site_quat[site].tolist()
+    return RobotInfo(
+        name=spec.name,
+        joints=spec.joints,
+        base_body=element_id(model, "body", spec.base_body, f"robot {spec.name!r}: "),
+        site_body=int(model.site_bodyid[site]),
+        T_body_site=Pose((x, y, z), (w, i, j, k)),
+        gripper=bool(spec.gripper_actuator),
+    )
