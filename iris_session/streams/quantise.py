@@ -48,9 +48,8 @@ def rotation_codes(q: Floats) -> Words:
     rows = np.arange(len(q))
     largest = np.abs(q).argmax(axis=1)
     scale = np.where(q[rows, largest] < 0.0, -_PER_UNIT, _PER_UNIT)
-    levels = np.rint(q[rows[:, None], _OTHERS[largest]] * scale[:, None]).astype(np.int64)
-    np.clip(levels, -_HALF, _HALF, out=levels)
-    levels += _HALF
+    # No clipping: next to a component at least as large, none of a unit quaternion exceeds 1 / sqrt(2).
+    levels = np.rint(q[rows[:, None], _OTHERS[largest]] * scale[:, None]).astype(np.int64) + _HALF
     packed = levels[:, 0] + ROTATION_LEVELS * (levels[:, 1] + ROTATION_LEVELS * levels[:, 2])
     codes: Words = (largest + 4 * packed).astype(np.uint64)
     return codes

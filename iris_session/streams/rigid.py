@@ -56,6 +56,8 @@ _HEADER: Final = struct.Struct("<BBHHH3iII")
 _ESCAPE: Final = np.dtype([("body", "<u2"), ("pose", "<f8", (7,))])
 _MAX_POSITION_BYTES: Final = 7
 _MAX_INDEX: Final = 2**31 - 1
+#: Quaternions farther from unit length (squared) than this are no rotations: they escape.
+_MAX_NORM_DEFECT: Final = 1e-3
 #: Below this many bytes per position an outlier is not looked for.
 _USUAL_POSITION_BYTES: Final = 6
 _COS_ALLOWANCE: Final = math.cos(0.5 * DRIFT_ALLOWANCE_RAD)
@@ -127,28 +129,33 @@ class RigidEncoder:
             near: Mask = np.einsum("ij,ij->i", offset, offset) <= DRIFT_ALLOWANCE_M**2
             q, anchor_q = poses[:, 3:], self._anchor[:, 3:]
             cosine = np.abs(np.einsum("ij,ij->i", q, anchor_q))
-            near &= cosine >= _COS_ALLOWANCE * np.sqrt(np.einsum("ij,ij->i", q, q))
+            squares = np.einsum("ij,ij->i", q, q)
+            near &= (cosine >= _COS_ALLOWANCE * np.sqrt(squares)) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
         near &= ~self._escapes
         return ~near
 
     def _anchor_anew(self, poses: Floats, bodies: Ints, seq: int) -> None:
-        """Makes the present pose of `bodies` their anchor and computes its code."""
+        """Makes the present pose of `bodies` (ascending) their anchor and computes its code."""
         if not len(bodies):
             return
-        anchor = poses[bodies]
+        anchor = poses.take(bodies, axis=0)
+        q = anchor[:, 3:]
         with np.errstate(invalid="ignore", over="ignore"):
-            norm = np.sqrt(np.einsum("ij,ij->i", anchor[:, 3:], anchor[:, 3:]))
-            nodes = np.rint(anchor[:, :3] / LATTICE_M)
-            fits = (np.abs(nodes).max(axis=1) <= _MAX_INDEX) & (norm > 1e-6) & (norm < 1e6)
-        self._anchored_seq[bodies] = seq
-        self._escapes[bodies] = ~fits
+            squares = np.einsum("ij,ij->i", q, q)
+            nodes = np.rint(anchor[:, :3] * (1.0 / LATTICE_M))
+            fits = (np.abs(nodes) <= _MAX_INDEX).all(axis=1) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
+        at: Ints | slice = slice(None) if len(bodies) == self.n_bodies else bodies
+        self._anchored_seq[at] = seq
+        self._escapes[at] = ~fits
         if not fits.all():
-            self._anchor[bodies] = anchor
-            bodies, anchor, norm, nodes = bodies[fits], anchor[fits], norm[fits], nodes[fits]
-        anchor[:, 3:] /= norm[:, None]
-        self._anchor[bodies] = anchor
-        self._index[bodies] = nodes.astype(np.int64)
-        self._rotation[bodies] = rotation_codes(anchor[:, 3:])
+            self._anchor[at] = anchor
+            at = bodies[fits]
+            anchor, squares, nodes = anchor[fits], squares[fits], nodes[fits]
+            q = anchor[:, 3:]
+        q /= np.sqrt(squares)[:, None]
+        self._anchor[at] = anchor
+        self._index[at] = nodes
+        self._rotation[at] = rotation_codes(q)
 
     def _add_refresh(self, sent: Mask) -> None:
         """Marks the next bodies of the round robin in `sent`."""
@@ -161,7 +168,7 @@ class RigidEncoder:
         """Payload with the anchors of `bodies` (ascending)."""
         escapes = self._escapes[bodies]
         quantised, escaped = (bodies[~escapes], bodies[escapes]) if escapes.any() else (bodies, bodies[:0])
-        index = self._index[quantised]
+        index = self._index.take(quantised, axis=0)
         origin, levels = _box(index)
         position_bytes = _bytes_for(levels)
         if position_bytes > _USUAL_POSITION_BYTES:
@@ -175,9 +182,6 @@ class RigidEncoder:
         positions = index[:, 0] + nx * (index[:, 1] + ny * index[:, 2])
         mask = np.zeros(self.n_bodies, np.bool_)
         mask[quantised] = True
-        verbatim = np.empty(len(escaped), _ESCAPE)
-        verbatim["body"] = escaped
-        verbatim["pose"] = self._anchor[escaped]
         head = _HEADER.pack(
             FORMAT, position_bytes, self.n_bodies, len(quantised), len(escaped), *origin.tolist(), nx, ny
         )
@@ -186,18 +190,28 @@ class RigidEncoder:
                 head,
                 np.packbits(mask, bitorder="little").tobytes(),
                 pack_words(positions, position_bytes),
-                pack_words(self._rotation[quantised], ROTATION_BYTES),
-                verbatim.tobytes(),
+                pack_words(self._rotation.take(quantised), ROTATION_BYTES),
+                self._verbatim(escaped),
             )
         )
+
+    def _verbatim(self, bodies: Ints) -> bytes:
+        """The anchors of `bodies` as escapes."""
+        if not len(bodies):
+            return b""
+        escapes = np.empty(len(bodies), _ESCAPE)
+        escapes["body"] = bodies
+        escapes["pose"] = self._anchor[bodies]
+        return escapes.tobytes()
 
 
 def _box(index: Ints) -> tuple[Ints, Ints]:
     """Lowest node and number of nodes per axis of the box around lattice nodes `index` (m, 3)."""
     if not len(index):
         return np.zeros(3, np.int64), np.ones(3, np.int64)
-    origin = index.min(axis=0)
-    return origin, index.max(axis=0) - origin + 1
+    axes = np.ascontiguousarray(index.T)  # three times as fast as along the short axis
+    origin = axes.min(axis=1)
+    return origin, axes.max(axis=1) - origin + 1
 
 
 def _bytes_for(levels: Ints) -> int:

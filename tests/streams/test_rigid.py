@@ -1,0 +1,345 @@
+"""Rigid-state stream: error bounds over drops, drift, late joiners and wild poses; bytes; hostile payloads."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.streams.errors import StreamError
+from iris_session.streams.quantise import Floats
+from iris_session.streams.rigid import (
+    DRIFT_ALLOWANCE_M,
+    DRIFT_ALLOWANCE_RAD,
+    MAX_POSITION_ERROR_M,
+    MAX_ROTATION_ERROR_RAD,
+    REFRESH_FRAMES,
+    WINDOW,
+    EncodedFrame,
+    RigidDecoder,
+    RigidEncoder,
+)
+from tests.streams.poses import moved, position_errors, random_poses, rotation_errors
+
+HEADER, BODY, ESCAPE = 28, 11, 58
+
+
+def assert_within_bound(decoded: Floats, truth: Floats) -> None:
+    assert position_errors(decoded, truth).max(initial=0.0) <= MAX_POSITION_ERROR_M
+    assert rotation_errors(decoded, truth).max(initial=0.0) <= MAX_ROTATION_ERROR_RAD
+
+
+def test_allowance_leaves_room_for_drift() -> None:
+    assert DRIFT_ALLOWANCE_M > 5e-6
+    assert math.degrees(DRIFT_ALLOWANCE_RAD) > 0.005
+
+
+def test_three_hundred_moving_bodies_are_small_and_exact() -> None:
+    rng = np.random.default_rng(0)
+    poses = random_poses(rng, 300)
+    encoder, decoder = RigidEncoder(300), RigidDecoder(300)
+    for _ in range(100):
+        poses = moved(rng, poses, 0.3 / 60, 0.5 / 60)
+        poses[:, :3] = np.clip(poses[:, :3], 0.0, (10.0, 10.0, 3.0))
+        frame = encoder.encode(poses, 1)
+        assert len(frame.payload) <= HEADER + 38 + 300 * BODY + ESCAPE
+        assert frame.base_seq == 0  # complete in itself: nobody needs a snapshot
+        assert decoder.apply(*frame)
+        assert_within_bound(decoder.poses, poses)
+
+
+def test_resting_bodies_cost_their_bit_and_the_round_robin() -> None:
+    poses = random_poses(np.random.default_rng(0), 300)
+    encoder = RigidEncoder(300)
+    frames = [encoder.encode(poses, 1) for _ in range(WINDOW + 2)]
+    assert len(frames[0].payload) == HEADER + 38 + 300 * BODY
+    assert len(frames[-1].payload) <= HEADER + 38 + BODY
+    assert frames[-1].base_seq == frames[-1].state_seq - WINDOW
+
+
+def test_only_what_moves_is_sent() -> None:
+    rng = np.random.default_rng(4)
+    poses = random_poses(rng, 100)
+    encoder, decoder = RigidEncoder(100), RigidDecoder(100)
+    for _ in range(2 * WINDOW):
+        poses[:7] = moved(rng, poses[:7], 0.002, 0.001)
+        frame = encoder.encode(poses, 1)
+        assert decoder.apply(*frame)
+    assert len(frame.payload) <= HEADER + 13 + 8 * BODY
+    assert_within_bound(decoder.poses, poses)
+
+
+def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
+    """0.6 um and 0.6 mdeg a frame: below the drift allowance in one frame, far above it in a second."""
+    rng = np.random.default_rng(5)
+    poses = random_poses(rng, 40)
+    heading = random_poses(rng, 40)[:, :3] - 5.0
+    heading *= 6e-7 / np.linalg.norm(heading, axis=1)[:, None]
+    encoder, decoder = RigidEncoder(40), RigidDecoder(40)
+    frame = encoder.encode(poses, 1)
+    assert decoder.apply(*frame)
+    for k in range(600):
+        poses[:, :3] += heading
+        poses = moved(rng, poses, 0.0, math.radians(6e-4))
+        frame = encoder.encode(poses, 1)
+        if rng.random() < 0.15 or k == 599:
+            assert decoder.apply(*frame)
+            assert_within_bound(decoder.poses, poses)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(0, 40),
+    size=st.sampled_from((1e-3, 1.0, 30.0, 3e3, 3e5)),
+    step=st.sampled_from((0.0, 1e-6, 1e-5, 1e-3, 1.0)),
+    lost=st.lists(st.booleans(), min_size=1, max_size=100),
+)
+def test_every_delivered_frame_is_within_the_bound(
+    seed: int, n: int, size: float, step: float, lost: list[bool]
+) -> None:
+    """Whatever is lost: a complete client is within the bound; one that was away too long says so."""
+    rng = np.random.default_rng(seed)
+    poses = random_poses(rng, n, (size, size, size))
+    encoder, decoder = RigidEncoder(n), RigidDecoder(n)
+    away = 0
+    for k, gone in enumerate(lost):
+        active = rng.random(n) < 0.3
+        poses[active] = moved(rng, poses[active], step, min(step, 0.1))
+        frame = encoder.encode(poses, 1 + k // 60)
+        if gone:
+            away += 1
+            continue
+        complete = decoder.apply(*frame)
+        valid = decoder.valid
+        assert complete == valid.all()
+        assert complete or away >= WINDOW
+        assert_within_bound(decoder.poses[valid], poses[valid])
+        if complete:
+            away = 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 30), frames=st.integers(1, 20))
+def test_wild_poses_pass_as_they_are(seed: int, n: int, frames: int) -> None:
+    rng = np.random.default_rng(seed)
+    wild = np.array([np.nan, np.inf, -np.inf, 0.0, 1e300, -1e9, 1e-320, 1e5])
+    encoder, decoder = RigidEncoder(n), RigidDecoder(n)
+    poses = random_poses(rng, n)
+    for _ in range(frames):
+        hit = rng.random((n, 7)) < 0.05
+        poses[hit] = wild[rng.integers(len(wild), size=(n, 7))][hit]
+        assert decoder.apply(*encoder.encode(poses, 1))
+        norms = np.array([math.hypot(*q) for q in poses[:, 3:]])
+        sane = np.isfinite(poses).all(axis=1) & (np.abs(norms - 1.0) < 1e-9)
+        assert_within_bound(decoder.poses[sane], poses[sane])
+        strange = ~np.isfinite(poses).all(axis=1)
+        np.testing.assert_array_equal(decoder.poses[strange], poses[strange])
+
+
+def test_far_bodies_escape_and_the_rest_stays_small() -> None:
+    poses = random_poses(np.random.default_rng(6), 300)
+    poses[10, 2], poses[20, 0] = -4000.0, 1e9
+    encoder, decoder = RigidEncoder(300), RigidDecoder(300)
+    frame = encoder.encode(poses, 1)
+    assert len(frame.payload) == HEADER + 38 + 298 * BODY + 2 * ESCAPE
+    assert decoder.apply(*frame)
+    assert_within_bound(decoder.poses, poses)
+
+
+def test_a_hall_takes_one_byte_more_rather_than_escapes() -> None:
+    poses = random_poses(np.random.default_rng(7), 300, (90.0, 90.0, 10.0))
+    frame = RigidEncoder(300).encode(poses, 1)
+    assert len(frame.payload) == HEADER + 38 + 300 * (BODY + 1)
+
+
+def resting_stream(n: int = 50, frames: int = 100) -> tuple[Floats, RigidEncoder, list[EncodedFrame]]:
+    rng = np.random.default_rng(8)
+    poses = random_poses(rng, n)
+    encoder = RigidEncoder(n)
+    sent = []
+    for _ in range(frames):
+        poses[0] = moved(rng, poses[:1], 0.01, 0.01)[0]
+        sent.append(encoder.encode(poses, 1))
+    return poses, encoder, sent
+
+
+def test_late_joiner_needs_a_snapshot_and_is_complete_with_it() -> None:
+    poses, encoder, frames = resting_stream()
+    decoder = RigidDecoder(50)
+    assert not decoder.complete
+    assert not decoder.apply(*frames[-1])
+    assert decoder.valid[0]
+    assert_within_bound(decoder.poses[:1], poses[:1])
+    assert decoder.load_keyframe(*encoder.keyframe())
+    assert_within_bound(decoder.poses, poses)
+
+
+def test_keyframe_older_than_the_stream_keeps_newer_poses() -> None:
+    rng = np.random.default_rng(9)
+    poses, encoder, _ = resting_stream()
+    keyframe = encoder.keyframe()
+    decoder = RigidDecoder(50)
+    for _ in range(WINDOW):
+        poses[0] = moved(rng, poses[:1], 0.01, 0.01)[0]
+        frame = encoder.encode(poses, 1)
+        decoder.apply(*frame)
+    assert decoder.load_keyframe(*keyframe)
+    assert_within_bound(decoder.poses, poses)
+    assert decoder.state_seq == frame.state_seq
+
+
+def test_keyframe_that_is_too_old_does_not_make_complete() -> None:
+    poses, _, frames = resting_stream(frames=200)
+    decoder = RigidDecoder(50)
+    decoder.apply(*frames[-1])
+    assert not decoder.load_keyframe(frames[100].state_seq, poses)
+    assert decoder.load_keyframe(frames[-1].base_seq, poses)
+
+
+def test_exact_keyframe_of_the_state_is_as_good_as_the_encoders() -> None:
+    poses, encoder, frames = resting_stream()
+    decoder = RigidDecoder(50)
+    assert decoder.load_keyframe(frames[-1].state_seq, poses)
+    poses[5, 0] += 0.9 * DRIFT_ALLOWANCE_M
+    assert decoder.apply(*encoder.encode(poses, 1))
+    assert_within_bound(decoder.poses, poses)
+
+
+def test_refresh_completes_a_client_without_snapshot() -> None:
+    poses, encoder, _ = resting_stream()
+    decoder = RigidDecoder(50)
+    done = [decoder.apply(*encoder.encode(poses, 1)) for _ in range(REFRESH_FRAMES)]
+    assert done[-1]
+    assert not done[0]
+    assert_within_bound(decoder.poses, poses)
+
+
+def test_new_scene_epoch_sends_everything() -> None:
+    poses, encoder, _ = resting_stream()
+    decoder = RigidDecoder(50)
+    assert decoder.apply(*encoder.encode(poses, 2))
+
+
+def test_encoder_that_replaces_another_goes_on_counting() -> None:
+    frames = resting_stream()[2]
+    decoder = RigidDecoder(50)
+    for frame in frames:
+        decoder.apply(*frame)
+    other = random_poses(np.random.default_rng(10), 50)
+    replacement = RigidEncoder(50, first_seq=frames[-1].state_seq + 1)
+    for _ in range(WINDOW + 5):
+        frame = replacement.encode(other, 1)
+    assert not decoder.apply(*frame)  # lost everything that the replacement sent: must not be taken for complete
+    assert decoder.apply(*replacement.encode(other, 2))
+    assert_within_bound(decoder.poses, other)
+
+
+def test_old_frames_are_ignored_and_counted() -> None:
+    poses, _, frames = resting_stream()
+    decoder = RigidDecoder(50)
+    for frame in frames:
+        decoder.apply(*frame)
+    assert decoder.apply(*frames[3])
+    assert decoder.stale_frames == 1
+    assert_within_bound(decoder.poses, poses)
+    decoder.reset()
+    assert decoder.apply(*frames[0])
+
+
+def test_same_calls_give_the_same_bytes() -> None:
+    assert resting_stream()[2] == resting_stream()[2]
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (2, 6), (14,)])
+def test_wrong_shapes_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        RigidEncoder(2).encode(np.zeros(shape), 1)
+    with pytest.raises(StreamError, match="expected"):
+        RigidDecoder(2).load_keyframe(1, np.zeros(shape))
+
+
+def test_wrong_arguments_are_refused() -> None:
+    with pytest.raises(ValueError, match="65535"):
+        RigidEncoder(65536)
+    with pytest.raises(ValueError, match="first_seq"):
+        RigidEncoder(1, first_seq=0)
+    with pytest.raises(StreamError, match="keyframe at"):
+        RigidDecoder(1).load_keyframe(2**63, np.zeros((1, 7)))
+    with pytest.raises(StreamError, match="base_seq"):
+        RigidDecoder(1).apply(3, 4, b"")
+
+
+# --- hostile bytes ----------------------------------------------------------------------------------------------------
+
+
+def valid_payload() -> bytes:
+    poses = random_poses(np.random.default_rng(11), 10)
+    poses[3, 0] = np.nan
+    poses[8, 0] = 1e12
+    return RigidEncoder(10).encode(poses, 1).payload
+
+
+def offer(payload: bytes) -> None:
+    """Applies `payload`; when it is refused, nothing may have changed."""
+    decoder = RigidDecoder(10)
+    decoder.load_keyframe(1, np.ones((10, 7)))
+    try:
+        decoder.apply(2, 1, payload)
+    except StreamError:
+        np.testing.assert_array_equal(decoder.poses, 1.0)
+        assert decoder.state_seq == 1
+        assert decoder.complete
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=400))
+def test_random_bytes_raise_stream_errors_only(payload: bytes) -> None:
+    offer(payload)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(1, 7), st.integers(0, 10), st.integers(0, 2), st.binary(min_size=400, max_size=400))
+def test_random_bodies_behind_a_fitting_header_raise_stream_errors_only(
+    position_bytes: int, quantised: int, escaped: int, noise: bytes
+) -> None:
+    size = quantised * (position_bytes + 5) + escaped * ESCAPE
+    bits = ((1 << quantised) - 1).to_bytes(2, "little")
+    head = struct.pack("<BBHHH", 1, position_bytes, 10, quantised, escaped)
+    offer(head + noise[:20] + bits + noise[20 : 20 + size])
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), min_size=1, max_size=4), st.integers(-3, 3))
+def test_damaged_payloads_raise_stream_errors_only(flips: list[tuple[int, int]], length: int) -> None:
+    payload = bytearray(valid_payload())
+    for at, value in flips:
+        payload[at % len(payload)] = value
+    offer(bytes(payload[:length] if length < 0 else payload + b"\0" * length))
+
+
+def test_each_check_refuses() -> None:
+    good = valid_payload()
+    n = 10
+
+    def refused(payload: bytes, match: str) -> None:
+        with pytest.raises(StreamError, match=match):
+            RigidDecoder(n).apply(1, 0, payload)
+
+    assert RigidDecoder(n).apply(1, 0, memoryview(good))
+    refused(good[:27], "shorter than its header")
+    refused(b"\x02" + good[1:], "format 2")
+    refused(good[:2] + b"\x0b\0" + good[4:], "for 11 bodies")
+    refused(good[:1] + b"\x08" + good[2:], "8 bytes")
+    refused(good[:20] + b"\0\0\0\0" + good[24:], "box of 0")
+    refused(good + b"\0", "header asks for")
+    refused(good[:28] + b"\xff\xff" + good[30:], "mask")
+    refused(good[:29] + bytes([good[29] | 0x80]) + good[30:], "mask")
+    last = len(good) - ESCAPE
+    refused(good[:last] + b"\x03\0" + good[last + 2 :], "ascending")
+    refused(good[:last] + b"\x0a\0" + good[last + 2 :], "ascending")
+    refused(good[:last] + b"\x09\0" + good[last + 2 :], "ascending")
