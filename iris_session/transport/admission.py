@@ -1,0 +1,158 @@
+"""`hello`: who may knock, as whom; and `Welcome` once the authority has let them in. Keys and tokens end here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.names import RefusalCode, Role
+from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
+from iris_session.protocol.steps import Admitted
+from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer, Route
+from iris_session.transport.config import FrontConfig, Ports
+from iris_session.transport.limiter import Drops, TokenBucket
+from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.sockets import fingerprint, peer_of
+
+SECRET_BYTES = 16  # 128 bits, made by the client
+
+
+class _RefusedError(Exception):
+    """Ends the handling of one hello."""
+
+    def __init__(self, code: str, message: str, advice: str = "") -> None:
+        super().__init__(message)
+        self.answer = Refused(code, message, advice)
+
+
+class Admission:
+    """Accepts or refuses `hello`. `hand_back` is called with the table of tokens before an entry depends on it."""
+
+    def __init__(
+        self,
+        config: FrontConfig,
+        ports: Ports,
+        clients: ClientTable,
+        outbox: Outbox,
+        drops: Drops,
+        tokens: ResumeTokens,
+        hand_back: Callable[[bytes], None],
+    ) -> None:
+        self._config = config
+        self._ports = ports
+        self._clients = clients
+        self._outbox = outbox
+        self._drops = drops
+        self._tokens = tokens
+        self._hand_back = hand_back
+        self._hellos = TokenBucket(config.limits.hellos_per_second, config.limits.hello_burst)
+
+    def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
+        """Answers a refusal itself, and gives no entry then."""
+        try:
+            connection, join = self._accept(route, peer, hello, now_ns)
+        except _RefusedError as refused:
+            self._drops.count(f"hello_{refused.answer.code}")
+            self._outbox.send_to_route(route, refused.answer)
+            return None
+        connection.last_heard_ns = now_ns
+        self._clients.add(connection)
+        self._hand_back(self._tokens.blob())
+        return Entry(connection.number, connection.number, now_ns, join)
+
+    def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
+        if not self._hellos.take(now_ns):
+            raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
+        if len(self._clients) >= self._config.limits.connections:
+            raise _RefusedError(
+                RefusalCode.FULL, f"all {self._config.limits.connections} connections are in use", "try again later"
+            )
+        gateway = self._gateway(route, peer)
+        key_id = self._key_id(peer, hello, gateway)
+        resume_of = self._resume(hello, key_id)
+        number = self._tokens.new_connection()
+        connection = Connection(
+            number, route, peer, peer_of(peer.descriptor), key_id, hello, gateway.number if gateway else 0
+        )
+        join = Join(
+            key_id,
+            hello.role,
+            hello.name,
+            hello.software,
+            hello.devices,
+            hello.capabilities,
+            hello.alignment,
+            resume_of,
+            connection.gateway,
+        )
+        return connection, join
+
+    def _gateway(self, route: Route, peer: Peer) -> Connection | None:
+        """The gateway that speaks, `None` for a client of its own."""
+        if not route.on_behalf_of:
+            return None
+        gateway = self._clients.find(Route(route.routing_id), peer)
+        if gateway is None or not gateway.admitted or gateway.hello.role != Role.GATEWAY:
+            raise _RefusedError(
+                RefusalCode.GATEWAY_ONLY,
+                "only an admitted participant with role 'gateway' may speak on behalf of others",
+                "leave on_behalf_of empty",
+            )
+        return gateway
+
+    def _key_id(self, peer: Peer, hello: Hello, gateway: Connection | None) -> str:
+        if gateway is None and peer.user_id:
+            return peer.user_id
+        if len(hello.secret) < SECRET_BYTES:
+            raise _RefusedError(
+                RefusalCode.IDENTITY,
+                f"hello has a secret of {len(hello.secret)} bytes, at least {SECRET_BYTES} are needed",
+                "make 16 random bytes once, keep them, and send them in every hello",
+            )
+        return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
+
+    def _resume(self, hello: Hello, key_id: str) -> str:
+        if not hello.resume_token:
+            return ""
+        participant_id = self._tokens.find(hello.resume_token, key_id)
+        if participant_id is None:
+            raise _RefusedError(
+                RefusalCode.RESUME_TOKEN, "this resume token is used, unknown, or of another key", "join without one"
+            )
+        return participant_id
+
+    def welcome(self, admitted: Admitted, now_ns: int) -> None:
+        """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over."""
+        connection = self._clients.by_number.get(admitted.connection)
+        if connection is None:
+            return
+        config = self._config
+        token = self._tokens.issue(connection.key_id, admitted.participant_id)
+        self._hand_back(self._tokens.blob())
+        connection.admitted = True
+        self._outbox.send(
+            connection,
+            Welcome(
+                config.session_id,
+                config.session_name,
+                config.session_kind,
+                admitted.participant_id,
+                connection.number,
+                admitted.role,
+                token,
+                admitted.resumed,
+                now_ns,
+                config.heartbeat_ns,
+                config.tick_period_ns,
+                config.state_period_ns,
+                Endpoints(self._ports.state, config.media_port, config.assets_port, config.web_port),
+                self._ports.key_fingerprint,
+            ),
+        )
+
+    def confirmed(self, connection: Connection) -> None:
+        """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
+        if connection.hello.resume_token:
+            self._tokens.retire(connection.hello.resume_token)
+            self._hand_back(self._tokens.blob())

@@ -1,0 +1,89 @@
+"""Turns the observations of one connection into alignment proposals, at a bounded rate. The estimator is `anchors`'."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.pose import IDENTITY_POSE, PoseTuple
+from iris_session.protocol.client_messages import Observation
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import AlignmentProposal
+
+
+class AlignmentDesk:
+    """Observations in, proposals out: when something new was observed, and at most one per `period_ns`."""
+
+    def __init__(self, anchors: dict[str, PoseTuple], period_ns: int) -> None:
+        self._anchors = anchors
+        self._period_ns = period_ns
+        self._estimator = AlignmentEstimator(anchors)
+        self._next_ns = 0
+        self._pending = False
+        self._unknown: tuple[str, int] | None = None
+        self._last: AlignmentProposal | None = None
+
+    def observe(self, observation: Observation) -> bool:
+        """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform)."""
+        if observation.anchor_id not in self._anchors:
+            self._unknown = (observation.anchor_id, observation.tracking_epoch)
+            self._pending = True
+            return False
+        pose = observation.T_tracking_anchor
+        self._unknown = None
+        used = self._estimator.add(
+            observation.anchor_id,
+            (pose.p, pose.q),
+            observation.capture_ns,
+            observation.tracking_epoch,
+            viewpoint_id=observation.viewpoint_id,
+            quality=observation.quality,
+            size_m=observation.size_m,
+            covariance=observation.covariance,
+        )
+        self._pending = self._pending or used
+        return used
+
+    def due(self, now_ns: int) -> bool:
+        return self._pending and now_ns >= self._next_ns
+
+    def propose(self, now_ns: int) -> AlignmentProposal | None:
+        """Estimates from everything observed. `None`: the result is the same as the last one."""
+        self._pending = False
+        self._next_ns = now_ns + self._period_ns
+        if self._unknown is not None:
+            proposal = self._unknown_anchor(*self._unknown)
+        else:
+            try:
+                proposal = _proposal(self._estimator.estimate())
+            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+                proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
+        if proposal == self._last:
+            return None
+        self._last = proposal
+        return proposal
+
+    def _unknown_anchor(self, anchor_id: str, tracking_epoch: int) -> AlignmentProposal:
+        known = ", ".join(sorted(self._anchors)) or "none"
+        return _refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}"[:512])
+
+
+def _refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
+    p, q = IDENTITY_POSE
+    return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice)
+
+
+def _proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
+    p, q = estimate.T_world_tracking
+    return AlignmentProposal(
+        Pose(p, q),
+        estimate.tracking_epoch,
+        tuple(estimate.covariance),
+        estimate.pivot_world,
+        estimate.error_at_anchor_m,
+        residual_tilt_rad=estimate.residual_tilt_rad,
+        n_observations=estimate.n_observations,
+        n_viewpoints=estimate.n_viewpoints,
+        refused=estimate.refused,
+        advice=estimate.advice,
+    )

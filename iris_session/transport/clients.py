@@ -1,0 +1,159 @@
+"""Connections as the front knows them, and sending to them without ever waiting.
+
+A connection is one accepted `hello`. It is found by its route (ZeroMQ routing id, and for those behind a gateway the
+name that the gateway gave), but it is bound to the TCP connection and key that said `hello`: another peer that comes
+to own the same routing id is a stranger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import zmq
+
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.server_messages import ServerMessage
+from iris_session.transport.config import FrontLimits
+from iris_session.transport.limiter import Drops, TokenBucket
+
+_encoder = msgspec.msgpack.Encoder()
+
+
+class Route(NamedTuple):
+    """Where a message came from. `on_behalf_of` is empty but for participants behind a gateway."""
+
+    routing_id: bytes
+    on_behalf_of: str = ""
+
+
+class Peer(NamedTuple):
+    """The TCP connection and the CURVE user id (fingerprint, empty on plain sockets) that a message came by."""
+
+    descriptor: int
+    user_id: str
+
+
+class Connection:
+    """One accepted `hello`, until it is lost or dropped."""
+
+    __slots__ = (
+        "address",
+        "admitted",
+        "confirmed",
+        "drops_in_a_row",
+        "faults",
+        "gateway",
+        "hello",
+        "key_id",
+        "last_heard_ns",
+        "number",
+        "peer",
+        "prefix",
+        "rates",
+        "route",
+    )
+
+    def __init__(
+        self, number: int, route: Route, peer: Peer, address: tuple[str, int], key_id: str, hello: Hello, gateway: int
+    ) -> None:
+        self.number = number
+        self.route = route
+        self.peer = peer
+        self.address = address
+        self.key_id = key_id
+        self.hello = hello
+        self.gateway = gateway
+        self.admitted = False
+        self.confirmed = False  # a message with its connection epoch has come: it has its `Welcome`
+        self.last_heard_ns = 0
+        self.drops_in_a_row = 0
+        self.faults = TokenBucket(2.0, 5.0)
+        self.rates = RateLimiter()
+        self.prefix = server_prefix(number)
+
+
+class ClientTable:
+    """All connections, by number and by route."""
+
+    def __init__(self) -> None:
+        self.by_number: dict[int, Connection] = {}
+        self.by_route: dict[Route, Connection] = {}
+
+    def __len__(self) -> int:
+        return len(self.by_number)
+
+    def add(self, connection: Connection) -> None:
+        self.by_number[connection.number] = connection
+        self.by_route[connection.route] = connection
+
+    def remove(self, connection: Connection) -> None:
+        self.by_number.pop(connection.number, None)
+        if self.by_route.get(connection.route) is connection:
+            del self.by_route[connection.route]
+
+    def find(self, route: Route, peer: Peer) -> Connection | None:
+        """The connection of a route, if it still is the peer that said `hello`."""
+        connection = self.by_route.get(route)
+        return connection if connection is not None and connection.peer == peer else None
+
+    def behind(self, gateway: Connection) -> list[Connection]:
+        """Connections that a gateway speaks for."""
+        return [c for c in self.by_number.values() if c.gateway == gateway.number]
+
+
+def server_prefix(connection_epoch: int) -> bytes:
+    """The bytes of a `ServerEnvelope` before its message: one encoded message serves every connection."""
+    return b"\x93" + _encoder.encode(PROTOCOL_VERSION) + _encoder.encode(connection_epoch)
+
+
+class Outbox:
+    """Sends on the control socket. What a socket does not take at once is dropped and counted."""
+
+    def __init__(self, control: zmq.Socket[bytes], limits: FrontLimits, drops: Drops) -> None:
+        self._control = control
+        self._limits = limits
+        self._drops = drops
+        #: Connections found gone or too slow while sending, with the reason; the loop takes leave of them.
+        self.failed: dict[int, str] = {}
+
+    def send(self, connection: Connection, message: ServerMessage, *bulk: bytes) -> bool:
+        """Sends one message, and bulk frames after it."""
+        return self.send_encoded(connection, _encoder.encode(message), bulk)
+
+    def send_encoded(self, connection: Connection, message: bytes, bulk: Sequence[bytes] = ()) -> bool:
+        """Sends an encoded message. A connection that loses `slow_drops` messages in a row is listed as slow."""
+        sent = self._send(connection.route, connection.prefix + message, bulk)
+        if sent:
+            connection.drops_in_a_row = 0
+            return True
+        connection.drops_in_a_row += 1
+        self._drops.count("send_queue_full", connection.number)
+        if connection.drops_in_a_row >= self._limits.slow_drops:
+            self.failed.setdefault(connection.number, "slow")
+        return False
+
+    def send_to_route(self, route: Route, message: ServerMessage) -> None:
+        """Sends to somebody who has no connection number: a refusal, or a fault before `hello`."""
+        if not self._send(route, server_prefix(0) + _encoder.encode(message), ()):
+            self._drops.count("send_queue_full")
+
+    def _send(self, route: Route, envelope: bytes, bulk: Sequence[bytes]) -> bool:
+        frames = [route.routing_id, envelope, *bulk]
+        if route.on_behalf_of:
+            frames.append(route.on_behalf_of.encode())  # last frame: whom of those behind the gateway this is for
+        try:
+            self._control.send_multipart(frames, zmq.DONTWAIT)
+        except zmq.ZMQError as error:
+            if error.errno in (zmq.EAGAIN, zmq.EHOSTUNREACH):
+                return False
+            raise
+        return True
+
+
+def encode_message(message: ServerMessage) -> bytes:
+    """Bytes for `Outbox.send_encoded`."""
+    return _encoder.encode(message)

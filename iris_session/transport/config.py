@@ -1,0 +1,116 @@
+"""What the front process is told at its start: endpoints, limits, anchors, the scene. Plain data, no behaviour.
+
+`FrontStart` travels as MessagePack on the standard input of the front, never in its arguments.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import BodyInfo, RobotInfo
+
+MILLISECOND: Final = 1_000_000
+SECOND: Final = 1_000_000_000
+
+
+class FrontLimits(msgspec.Struct, frozen=True):
+    """Bounds of everything that a client can make the front hold or do. Sizes and rates per message type:
+    `protocol.limits`.
+
+    `pending_messages`, `pending_urgent`, `pending_devices`, `pending_samples`: waiting for the authority, per
+    connection (samples: per device). `unacknowledged`: batches on the way to the authority; urgent ones may use as
+    many again. `slow_drops`: messages in a row that a client's socket did not take before it counts as lost.
+    """
+
+    connections: int = 64
+    hellos_per_second: float = 40.0
+    hello_burst: int = 80
+    pending_messages: int = 64
+    pending_urgent: int = 8
+    pending_devices: int = 16
+    pending_samples: int = 16
+    batch_entries: int = 512
+    unacknowledged: int = 8
+    send_queue: int = 256
+    slow_drops: int = 64
+    resume_tokens: int = 1024
+
+
+class SceneInfo(msgspec.Struct, frozen=True):
+    """What the front adds to every `Snapshot`. `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, little-endian,
+    used until the first state frame."""
+
+    scene_hash: str
+    robots: tuple[RobotInfo, ...] = ()
+    bodies: tuple[BodyInfo, ...] = ()
+    poses: bytes = b""
+
+
+class FrontConfig(msgspec.Struct, frozen=True):
+    """Configuration of the front. Port 0: any free one.
+
+    `host`: address to listen on. Any other than loopback needs CURVE: `curve_secret_file` is the server's ZeroMQ
+    certificate (`*.key_secret`), `curve_clients_dir` holds the public certificates (`*.key`) of the clients that may
+    connect. `origin_ns`: `time.monotonic_ns()` at session time 0. `recorder_endpoint`: a PULL socket that takes raw
+    samples, empty when nothing is recorded. `forward_observations`: raw observations reach the authority too.
+    """
+
+    host: str = "127.0.0.1"
+    control_port: int = 7721
+    state_port: int = 7722
+    media_port: int = 0
+    assets_port: int = 0
+    web_port: int = 0
+    session_id: str = ""
+    session_name: str = "session"
+    session_kind: str = "live"
+    origin_ns: int = 0
+    heartbeat_ns: int = 500 * MILLISECOND
+    silence_ns: int = 2 * SECOND
+    stall_ns: int = 100 * MILLISECOND
+    parent_silence_ns: int = 2 * SECOND
+    presence_period_ns: int = SECOND // 60
+    proposal_period_ns: int = SECOND // 5
+    tick_period_ns: int = 2 * MILLISECOND
+    state_period_ns: int = SECOND // 60
+    limits: FrontLimits = FrontLimits()
+    curve_secret_file: str = ""
+    curve_clients_dir: str = ""
+    anchors: dict[str, Pose] = {}
+    forward_observations: bool = False
+    recorder_endpoint: str = ""
+
+    @property
+    def loopback(self) -> bool:
+        """True when only this machine can reach the sockets."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+class Ports(msgspec.Struct, frozen=True):
+    """Where the front listens. `key_fingerprint`: of the server's CURVE key, empty without one."""
+
+    host: str
+    control: int
+    state: int
+    key_fingerprint: str = ""
+
+
+class FrontStart(msgspec.Struct, frozen=True):
+    """Standard input of the front process. `handback`: opaque memory of a front that this one replaces."""
+
+    config: FrontConfig
+    scene: SceneInfo
+    link_endpoint: str
+    parent_pid: int
+    handback: bytes = b""
+
+
+class FrontError(Exception):
+    """The front cannot run. The text is one line that says what to do."""

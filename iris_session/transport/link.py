@@ -1,0 +1,161 @@
+"""The authority's side of the link to the front: entries in, decisions and state out. No thread, never waits."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import zmq
+
+from iris_session.protocol.entries import HOST, Entry, FrontRestarted, decode_entries
+from iris_session.protocol.server_messages import PresenceItem, StateHeader
+from iris_session.protocol.steps import Decision
+from iris_session.transport import link_messages as messages
+from iris_session.transport.config import FrontConfig, Ports, SceneInfo
+from iris_session.transport.sockets import readable
+
+#: Messages taken from the front in one `poll`; more than its credits allow cannot wait.
+_POLL_BOUND: Final = 64
+_SEND_QUEUE: Final = 256
+#: Decisions kept while the front does not read; when they are full the front is given up.
+_BACKLOG: Final = 4096
+
+
+class FrontLink:
+    """Talks to one front process at a time; `open` starts over for a new one.
+
+    `ports`: where the front listens, `None` until it is ready. `failure`: why it could not start. `status`: its
+    counters. `state_drops`: state frames that the front did not take. `overrun`: it reads nothing any more.
+    """
+
+    def __init__(self, config: FrontConfig, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._config = config
+        self._monotonic_ns = monotonic_ns
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._socket: zmq.Socket[bytes] | None = None
+        self._restarted = False
+        self._presence: dict[tuple[str, str], PresenceItem] = {}
+        self._presence_ns = 0
+        self._sent_ns = 0
+        self._backlog: deque[tuple[bytes, bytes]] = deque()
+        self.ports: Ports | None = None
+        self.failure = ""
+        self.status = messages.FrontStatus(0, {}, {})
+        self.handback = b""
+        self.state_drops = 0
+        self.overrun = False
+        self._events = 0
+
+    def open(self, path: Path) -> str:
+        """Listens on a new ipc socket at `path` for the next front; gives its endpoint."""
+        if self._socket is not None:
+            self._socket.close(linger=0)
+            self._restarted = self._restarted or self.ports is not None
+        self.ports, self.failure, self.overrun = None, "", False
+        self._backlog.clear()
+        self._socket = self._context.socket(zmq.PAIR)
+        self._socket.setsockopt(zmq.SNDHWM, _SEND_QUEUE)
+        self._socket.setsockopt(zmq.RCVHWM, 0)  # bounded by the front's credits
+        endpoint = f"ipc://{path}"
+        self._socket.bind(endpoint)
+        return endpoint
+
+    @property
+    def now_ns(self) -> int:
+        """Session time."""
+        return self._monotonic_ns() - self._config.origin_ns
+
+    def poll(self) -> list[Entry]:
+        """Entries since the last call, in the order to be given to the authority. Never waits."""
+        entries: list[Entry] = []
+        if self._restarted:
+            self._restarted = False
+            entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
+        socket = self._socket
+        if socket is None or not readable(socket):
+            return entries
+        batches = 0
+        for _ in range(_POLL_BOUND):
+            kind, payload = socket.recv_multipart(zmq.DONTWAIT)
+            if kind == messages.ENTRIES:
+                entries += decode_entries(payload)
+                batches += 1
+            elif kind == messages.HANDBACK:
+                self.handback = payload
+            elif kind == messages.STATUS:
+                self.status = messages.decode_status(payload)
+            elif kind == messages.READY:
+                self.ports = messages.decode_ports(payload)
+            elif kind == messages.FAILED:
+                self.failure = payload.decode()
+            if not readable(socket):
+                break
+        if batches:
+            self._send(messages.ACK, bytes((batches,)))
+        return entries
+
+    def send_decision(self, step: int, decision: Decision) -> None:
+        """Gives the front what leaves the process; call it in every step, it also says that the session lives."""
+        for item in decision.presence:
+            self._presence[(item.participant, item.device)] = item
+        if decision.outgoing or decision.events or decision.admitted or decision.dropped:
+            decided = messages.Decided(step, decision.admitted, decision.outgoing, decision.events, decision.dropped)
+            self._send(messages.DECIDED, messages.encoder.encode(decided))
+        now_ns = self._monotonic_ns()
+        if self._presence and now_ns - self._presence_ns >= self._config.presence_period_ns:
+            self._presence_ns = now_ns
+            items = tuple(self._presence.values())
+            self._presence.clear()
+            self._send(messages.PRESENCE, messages.encoder.encode(items))
+        elif now_ns - self._sent_ns > messages.KEEPALIVE_NS:
+            self._send(messages.ALIVE, b"")
+
+    def send_state(self, header: StateHeader, poses: npt.NDArray[np.float64]) -> None:
+        """State after a tick: `poses` (n, 7) float64 C-contiguous, `x y z qw qx qy qz`, world, in the order of the
+        scene's bodies. The front fills `published_ns`, `state_seq` and `base_seq`. A front that does not keep up
+        loses frames, counted in `state_drops`."""
+        if self._socket is None or self.ports is None:
+            return
+        try:
+            self._socket.send_multipart(
+                (messages.STATE, messages.encoder.encode(header), np.ascontiguousarray(poses).data), zmq.DONTWAIT
+            )
+            self._sent_ns = self._monotonic_ns()
+        except zmq.Again:
+            self.state_drops += 1
+
+    def send_scene(self, scene: SceneInfo) -> None:
+        """Another scene: later snapshots and states are of its bodies."""
+        self._send(messages.SCENE, messages.encoder.encode(scene))
+
+    def send_end(self) -> None:
+        """Asks the front to tell its clients that the session ends, and to exit."""
+        self._send(messages.END, b"")
+
+    def _send(self, kind: bytes, payload: bytes) -> None:
+        """Sends in order; keeps a bounded backlog while the front does not read."""
+        if self._socket is None or self.ports is None:
+            return
+        self._backlog.append((kind, payload))
+        try:
+            while self._backlog:
+                self._socket.send_multipart(self._backlog[0], zmq.DONTWAIT)
+                self._backlog.popleft()
+        except zmq.Again:
+            self.overrun = self.overrun or len(self._backlog) > _BACKLOG
+            if self.overrun:
+                self._backlog.clear()
+            return
+        self._sent_ns = self._monotonic_ns()
+
+    def close(self) -> None:
+        """Closes the socket. The front notices by its parent's end or by `send_end`."""
+        if self._socket is not None:
+            self._socket.close(linger=200)
+            self._socket = None
+        self._context.term()

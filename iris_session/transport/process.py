@@ -1,0 +1,125 @@
+"""Starting, watching, restarting and ending the front process. The parent's side; no thread."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+
+from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
+from iris_session.transport.link import FrontLink
+
+
+class FrontProcess:
+    """One front of a session, and its successors.
+
+        process = FrontProcess(config, scene)
+        ports = process.start()
+        entries = process.link.poll()
+        ...
+        if not process.alive:
+            process.restart()          # same ports, resume tokens stay valid
+        process.close()
+
+    The front runs in a session of its own, so Ctrl-C in the terminal reaches only the parent, which then closes it.
+    """
+
+    def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
+        self._config = config
+        self._scene = scene
+        self._folder = tempfile.TemporaryDirectory(prefix="iris-")  # mode 0700
+        self._generation = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self.link = FrontLink(config)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the present front, 0 without one."""
+        return 0 if self._process is None else self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the front runs and reads its link."""
+        return self._process is not None and self._process.poll() is None and not self.link.overrun
+
+    @property
+    def restarts(self) -> int:
+        return max(0, self._generation - 1)
+
+    def start(self, timeout_s: float = 15.0) -> Ports:
+        """Starts the front and waits until it listens.
+
+        Raises `FrontError` with one line that says what to do: a port in use, a missing key, a wrong address.
+        """
+        self._spawn()
+        return self.wait_ready(timeout_s)
+
+    def restart(self) -> None:
+        """Replaces a front that died, on the same ports. Does not wait: `link.ports` is set when it is ready."""
+        self._end_process(0.0)
+        ports = self.link.ports
+        if ports is not None:
+            self._config = msgspec.structs.replace(self._config, control_port=ports.control, state_port=ports.state)
+        self._spawn()
+
+    def set_scene(self, scene: SceneInfo) -> None:
+        """Another scene, for this front and its successors."""
+        self._scene = scene
+        self.link.send_scene(scene)
+
+    def wait_ready(self, timeout_s: float) -> Ports:
+        """Waits for `Ready`. Raises `FrontError` when the front fails, dies or says nothing for `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            running = self._process is not None and self._process.poll() is None
+            self.link.poll()
+            if self.link.ports is not None:
+                return self.link.ports
+            if self.link.failure or not running:
+                text = self.link.failure or "the front process ended at its start, see its messages above"
+                self.close()
+                raise FrontError(text)
+            time.sleep(0.002)
+        self.close()
+        raise FrontError(f"the front process was not ready after {timeout_s:g} s")
+
+    def _spawn(self) -> None:
+        self._generation += 1
+        folder = Path(self._folder.name)
+        endpoint = self.link.open(folder / f"front-{self._generation}")
+        start = FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
+        # A file instead of a pipe: a large scene must not make the parent wait until the front reads.
+        path = folder / "start"
+        path.write_bytes(msgspec.msgpack.encode(start))
+        with path.open("rb") as stdin:
+            path.unlink()
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "iris_session.transport.front"], stdin=stdin, start_new_session=True
+            )
+
+    def _end_process(self, patience_s: float) -> None:
+        process = self._process
+        if process is None:
+            return
+        try:
+            process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            try:
+                process.wait(1.0 if patience_s else 0.05)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
+        self.link.send_end()
+        self._end_process(timeout_s if self.link.ports is not None else 0.0)
+        self._process = None
+        self.link.close()
+        self._folder.cleanup()

@@ -1,0 +1,74 @@
+"""Rigid state and presence on the PUB socket: encodes each state frame once, stamps it when it is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import zmq
+
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, Presence, PresenceItem, StateHeader
+from iris_session.streams.rigid import RigidEncoder
+from iris_session.transport.config import SceneInfo
+
+POSE_BYTES = 56  # seven float64
+_encoder = msgspec.msgpack.Encoder()
+_decode_header = msgspec.msgpack.Decoder(StateHeader).decode
+
+
+class StatePublisher:
+    """Latest value only: nothing waits here, and a subscriber that does not keep up loses frames in its own queue."""
+
+    def __init__(
+        self, state: zmq.Socket[bytes], scene: SceneInfo, now_ns: Callable[[], int], first_seq: int = 1
+    ) -> None:
+        self._state = state
+        self._now_ns = now_ns
+        self._next_seq = first_seq
+        self.frames = 0
+        self.set_scene(scene)
+
+    def set_scene(self, scene: SceneInfo) -> None:
+        """Takes over another scene: later frames have its bodies."""
+        self.scene = scene
+        self._encoder = RigidEncoder(len(scene.bodies), self._next_seq)
+        self._published = False
+
+    def publish(self, header: bytes, poses: bytes) -> bool:
+        """Encodes and sends one state. `header`: encoded `StateHeader` without its `published_ns` and `*_seq`.
+
+        False: the poses are not those of the present scene.
+        """
+        n = len(self.scene.bodies)
+        if len(poses) != n * POSE_BYTES:
+            return False
+        head = _decode_header(header)
+        frame = self._encoder.encode(np.frombuffer(poses, np.float64).reshape(n, 7), head.scene_epoch)
+        self._published = True
+        self._next_seq = frame.state_seq + 1
+        stamped = StateHeader(
+            head.scene_epoch,
+            head.scene_revision,
+            head.tick,
+            head.sim_time,
+            head.session_time,
+            self._now_ns(),
+            frame.state_seq,
+            frame.base_seq,
+            head.applied,
+        )
+        self._state.send_multipart((TOPIC_RIGID, _encoder.encode(stamped), frame.payload))
+        self.frames += 1
+        return True
+
+    def publish_presence(self, session_time: int, items: tuple[PresenceItem, ...]) -> None:
+        presence = Presence(session_time, self._now_ns(), items)
+        self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
+
+    def keyframe(self) -> tuple[int, bytes]:
+        """`(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, or of the scene before the first."""
+        if not self._published:
+            return 0, self.scene.poses
+        seq, poses = self._encoder.keyframe()
+        return seq, poses.tobytes()
