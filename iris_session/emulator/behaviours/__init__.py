@@ -1,0 +1,44 @@
+"""Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
+
+`base` (the contract), `giver` and `receiver` (hand a thing over in mid-air), `wander` (motion without a task).
+"""
+
+from __future__ import annotations
+
+from iris_session.emulator.behaviours.base import Behaviour, HandInput, OperatorView
+from iris_session.emulator.behaviours.giver import Giver
+from iris_session.emulator.behaviours.receiver import Receiver
+from iris_session.emulator.behaviours.wander import Idle, Wander
+from iris_session.protocol.names import Device
+
+__all__ = ["Behaviour", "Giver", "HandInput", "Idle", "OperatorView", "Receiver", "Wander", "make_behaviour"]
+
+NAMES = ("giver", "receiver", "wander", "idle")
+
+
+def make_behaviour(
+    name: str,
+    robot: str,
+    object: str = "hammer",
+    partner: str = "",
+    device: str = Device.CONTROLLER_RIGHT,
+    seed: int = 0,
+) -> Behaviour:
+    """The behaviour `name` for `robot`. `partner`: the other robot of a handover; default the other of left and right.
+
+    Raises `ValueError` naming what is available.
+    """
+    if name in {"giver", "receiver"} and not partner:
+        if robot not in {"left", "right"}:
+            raise ValueError(f"the {name} of '{robot}' needs a partner: the name of the other robot")
+        partner = "right" if robot == "left" else "left"
+    match name:
+        case "giver":
+            return Giver(robot, object, partner, device)
+        case "receiver":
+            return Receiver(robot, object, partner, device)
+        case "wander":
+            return Wander(robot, device, seed)
+        case "idle":
+            return Idle(robot, device)
+    raise ValueError(f"no behaviour '{name}'. Available behaviours: {', '.join(NAMES)}")

@@ -1,0 +1,62 @@
+"""What a scripted operator is given and what it gives back. Nothing here knows the network, the headset or MuJoCo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from anchors.pose import PoseTuple
+
+
+class OperatorView(Protocol):
+    """What the person sees through the headset: the state stream, in the world frame, late and noisy as it is."""
+
+    @property
+    def session_time_ns(self) -> int:
+        """The present session time by the client's clock; never goes back."""
+        ...
+
+    @property
+    def estop(self) -> bool: ...
+
+    def body_pose(self, name: str) -> PoseTuple | None:
+        """Pose of a body of the scene; `None`: not in the stream."""
+        ...
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        """Pose of the robot's end-effector site; `None`: not in the stream."""
+        ...
+
+    def lease_version(self, robot: str) -> int | None:
+        """Version of my lease on `robot`; `None`: it is not mine."""
+        ...
+
+    def device_pose(self, device: str) -> PoseTuple:
+        """Where my own hand is now."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class HandInput:
+    """What the person does with one hand at this moment. `gripper`: trigger, 0 open to 1 closed."""
+
+    device: str
+    robot: str
+    pose_world: PoseTuple
+    clutch: bool
+    gripper: float
+
+
+class Behaviour(Protocol):
+    """A closed loop from what is seen to what the hands do.
+
+    `phase`: what it is at, one word. `done`: it will only keep still from now on. `failed`: why it gave up, else "".
+    """
+
+    phase: str
+    done: bool
+    failed: str
+
+    def update(self, view: OperatorView) -> tuple[HandInput, ...]:
+        """Called once per headset frame or input sample (60-90 Hz)."""
+        ...

@@ -1,0 +1,103 @@
+"""What a person makes of the picture: poses smoothed over a few frames, and whether a thing keeps still."""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import PoseTuple, Vec3, apply, distance, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
+from iris_session.emulator.behaviours.base import OperatorView
+from iris_session.emulator.behaviours.things import PAD_IN_FINGER
+
+#: Smoothing time of vision [s]: averages 1 mm of noise at 60-90 Hz to about 0.4 mm.
+SMOOTHING_S = 0.07
+#: A thing that stays within this distance [m] keeps still.
+STILL_M = 0.005
+
+
+class Seen:
+    """A pose smoothed over `SMOOTHING_S`, and since when it stays where it is."""
+
+    def __init__(self, pose: PoseTuple, now_s: float) -> None:
+        self.pose = pose
+        self._now_s = now_s
+        self._rest = pose[0]
+        self._rest_since_s = now_s
+
+    def update(self, pose: PoseTuple, now_s: float) -> None:
+        a = 1.0 - math.exp(-(now_s - self._now_s) / SMOOTHING_S)
+        (x, y, z), q = self.pose
+        rx, ry, rz = quat_to_rotvec(quat_mul(pose[1], quat_conj(q)))
+        p = (x + a * (pose[0][0] - x), y + a * (pose[0][1] - y), z + a * (pose[0][2] - z))
+        self.pose = (p, quat_mul(quat_from_rotvec((a * rx, a * ry, a * rz)), q))
+        self._now_s = now_s
+        if distance(p, self._rest) > STILL_M:
+            self._rest, self._rest_since_s = p, now_s
+
+    @property
+    def still_s(self) -> float:
+        """For how long [s] it has kept still."""
+        return self._now_s - self._rest_since_s
+
+
+class Eyes:
+    """Watches bodies and robot tips by name. `ready` once every one of them was seen.
+
+    `perhaps`: bodies that need not be there.
+    """
+
+    def __init__(self, bodies: tuple[str, ...], robots: tuple[str, ...], perhaps: tuple[str, ...] = ()) -> None:
+        fingers = tuple(f"{robot}/finger_{side}" for robot in robots for side in ("left", "right"))
+        self._bodies = bodies + fingers + tuple(f"{robot}/base" for robot in robots)
+        self._robots = robots
+        self._perhaps = perhaps
+        self._seen: dict[str, Seen] = {}
+        self._others: list[Vec3] = []
+        self.ready = False
+
+    def look(self, view: OperatorView) -> None:
+        """Takes in the present picture. What is not in it stays as it was last seen."""
+        now_s = view.session_time_ns * 1e-9
+        poses = [(name, view.body_pose(name)) for name in self._bodies]
+        poses += [(f"tip {robot}", view.tip_pose(robot)) for robot in self._robots]
+        for name, pose in poses:
+            if pose is None:
+                continue
+            if name in self._seen:
+                self._seen[name].update(pose, now_s)
+            else:
+                self._seen[name] = Seen(pose, now_s)
+        self.ready = len(self._seen) == len(poses)
+        self._others = [pose[0] for pose in map(view.body_pose, self._perhaps) if pose is not None]
+
+    def others(self) -> list[Vec3]:
+        """Where those of `perhaps` are [m] that are there."""
+        return self._others
+
+    def body(self, name: str) -> PoseTuple:
+        return self._seen[name].pose
+
+    def tip(self, robot: str) -> PoseTuple:
+        return self._seen[f"tip {robot}"].pose
+
+    def still_s(self, name: str) -> float:
+        """For how long [s] the body `name` has kept still."""
+        return self._seen[name].still_s
+
+    def pads(self, robot: str) -> tuple[Vec3, Vec3]:
+        """Where the faces of the two finger pads are [m], world frame."""
+        left, right = (self._seen[f"{robot}/finger_{side}"].pose for side in ("left", "right"))
+        return apply(left, PAD_IN_FINGER), apply(right, PAD_IN_FINGER)
+
+    def gap(self, robot: str) -> float:
+        """Distance between the finger pads [m]."""
+        return distance(*self.pads(robot))
+
+    def holds(self, robot: str, name: str, half_width: float) -> bool:
+        """Whether the pads of `robot` lie on the two sides of `name` (half width [m] along its y), closed on it."""
+        (px, py, pz), q = self.body(name)
+        inverse_q = quat_conj(q)
+        local = [apply(((0.0, 0.0, 0.0), inverse_q), (p[0] - px, p[1] - py, p[2] - pz)) for p in self.pads(robot)]
+        low, high = sorted(p[1] for p in local)
+        on_both_sides = abs(low + half_width) < 0.006 and abs(high - half_width) < 0.006
+        along = all(abs(p[0]) < 0.15 and abs(p[2]) < 0.02 for p in local)
+        return on_both_sides and along

@@ -1,0 +1,186 @@
+"""The hand of a scripted operator: moves a robot's tip by clutched relative motion, looking at where the tip goes.
+
+While the clutch is closed the tip follows the *changes* of the hand. The operator therefore moves the hand as he wants
+the tip to move, and when the movement is over he adds what is still missing, as a person does. When the robot does
+not follow (the session holds it, or the engagement was lost), he opens the clutch, waits a moment and takes hold again.
+"""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import (
+    IDENTITY_POSE,
+    PoseTuple,
+    Vec3,
+    quat_conj,
+    quat_from_rotvec,
+    quat_mul,
+    quat_normalize,
+    quat_to_rotvec,
+)
+from iris_session.emulator.behaviours.base import HandInput, OperatorView
+from iris_session.emulator.behaviours.reach import Reach
+
+#: Peak speeds of free movements; the hand itself stays below 0.5 m/s with corrections added.
+SPEED = 0.40  # m/s
+TURN = 1.6  # rad/s
+#: Visual corrections: per second of remaining error. Times the loop delay (0.1-0.2 s) well below 1, so it is stable.
+CORRECTION_RATE = 3.0
+CORRECTION_SPEED = 0.06  # m/s
+CORRECTION_TURN = 0.3  # rad/s
+CORRECTION_MOST = 0.05  # m, and rad times ten
+#: The tip is this far from where it should be, for so long: the robot does not follow.
+LOST_M = 0.08
+LOST_RAD = 0.4
+LOST_S = 0.7
+#: The clutch stays open so long before it is closed again [s].
+REARM_S = 0.25
+#: Pulling or releasing the trigger takes so long [s].
+TRIGGER_S = 0.4
+#: Longest step of the operator's own clock [s]: after a stall of the computer the hand goes on, it does not jump.
+LONGEST_STEP_S = 0.05
+
+
+class ClutchedHand:
+    """One hand on one robot. Call `update` once per sample, then `input`; goals are tip poses in the world."""
+
+    def __init__(self, device: str, robot: str) -> None:
+        self.device, self.robot = device, robot
+        self.now_s = 0.0  # the operator's own clock: runs only while he can act
+        self.reclutches = 0
+        self.trigger_goal = 0.0
+        self._trigger = 0.0
+        self._last_ns: int | None = None
+        self._engaged = False
+        self._rearm_s = 0.0
+        self._hand: PoseTuple = IDENTITY_POSE
+        self._hand_at_engage: PoseTuple = IDENTITY_POSE
+        self._tip_at_engage: PoseTuple = IDENTITY_POSE
+        self._correction_p: Vec3 = (0.0, 0.0, 0.0)
+        self._correction_r: Vec3 = (0.0, 0.0, 0.0)
+        self._goal: PoseTuple | None = None
+        self._speed, self._turn = SPEED, TURN
+        self._reach: Reach | None = None
+        self._correcting = True
+        self._missing_m, self._missing_rad = math.inf, math.inf
+        self._close_since_s = math.inf
+        self._lost_since_s = math.inf
+
+    def update(self, view: OperatorView, tip: PoseTuple | None) -> bool:
+        """Advances the hand to the present. `tip`: where the tip is seen. Returns whether the operator can act."""
+        step_s = self._clock(view.session_time_ns)
+        if tip is None or view.estop or view.lease_version(self.robot) is None:
+            self._open(view)
+            return False
+        self.now_s += step_s
+        rate = step_s / TRIGGER_S
+        if not self._engaged:
+            self._hand = view.device_pose(self.device)
+            if self.now_s >= self._rearm_s:
+                self._engage(tip)
+        else:
+            self._trigger += min(max(self.trigger_goal - self._trigger, -rate), rate)
+            self._follow(tip, step_s, view)
+        return True
+
+    def move_to(self, goal: PoseTuple, speed: float = SPEED, turn: float = TURN, correct: bool = True) -> None:
+        """Starts a movement of the tip to `goal`. `correct`: add what is missing at the end, until told otherwise."""
+        self._goal, self._speed, self._turn, self._correcting = goal, speed, turn, correct
+        self._close_since_s = math.inf
+        if self._engaged:
+            self._reach = Reach.plan(self._reference(), goal, self.now_s, speed, turn)
+
+    def hold_still(self) -> None:
+        """Keeps the hand where it is: no corrections while two robots hold the same thing."""
+        self._correcting = False
+
+    def arrived(self, within_m: float = 0.003, within_rad: float = 0.02, for_s: float = 0.12) -> bool:
+        """Whether the movement is over and the tip was seen at the goal for `for_s` seconds."""
+        if not self.moved():
+            return False
+        if self._missing_m > within_m or self._missing_rad > within_rad:
+            self._close_since_s = math.inf
+            return False
+        self._close_since_s = min(self._close_since_s, self.now_s)
+        return self.now_s - self._close_since_s >= for_s
+
+    def moved(self) -> bool:
+        """Whether the movement is over, wherever the tip is."""
+        return self._engaged and self._reach is not None and self._reach.finished(self.now_s)
+
+    def trigger_done(self) -> bool:
+        return self._engaged and self._trigger == self.trigger_goal
+
+    def let_go(self, view: OperatorView, for_s: float) -> None:
+        """Opens the clutch for `for_s` seconds; the last goal stays."""
+        self._open(view)
+        self._rearm_s = self.now_s + for_s
+
+    def rest(self, view: OperatorView) -> HandInput:
+        """Opens the clutch for good; the robot holds."""
+        self._open(view)
+        self._goal = self._reach = None
+        return self.input()
+
+    def input(self) -> HandInput:
+        return HandInput(self.device, self.robot, self._hand, self._engaged, self._trigger)
+
+    def _clock(self, now_ns: int) -> float:
+        step_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * 1e-9
+        self._last_ns = now_ns
+        return min(max(step_s, 0.0), LONGEST_STEP_S)
+
+    def _open(self, view: OperatorView) -> None:
+        self._engaged = False
+        self._rearm_s = self.now_s + REARM_S
+        self._hand = view.device_pose(self.device)
+
+    def _engage(self, tip: PoseTuple) -> None:
+        self._engaged = True
+        self._hand_at_engage, self._tip_at_engage = self._hand, tip
+        self._correction_p = self._correction_r = (0.0, 0.0, 0.0)
+        self._lost_since_s = math.inf
+        self._reach = None if self._goal is None else Reach.plan(tip, self._goal, self.now_s, self._speed, self._turn)
+
+    def _reference(self) -> PoseTuple:
+        """Where the tip should be now, before corrections."""
+        return self._tip_at_engage if self._reach is None else self._reach.pose(self.now_s)
+
+    def _follow(self, tip: PoseTuple, step_s: float, view: OperatorView) -> None:
+        reference = self._reference()
+        miss_p = (reference[0][0] - tip[0][0], reference[0][1] - tip[0][1], reference[0][2] - tip[0][2])
+        miss_r = quat_to_rotvec(quat_mul(reference[1], quat_conj(tip[1])))
+        self._missing_m, self._missing_rad = math.hypot(*miss_p), math.hypot(*miss_r)
+        if self._correcting and self.moved():
+            self._correction_p = _toward(self._correction_p, miss_p, step_s, CORRECTION_SPEED, CORRECTION_MOST)
+            self._correction_r = _toward(self._correction_r, miss_r, step_s, CORRECTION_TURN, 10.0 * CORRECTION_MOST)
+        if self._missing_m < LOST_M and self._missing_rad < LOST_RAD:
+            self._lost_since_s = math.inf
+        else:
+            self._lost_since_s = min(self._lost_since_s, self.now_s)
+        if self.now_s - self._lost_since_s > LOST_S:
+            self.reclutches += 1
+            self._open(view)
+            return
+        self._hand = self._hand_for(reference)
+
+    def _hand_for(self, reference: PoseTuple) -> PoseTuple:
+        """The hand pose that brings the tip to `reference` plus corrections, by the motion since the engagement."""
+        p0, h0, c = self._tip_at_engage[0], self._hand_at_engage[0], self._correction_p
+        p = reference[0]
+        q_tip = quat_mul(quat_from_rotvec(self._correction_r), reference[1])
+        q = quat_mul(quat_mul(q_tip, quat_conj(self._tip_at_engage[1])), self._hand_at_engage[1])
+        moved = (h0[0] + p[0] + c[0] - p0[0], h0[1] + p[1] + c[1] - p0[1], h0[2] + p[2] + c[2] - p0[2])
+        return (moved, quat_normalize(q))
+
+
+def _toward(correction: Vec3, miss: Vec3, step_s: float, speed: float, most: float) -> Vec3:
+    """`correction` moved towards `miss`, at a limited speed and to a limited length."""
+    rate = CORRECTION_RATE * math.hypot(*miss)
+    scale = CORRECTION_RATE * step_s * (min(1.0, speed / rate) if rate > 0.0 else 0.0)
+    moved = (correction[0] + scale * miss[0], correction[1] + scale * miss[1], correction[2] + scale * miss[2])
+    length = math.hypot(*moved)
+    if length <= most:
+        return moved
+    return (moved[0] * most / length, moved[1] * most / length, moved[2] * most / length)

@@ -1,0 +1,166 @@
+"""What giver and receiver have in common: phases, patience, and taking a thing with the gripper from above."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse
+from iris_session.emulator.behaviours.base import HandInput, OperatorView
+from iris_session.emulator.behaviours.eyes import Eyes
+from iris_session.emulator.behaviours.hand import ClutchedHand
+from iris_session.emulator.behaviours.things import COMMON_THINGS, Thing, above, grasp, thing_named
+
+#: Height of the hands above the bases of the robots at the exchange [m].
+EXCHANGE_HEIGHT = 0.34
+#: How far above a grasp the hand first goes, and how far it backs off afterwards [m].
+CLEAR_ABOVE = 0.11
+#: Speed of the last centimetres before a grasp [m/s].
+CAREFUL_SPEED = 0.16
+#: So often taking the thing is tried before the operator gives up.
+ATTEMPTS = 4
+
+
+class Operator:
+    """A behaviour as a machine of phases. `done` and not `failed`: it succeeded.
+
+    A subclass fills `self._steps` (phase -> method called once per update) and says where to take the thing.
+    """
+
+    def __init__(self, robot: str, object: str, partner: str, device: str) -> None:
+        self.phase = "wait"
+        self.done = False
+        self.failed = ""
+        self.attempts = 1
+        self.robot, self.object, self.partner = robot, object, partner
+        self.thing: Thing = thing_named(object)
+        self.hand = ClutchedHand(device, robot)
+        self.eyes = Eyes((object,), (robot, partner), tuple(name for name in COMMON_THINGS if name != object))
+        self._entering, self._entering_now = True, False
+        self._entered_s = 0.0
+        self._home: PoseTuple | None = None
+        self._steps: dict[str, Callable[[], None]] = {
+            "wait": self._wait,
+            "approach": self._approach,
+            "descend": self._descend,
+            "close": self._close,
+            "back_off": self._back_off,
+            "rise": self._rise,
+            "return": self._return,
+        }
+        self._take_x = 0.0  # where along the thing it is taken [m]
+        self._after_close = ""
+
+    def update(self, view: OperatorView) -> tuple[HandInput, ...]:
+        """One look and one hand input; see `Behaviour.update`."""
+        self.eyes.look(view)
+        if self.done:
+            return (self.hand.rest(view),)
+        can_act = self.hand.update(view, self.eyes.tip(self.robot) if self.eyes.ready else None)
+        if can_act:
+            self._entering_now, self._entering = self._entering, False
+            self._steps[self.phase]()
+        return (self.hand.input(),)
+
+    # --- phases that both know ----------------------------------------------------------------------------------------
+
+    def _first_phase(self) -> str:
+        """The phase in which taking the thing begins, and begins again after a failed attempt."""
+        raise NotImplementedError
+
+    def _wait(self) -> None:
+        self._home = self.eyes.tip(self.robot)
+        self._enter(self._first_phase())
+
+    def _approach(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(above(self._grasp_pose(), CLEAR_ABOVE))
+        if self.hand.arrived(0.008, 0.06) and self.hand.trigger_done():
+            self._enter("descend")
+        elif self._waited(8.0):
+            self._retry(f"{self.robot} cannot reach the {self.object}")
+
+    def _descend(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(self._grasp_pose(), CAREFUL_SPEED)
+        if self.hand.arrived(0.0025, 0.025) or (self._waited(4.0) and self.hand.arrived(0.006, 0.06)):
+            self._enter("close")
+        elif self._waited(6.0):
+            self._retry(f"{self.robot} cannot reach down to the {self.object}")
+
+    def _close(self) -> None:
+        if self._entering_now:
+            self.hand.hold_still()
+            self.hand.trigger_goal = 1.0
+        if self.hand.trigger_done() and self._waited(0.7) and self._holding():
+            self._enter(self._after_close)
+        elif self._waited(2.5):
+            self._retry(f"{self.robot} closed its gripper beside the {self.object}")
+
+    def _back_off(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(self.eyes.tip(self.robot))
+        if self.hand.trigger_done() and self._waited(0.8):
+            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), correct=False)
+            self._enter("rise")
+
+    def _rise(self) -> None:
+        if self.hand.moved():
+            self._enter(self._first_phase())
+
+    def _return(self) -> None:
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
+            self._finish()
+
+    # --- transitions --------------------------------------------------------------------------------------------------
+
+    def _enter(self, phase: str) -> None:
+        self.phase, self._entering, self._entered_s = phase, True, self.hand.now_s
+
+    def _waited(self, seconds: float) -> bool:
+        """Whether this phase has lasted `seconds` already."""
+        return self.hand.now_s - self._entered_s >= seconds
+
+    def _retry(self, reason: str) -> None:
+        """Lets go and begins again, or gives up with `reason` after the last attempt."""
+        if self.attempts >= ATTEMPTS:
+            self._give_up(f"{reason} (after {self.attempts} attempts)")
+            return
+        self.attempts += 1
+        self._enter("back_off")
+
+    def _give_up(self, reason: str) -> None:
+        self.phase, self.failed, self.done = "failed", reason, True
+
+    def _finish(self) -> None:
+        self.phase, self.done = "done", True
+
+    # --- geometry as seen ---------------------------------------------------------------------------------------------
+
+    def _grasp_pose(self) -> PoseTuple:
+        """Tip pose that takes the thing where it is seen now."""
+        like = self._home if self._home is not None else self.eyes.tip(self.robot)
+        return grasp(self.eyes.body(self.object), self._take_x, like[1])
+
+    def _holding(self) -> bool:
+        return self.eyes.holds(self.robot, self.object, self.thing.half_width)
+
+    def _lost(self) -> bool:
+        """Whether the thing is no longer between the fingers."""
+        taken_at = apply(self.eyes.body(self.object), (self._take_x, 0.0, 0.0))
+        return distance(taken_at, self.eyes.tip(self.robot)[0]) > 0.05
+
+    def _tip_for(self, T_world_thing: PoseTuple) -> PoseTuple:
+        """Tip pose that brings the thing, as it now lies in the gripper, to `T_world_thing`."""
+        T_tip_thing = compose(inverse(self.eyes.tip(self.robot)), self.eyes.body(self.object))
+        return compose(T_world_thing, inverse(T_tip_thing))
+
+    def _exchange(self) -> tuple[Vec3, Vec3]:
+        """Where things change hands (world), and the horizontal direction from me to my partner."""
+        (ax, ay, az), (bx, by, bz) = self.eyes.body(f"{self.robot}/base")[0], self.eyes.body(f"{self.partner}/base")[0]
+        apart = max(((bx - ax) ** 2 + (by - ay) ** 2) ** 0.5, 1e-6)
+        middle = ((ax + bx) / 2.0, (ay + by) / 2.0, (az + bz) / 2.0 + EXCHANGE_HEIGHT)
+        return middle, ((bx - ax) / apart, (by - ay) / apart, 0.0)

@@ -1,0 +1,149 @@
+"""The receiver: waits until a thing is offered, takes its free end, waits until the giver has left, puts it down."""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import PoseTuple, Vec3, apply, distance
+from iris_session.emulator.behaviours.operator import CAREFUL_SPEED, CLEAR_ABOVE, Operator
+from iris_session.emulator.behaviours.things import above, face_up, level
+from iris_session.protocol.names import Device
+
+#: A thing nearer to the place of exchange than this is offered [m].
+OFFERED_M = 0.10
+#: How long the receiver waits for an offer [s].
+PATIENCE_S = 120.0
+#: A giver whose tip is farther than this from where it held the thing has left [m].
+LEFT_M = 0.08
+
+
+class Receiver(Operator):
+    """Takes `object` with `robot` from the operator of `partner` and lays it on the table.
+
+    `place`: where (x, y [m] in the world); default: in front of the robot, on its freer side.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        object: str,
+        partner: str,
+        device: str = Device.CONTROLLER_RIGHT,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__(robot, object, partner, device)
+        self._after_close = "secure"
+        self._place = place
+        self._laid: PoseTuple | None = None
+        self._steps |= {
+            "watch": self._watch,
+            "secure": self._secure,
+            "carry": self._carry,
+            "lower": self._lower,
+            "put": self._put,
+            "open": self._open,
+            "leave": self._leave,
+        }
+
+    def _first_phase(self) -> str:
+        return "watch"
+
+    def _watch(self) -> None:
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        middle, _ = self._exchange()
+        offered = (
+            distance(self.eyes.body(self.object)[0], middle) < OFFERED_M
+            and self.eyes.still_s(self.object) > 0.4
+            and self.eyes.holds(self.partner, self.object, self.thing.half_width)
+        )
+        if offered:
+            self._take_x = self._free_end()
+            self._enter("approach")
+        elif self._waited(PATIENCE_S):
+            self._give_up(f"nobody offered the {self.object} within {PATIENCE_S:.0f} s")
+
+    def _free_end(self) -> float:
+        """Where to take the thing [m along its x]: for a symmetric thing the end away from the giver's fingers."""
+        x = self.thing.receiver_x
+        if not self.thing.symmetric:
+            return x
+        thing, giver = self.eyes.body(self.object), self.eyes.tip(self.partner)[0]
+        return max((x, -x), key=lambda end: distance(apply(thing, (end, 0.0, 0.0)), giver))
+
+    def _secure(self) -> None:
+        """Keeps hold until the giver has opened and left. Both robots hold the thing: no corrections."""
+        if self._entering_now:
+            self.hand.hold_still()
+        given_at = apply(self.eyes.body(self.object), (-self._take_x, 0.0, 0.0))
+        opened = self.eyes.gap(self.partner) > 2.0 * self.thing.half_width + 0.015
+        if opened and distance(self.eyes.tip(self.partner)[0], given_at) > LEFT_M:
+            self._enter("carry")
+        elif self._waited(1.0) and not self._holding():
+            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+        elif self._waited(15.0):
+            self._retry(f"{self.partner} did not let go of the {self.object}")
+
+    def _carry(self) -> None:
+        if self._entering_now:
+            x, y = self._place if self._place is not None else self._free_place()
+            base, (dx, dy, _) = self.eyes.body(f"{self.robot}/base")[0], self._exchange()[1]
+            yaw = math.atan2(-dy, -dx) if self._take_x > 0.0 else math.atan2(dy, dx)
+            up = face_up(self.eyes.body(self.object))
+            self._laid = level((x, y, base[2] + self.thing.half_thickness), yaw, up)
+            self.hand.move_to(self._tip_for(above(self._laid, CLEAR_ABOVE)))
+        if self._lost():
+            self._give_up(f"{self.robot} dropped the {self.object} on the way")
+        elif self.hand.arrived(0.01, 0.06) or self._waited(8.0):
+            self._enter("lower")
+
+    def _lower(self) -> None:
+        """Down to a finger's breadth above the table, level again as the thing now hangs in the gripper."""
+        if self._entering_now and self._laid is not None:
+            self.hand.move_to(self._tip_for(above(self._laid, 0.015)), CAREFUL_SPEED)
+        if self._lost():
+            self._give_up(f"{self.robot} dropped the {self.object} on the way")
+        elif self.hand.arrived(0.004, 0.03) or self._waited(5.0):
+            self._enter("put")
+
+    def _put(self) -> None:
+        """The last centimetre, by the height that is seen below the lowest point."""
+        if self._entering_now:
+            table = self.eyes.body(f"{self.robot}/base")[0][2]
+            below = self.thing.lowest(self.eyes.body(self.object)) - table
+            self.hand.move_to(above(self.eyes.tip(self.robot), -max(below - 0.0005, 0.0)), 0.05, correct=False)
+        if self.hand.moved() and self._waited(0.9):
+            self._enter("open")
+
+    def _open(self) -> None:
+        self.hand.hold_still()
+        self.hand.trigger_goal = 0.0
+        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.015:
+            self._enter("leave")
+        elif self._waited(4.0):
+            self._give_up(f"the gripper of {self.robot} does not open")
+
+    def _leave(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.3, correct=False)
+        if not self.hand.moved():
+            return
+        p_world = self.eyes.body(self.object)[0]
+        if self._laid is None or distance(p_world, self._laid[0]) > 0.06:
+            self._give_up(f"the {self.object} did not stay where {self.robot} put it")
+        else:
+            self._enter("return")
+
+    def _free_place(self) -> tuple[float, float]:
+        """A place in front of the robot, on the side of the shared table that is farther from other things."""
+        base, (dx, dy, _) = self.eyes.body(f"{self.robot}/base")[0], self._exchange()[1]
+        sides = [
+            (base[0] + 0.43 * dx - side * 0.2 * dy, base[1] + 0.43 * dy + side * 0.2 * dx, base[2]) for side in (1, -1)
+        ]
+        others = self.eyes.others()
+
+        def room(place: Vec3) -> float:
+            return min((distance(place, other) for other in others), default=1.0)
+
+        best = max(sides, key=room)
+        return best[0], best[1]

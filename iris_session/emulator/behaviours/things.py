@@ -1,0 +1,102 @@
+"""What a person knows about the things of the demo scenes: their size, and where to take and offer them.
+
+Frames as in `physics/scenes/handover.xml`: x along the handle towards its free end, y across (the closing direction of
+a gripper), z up when it lies on the table, origin in the middle of the length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, quat_angle, quat_from_yaw, quat_mul, quat_rotate
+
+#: Middle of the face of a finger pad in the frame of its finger body [m].
+PAD_IN_FINGER: Vec3 = (0.0, 0.0, 0.045)
+#: How far above the middle of a thing's thickness the pads take it [m]: keeps the finger tips clear of the table.
+_GRASP_ABOVE = 0.003
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """A thing that can be handed over.
+
+    `giver_x`, `receiver_x`: where along x the giver and the receiver take it [m]. `half_width`: along y at both places
+    [m]. `corners`: points of its outline that can touch a table. `symmetric`: either end may be given.
+    """
+
+    giver_x: float
+    receiver_x: float
+    half_width: float
+    half_thickness: float
+    corners: tuple[Vec3, ...]
+    symmetric: bool = False
+
+    def lowest(self, T_world_thing: PoseTuple) -> float:
+        """Height of its lowest point [m]."""
+        return min(apply(T_world_thing, corner)[2] for corner in self.corners)
+
+
+def _outline(*boxes: tuple[float, float, float, float]) -> tuple[Vec3, ...]:
+    """Corners of boxes given as (x from, x to, half width, half thickness)."""
+    return tuple((x, y, z) for a, b, w, t in boxes for x in (a, b) for y in (-w, w) for z in (-t, t))
+
+
+HAMMER = Thing(
+    giver_x=-0.080,
+    receiver_x=0.085,
+    half_width=0.0123,
+    half_thickness=0.016,
+    corners=_outline((-0.164, -0.132, 0.062, 0.016), (0.036, 0.140, 0.0125, 0.0155)),
+)
+BOARD = Thing(
+    giver_x=-0.080,
+    receiver_x=0.080,
+    half_width=0.028,
+    half_thickness=0.012,
+    corners=_outline((-0.150, 0.150, 0.028, 0.012)),
+    symmetric=True,
+)
+
+
+#: Things that may lie about, to be kept clear of.
+COMMON_THINGS = ("hammer", "board", *(f"object{i}" for i in range(1, 7)))
+
+
+def thing_named(name: str) -> Thing:
+    """The thing that body `name` is: `hammer`, `board`, or `objectN` of a generated scene (odd N: hammers)."""
+    if name.startswith("object") and name[6:].isdigit():
+        return HAMMER if int(name[6:]) % 2 else BOARD
+    known = {"hammer": HAMMER, "board": BOARD}
+    if name not in known:
+        raise ValueError(f"no operator knows how to take '{name}'. Known things: hammer, board, object1, object2, ...")
+    return known[name]
+
+
+def face_up(T_world_thing: PoseTuple) -> float:
+    """1 when the thing's z axis points up, -1 when it lies on its other face."""
+    return 1.0 if quat_rotate(T_world_thing[1], (0.0, 0.0, 1.0))[2] >= 0.0 else -1.0
+
+
+def level(p_world: Vec3, yaw: float, up: float) -> PoseTuple:
+    """Pose of a thing that lies level with its x axis along `yaw` [rad], on the face given by `up`."""
+    q = quat_from_yaw(yaw)
+    return (p_world, q if up > 0.0 else quat_mul(q, (0.0, 1.0, 0.0, 0.0)))
+
+
+def grasp(T_world_thing: PoseTuple, x: float, q_world_like: Quat) -> PoseTuple:
+    """Tip pose that takes the thing at `x` [m] from above.
+
+    A gripper fits two ways, turned by half a turn: the one nearer to the orientation `q_world_like` is taken.
+    """
+    up = face_up(T_world_thing)
+    ways: tuple[Quat, Quat] = ((0.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 0.0))
+    if up < 0.0:
+        ways = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    poses = [compose(T_world_thing, ((x, 0.0, up * _GRASP_ABOVE), way)) for way in ways]
+    return min(poses, key=lambda pose: quat_angle(pose[1], q_world_like))
+
+
+def above(pose: PoseTuple, height: float) -> PoseTuple:
+    """The same pose `height` [m] higher."""
+    (x, y, z), q = pose
+    return ((x, y, z + height), q)
