@@ -1,0 +1,124 @@
+"""The kinematic chain of one robot alone: a tiny `MjModel` for inverse kinematics, built from the scene's arrays.
+
+Solving on the arm alone costs a fifth of solving on the scene. Nothing is read from files, so it works for every
+compiled model. The root of the chain is the body that carries the first arm joint: poses here are `T_root_tip`, and
+the caller supplies `T_world_root` (constant unless the robot's base moves).
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.pose import PoseTuple
+from iris_session.control.errors import ControlError
+from iris_session.protocol.specs import RobotSpec
+
+Floats = NDArray[np.float64]
+
+_JOINT_TYPES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def named_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, what: str) -> int:
+    """Id of a named element. Raises `ControlError` with the available names."""
+    found = int(mujoco.mj_name2id(model, int(kind), name))
+    if found < 0:
+        count = {"joint": model.njnt, "site": model.nsite, "actuator": model.nu, "body": model.nbody}[what]
+        names = [mujoco.mj_id2name(model, int(kind), i) or "(unnamed)" for i in range(count)]
+        raise ControlError(f"{what} {name!r} does not exist in the model. Available {what}s: {', '.join(names)}")
+    return found
+
+
+class ArmModel:
+    """Forward kinematics of one robot's chain. Joint vectors are in the order of `RobotSpec.joints`, shape (n,)."""
+
+    def __init__(self, scene: mujoco.MjModel, robot: RobotSpec) -> None:
+        """Raises `ControlError` when the joints do not form one hinge/slide chain that ends at the site."""
+        self.joint_ids = [named_id(scene, mujoco.mjtObj.mjOBJ_JOINT, name, "joint") for name in robot.joints]
+        self.site_id = named_id(scene, mujoco.mjtObj.mjOBJ_SITE, robot.site, "site")
+        chain = _chain(scene, robot, self.joint_ids, int(scene.site_bodyid[self.site_id]))
+        self.root_body = int(scene.body_parentid[chain[0]])
+        self.model = _build(scene, chain, self.site_id)
+        self.data = mujoco.MjData(self.model)
+        chain_ids = [j for body in chain for j in _joints_of(scene, body)]
+        #: `q_chain = q[to_chain]`, `q = q_chain[from_chain]`.
+        self.to_chain = np.array([self.joint_ids.index(j) for j in chain_ids], dtype=np.intp)
+        self.from_chain = np.argsort(self.to_chain)
+
+    def fk(self, q: Floats) -> PoseTuple:
+        """`T_root_tip` at joint positions `q`."""
+        self.data.qpos[:] = q[self.to_chain]
+        mujoco.mj_kinematics(self.model, self.data)
+        return site_pose(self.data, 0)
+
+
+def site_pose(data: mujoco.MjData, site_id: int) -> PoseTuple:
+    """World pose of a site, as plain floats."""
+    x, y, z = data.site_xpos[site_id].tolist()
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, data.site_xmat[site_id])
+    w, i, j, k = quat.tolist()
+    return ((x, y, z), (w, i, j, k))
+
+
+def moving_base(scene: mujoco.MjModel, body: int) -> bool:
+    """True when `body` can move relative to the world (joints or mocap above it)."""
+    while body > 0:
+        if scene.body_jntnum[body] > 0 or scene.body_mocapid[body] >= 0:
+            return True
+        body = int(scene.body_parentid[body])
+    return False
+
+
+def _joints_of(scene: mujoco.MjModel, body: int) -> list[int]:
+    start = int(scene.body_jntadr[body])
+    return list(range(start, start + int(scene.body_jntnum[body])))
+
+
+def _chain(scene: mujoco.MjModel, robot: RobotSpec, joint_ids: list[int], tip: int) -> list[int]:
+    """Bodies from the first arm joint to the site's body."""
+    path = []
+    body = tip
+    while body > 0:
+        path.append(body)
+        body = int(scene.body_parentid[body])
+    path.reverse()
+    wanted = set(joint_ids)
+    carrying = [k for k, b in enumerate(path) if any(j in wanted for j in _joints_of(scene, b))]
+    chain = path[carrying[0] :] if carrying else []
+    found = [j for b in chain for j in _joints_of(scene, b)]
+    for joint, name in zip(joint_ids, robot.joints, strict=True):
+        if joint not in found:
+            raise ControlError(
+                f"robot {robot.name!r}: joint {name!r} does not move site {robot.site!r}; name joints on its chain only"
+            )
+        if int(scene.jnt_type[joint]) not in _JOINT_TYPES:
+            raise ControlError(f"robot {robot.name!r}: joint {name!r} must be a hinge or a slide joint")
+    extra = [mujoco.mj_id2name(scene, int(mujoco.mjtObj.mjOBJ_JOINT), j) or f"#{j}" for j in found if j not in wanted]
+    if extra or not found:
+        raise ControlError(
+            f"robot {robot.name!r}: joints {', '.join(extra) or '(none)'} lie between its joints and site "
+            f"{robot.site!r}; the chain must consist of the robot's own joints"
+        )
+    return chain
+
+
+def _build(scene: mujoco.MjModel, chain: list[int], site_id: int) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    parent = spec.worldbody
+    for body in chain:
+        parent = parent.add_body(pos=scene.body_pos[body], quat=scene.body_quat[body])
+        # Only kinematics is asked of this model; the compiler wants every moving body to have a mass.
+        parent.mass, parent.inertia, parent.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
+        for joint in _joints_of(scene, body):
+            parent.add_joint(
+                type=mujoco.mjtJoint(int(scene.jnt_type[joint])),
+                pos=scene.jnt_pos[joint],
+                axis=scene.jnt_axis[joint],
+                ref=scene.qpos0[scene.jnt_qposadr[joint]],
+                limited=int(mujoco.mjtLimited.mjLIMITED_FALSE),  # limits are bounds of the solver, see `ik`
+            )
+    parent.add_site(name="tip", pos=scene.site_pos[site_id], quat=scene.site_quat[site_id])
+    return spec.compile()

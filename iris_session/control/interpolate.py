@@ -1,0 +1,89 @@
+"""Joint motion at the tick rate: all robots' commanded joints follow their goals in one vectorised pass.
+
+Goals come at 60-100 Hz. Towards a goal the joints move evenly, so that they arrive one and a half sample intervals
+later: when samples keep coming, the next goal is there before they have to slow down. Velocity and acceleration never
+exceed their limits, and every joint can always stop at its goal without passing it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iris_session.control.arm_model import Floats
+
+#: Arrival after this many sample intervals: above 1, so that motion between regular samples is even.
+ARRIVAL_INTERVALS = 1.5
+
+
+class JointInterpolator:
+    """Commanded positions `q` and velocities `v` of n joints, moving to `goal`. All arrays float64, shape (n,).
+
+    `cap`: velocity limit in force now (ramps and proximity lower it); `remaining`: time to arrive in [s].
+    """
+
+    def __init__(self, velocity: Floats, acceleration: Floats, dt: float) -> None:
+        n = len(velocity)
+        self.q, self.v, self.goal, self.remaining = np.zeros(n), np.zeros(n), np.zeros(n), np.full(n, dt)
+        self.velocity, self.cap = velocity, velocity.copy()
+        self.acceleration = acceleration
+        self.dt = dt
+        self._dv = acceleration * dt
+        self._half_dv = 0.5 * self._dv
+        self._half_dv_squared = self._half_dv**2
+        self._double_acceleration = 2.0 * acceleration
+        self.moving = False
+
+    def place(self, q: Floats) -> None:
+        """Stand still at `q`."""
+        self.q[:] = q
+        self.goal[:] = q
+        self.v[:] = 0.0
+        self.remaining[:] = self.dt
+        self.cap[:] = self.velocity
+        self.moving = False
+
+    def aim(self, joints: slice, goal: Floats, interval: float) -> None:
+        """New goal for some joints, to arrive `ARRIVAL_INTERVALS` times `interval` [s] from now."""
+        self.goal[joints] = goal
+        self.remaining[joints] = ARRIVAL_INTERVALS * interval
+        self.moving = True
+
+    def stop(self, joints: slice) -> None:
+        """New goal: where these joints can stop, but not beyond the goal they already had."""
+        q, v = self.q[joints], self.v[joints]
+        # Distance needed to stop: v^2 / 2a + |v| dt / 2 (discrete time).
+        reach = v * v / self._double_acceleration[joints] + 0.5 * np.abs(v) * self.dt
+        distance = np.minimum(reach, np.abs(self.goal[joints] - q))
+        ahead = np.sign(self.goal[joints] - q) == np.sign(v)
+        # Standing joints finish the last step of their motion, if any is left, only when they already move.
+        self.goal[joints] = q + np.sign(v) * np.where(ahead, distance, reach)
+        self.remaining[joints] = self.dt
+        self.moving = True
+
+    def advance(self) -> None:
+        """One tick."""
+        if not self.moving:
+            return
+        error = self.goal - self.q
+        # Fastest speed from which a joint can still stop at its goal, in discrete time.
+        brake = np.sqrt(self._half_dv_squared + self._double_acceleration * np.abs(error)) - self._half_dv
+        limit = np.minimum(brake, self.cap)
+        wanted = np.minimum(np.maximum(error / self.remaining, -limit), limit)
+        self.v += np.minimum(np.maximum(wanted - self.v, -self._dv), self._dv)
+        self.q += self.v * self.dt
+        np.maximum(self.remaining - self.dt, self.dt, out=self.remaining)
+        arrived = (np.abs(self.goal - self.q) < 1e-9) & (np.abs(self.v) <= self._dv)
+        if arrived.any():
+            self.q[arrived] = self.goal[arrived]
+            self.v[arrived] = 0.0
+            self.moving = not bool(arrived.all())
+
+    def state(self) -> list[bytes]:
+        """Arrays as raw bytes, for snapshots."""
+        return [a.tobytes() for a in (self.q, self.v, self.goal, self.remaining, self.cap)]
+
+    def set_state(self, arrays: list[bytes], moving: bool) -> None:
+        """Inverse of `state`."""
+        for array, raw in zip((self.q, self.v, self.goal, self.remaining, self.cap), arrays, strict=True):
+            array[:] = np.frombuffer(raw)
+        self.moving = moving

@@ -1,0 +1,130 @@
+"""Robots near contact: the speed at which two robots close in on each other is bounded by their distance.
+
+Distances are measured on the whole scene between the robots' geoms, finger bodies exempt: grippers must meet to hand
+objects over. Broad phase: boxes around each robot's geoms; then bounding spheres; then `mj_geomDistance` for the
+nearest pairs. Only motion that closes the gap is slowed; motion that opens it never is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.control.arm_model import Floats, named_id
+from iris_session.control.config import ControlConfig
+from iris_session.protocol.specs import RobotSpec
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+_HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
+
+
+class Proximity:
+    """Speed factors per robot from their distances. Stateless: everything follows from the arguments."""
+
+    def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig) -> None:
+        self._model = model
+        self._config = config
+        self._geoms = [_guarded_geoms(model, robot) for robot in robots]
+        self._dofs = [
+            np.array(
+                [model.jnt_dofadr[named_id(model, mujoco.mjtObj.mjOBJ_JOINT, j, "joint")] for j in robot.joints],
+                dtype=np.intp,
+            )
+            for robot in robots
+        ]
+        self._all = np.concatenate(self._geoms) if robots else np.zeros(0, dtype=np.intp)
+        self._radius = np.asarray(model.geom_rbound)[self._all]
+        self._starts = np.cumsum([0, *(len(g) for g in self._geoms)])
+        self._jacobian = np.zeros((3, model.nv))
+        self._segment = np.zeros(6)
+        self.active = config.proximity_margin > 0.0 and sum(len(g) > 0 for g in self._geoms) > 1
+
+    def factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[float]:
+        """Factor 0..1 on each robot's joint speed. `wanted`: joint velocities [rad/s] each robot would take, (n_i,)."""
+        factors = [1.0] * len(self._geoms)
+        for a, b in self._near_robots(data):
+            for distance, geom_a, geom_b, p_a, p_b in self._near_geoms(data, a, b):
+                gap = p_b - p_a
+                length = float(np.linalg.norm(gap))
+                if length < 1e-9:
+                    continue
+                # Witness points of penetrating geoms are swapped: the direction from a to b stays the same.
+                normal = gap / length if distance >= 0.0 else -gap / length
+                closing = [
+                    float(normal @ self._point_velocity(data, a, geom_a, p_a, wanted[a])),
+                    -float(normal @ self._point_velocity(data, b, geom_b, p_b, wanted[b])),
+                ]
+                allowed = max(0.0, self._config.proximity_gain * (distance - self._config.proximity_stop))
+                total = closing[0] + closing[1]
+                if total <= allowed:
+                    continue
+                # Only those who approach are slowed; someone who retreats keeps his speed and its benefit is shared.
+                approach = max(closing[0], 0.0) + max(closing[1], 0.0)
+                factor = max(0.0, (allowed - total + approach) / approach)
+                for robot, speed in zip((a, b), closing, strict=True):
+                    if speed > 0.0:
+                        factors[robot] = min(factors[robot], factor)
+        return factors
+
+    def _near_robots(self, data: mujoco.MjData) -> list[tuple[int, int]]:
+        """Pairs of robots whose boxes are within the margin, in index order."""
+        present = [i for i, g in enumerate(self._geoms) if len(g)]
+        centre = data.geom_xpos[self._all]
+        starts = self._starts[present]
+        low = np.minimum.reduceat(centre - self._radius[:, None], starts)
+        high = np.maximum.reduceat(centre + self._radius[:, None], starts)
+        gap = np.maximum(low[None, :, :] - high[:, None, :], low[:, None, :] - high[None, :, :]).max(axis=2)
+        rows, columns = np.nonzero(np.triu(gap < self._config.proximity_margin, k=1))
+        return [(present[r], present[c]) for r, c in zip(rows.tolist(), columns.tolist(), strict=True)]
+
+    def _near_geoms(self, data: mujoco.MjData, a: int, b: int) -> list[tuple[float, int, int, Floats, Floats]]:
+        """Geom pairs of two robots within the margin: distance [m], geoms, nearest points in the world."""
+        margin = self._config.proximity_margin
+        geoms_a, geoms_b = self._geoms[a], self._geoms[b]
+        centre_a, centre_b = data.geom_xpos[geoms_a], data.geom_xpos[geoms_b]
+        between = np.linalg.norm(centre_a[:, None, :] - centre_b[None, :, :], axis=2)
+        radius = np.asarray(self._model.geom_rbound)
+        bound = between - radius[geoms_a][:, None] - radius[geoms_b][None, :]
+        order = np.argsort(bound, axis=None, kind="stable")
+        near = order[bound.ravel()[order] < margin]
+        found = []
+        for flat in near[: self._config.proximity_exact_pairs].tolist():
+            i, j = divmod(flat, len(geoms_b))
+            geom_a, geom_b = int(geoms_a[i]), int(geoms_b[j])
+            distance = float(mujoco.mj_geomDistance(self._model, data, geom_a, geom_b, margin, self._segment))
+            if distance < margin:
+                found.append((distance, geom_a, geom_b, self._segment[:3].copy(), self._segment[3:].copy()))
+        return found
+
+    def _point_velocity(self, data: mujoco.MjData, robot: int, geom: int, point: Floats, joints: Floats) -> Floats:
+        body = int(self._model.geom_bodyid[geom])
+        mujoco.mj_jac(self._model, data, self._jacobian, None, point, body)
+        velocity: Floats = self._jacobian[:, self._dofs[robot]] @ joints
+        return velocity
+
+
+def _guarded_geoms(model: mujoco.MjModel, robot: RobotSpec) -> NDArray[np.intp]:
+    """Geoms of the robot's subtree that may collide, without its fingers."""
+    base = named_id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body, "body")
+    fingers = {named_id(model, mujoco.mjtObj.mjOBJ_BODY, name, "body") for name in robot.finger_bodies}
+    inside, exempt = {base}, set(fingers)
+    for body in range(base + 1, model.nbody):  # parents come before their children
+        parent = int(model.body_parentid[body])
+        if parent in inside:
+            inside.add(body)
+        if parent in exempt:
+            exempt.add(body)
+    return np.array(
+        [
+            g
+            for g in range(model.ngeom)
+            if int(model.geom_bodyid[g]) in inside
+            and int(model.geom_bodyid[g]) not in exempt
+            and int(model.geom_type[g]) not in (_PLANE, _HFIELD)
+            and (model.geom_contype[g] or model.geom_conaffinity[g])
+        ],
+        dtype=np.intp,
+    )
