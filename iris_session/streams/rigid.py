@@ -44,7 +44,7 @@ MAX_ROTATION_ERROR_RAD: Final = math.radians(0.05)
 DRIFT_ALLOWANCE_M: Final = 0.995 * MAX_POSITION_ERROR_M - POSITION_QUANTUM_ERROR_M
 DRIFT_ALLOWANCE_RAD: Final = 0.995 * MAX_ROTATION_ERROR_RAD - ROTATION_QUANTUM_ERROR_RAD
 
-#: Frames that a client may lose in a row without a snapshot: half a second at 60 Hz.
+#: Age of `base_seq` in frames, half a second at 60 Hz: a client may lose one frame less in a row without a snapshot.
 WINDOW: Final = 30
 #: Frames of one round of repeats of resting bodies: ten seconds at 60 Hz.
 REFRESH_FRAMES: Final = 600
@@ -87,7 +87,6 @@ class RigidEncoder:
             raise ValueError(f"first_seq is {first_seq}: frames are numbered from 1")
         self.n_bodies = n_bodies
         self._next_seq = first_seq
-        self._first_seq = first_seq
         self._scene_epoch: int | None = None
         self._anchor = np.full((n_bodies, 7), np.nan)
         self._anchored_seq = np.full(n_bodies, -1, np.int64)
@@ -112,10 +111,10 @@ class RigidEncoder:
             self._scene_epoch = scene_epoch
             changed[:] = True
         self._anchor_anew(poses, np.flatnonzero(changed), seq)
-        # Frames before `first_seq` were another encoder's: this one cannot tell what has changed since.
-        base_seq = seq - WINDOW if seq - WINDOW >= self._first_seq else 0
+        base_seq = max(seq - WINDOW, 0)
         sent = self._anchored_seq > base_seq
         self._add_refresh(sent)
+        # A frame that holds every body (as all do until `WINDOW` frames after the first) needs no frame before it.
         return EncodedFrame(seq, 0 if sent.all() else base_seq, self._pack(np.flatnonzero(sent)))
 
     def keyframe(self) -> tuple[int, Floats]:
@@ -131,7 +130,6 @@ class RigidEncoder:
             cosine = np.abs(np.einsum("ij,ij->i", q, anchor_q))
             squares = np.einsum("ij,ij->i", q, q)
             near &= (cosine >= _COS_ALLOWANCE * np.sqrt(squares)) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
-        near &= ~self._escapes
         return ~near
 
     def _anchor_anew(self, poses: Floats, bodies: Ints, seq: int) -> None:

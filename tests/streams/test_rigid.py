@@ -91,6 +91,24 @@ def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
             assert_within_bound(decoder.poses, poses)
 
 
+def test_creeping_rotations_stay_within_the_bound_at_the_worst_place() -> None:
+    """Rotations half a step beside their codes, turning on away from them by a tenth of the allowance per frame."""
+    half = 0.25 * math.sqrt(2.0) / 3250
+    rest = np.rint(0.5 / (2 * half)) * 2 * half - 0.999 * half - 2 * half * np.arange(1, 20)[:, None] * np.ones(3)
+    q = np.hstack((np.sqrt(1.0 - np.einsum("ij,ij->i", rest, rest))[:, None], rest))
+    poses = np.hstack((np.zeros((19, 3)), q))
+    encoder, decoder = RigidEncoder(19), RigidDecoder(19)
+    assert decoder.apply(*encoder.encode(poses, 1))
+    assert rotation_errors(decoder.poses, poses).max() > math.radians(0.042)
+    away = poses[:, 3:] - decoder.poses[:, 3:]
+    axis = away / np.linalg.norm(away, axis=1)[:, None]
+    for _ in range(40):
+        poses[:, 3:] += axis * (0.05 * DRIFT_ALLOWANCE_RAD)
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
+        assert decoder.apply(*encoder.encode(poses, 1))
+        assert_within_bound(decoder.poses, poses)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -166,6 +184,19 @@ def resting_stream(n: int = 50, frames: int = 100) -> tuple[Floats, RigidEncoder
         poses[0] = moved(rng, poses[:1], 0.01, 0.01)[0]
         sent.append(encoder.encode(poses, 1))
     return poses, encoder, sent
+
+
+@pytest.mark.parametrize(("lost", "complete"), [(WINDOW - 1, True), (WINDOW, False)])
+def test_a_window_of_frames_may_be_lost_and_not_one_more(lost: int, complete: bool) -> None:
+    poses, encoder, frames = resting_stream()
+    decoder = RigidDecoder(50)
+    for frame in frames:
+        decoder.apply(*frame)
+    poses[49, 0] += 0.01  # in the first lost frame
+    for _ in range(lost):
+        encoder.encode(poses, 1)
+    assert decoder.apply(*encoder.encode(poses, 1)) is complete
+    assert_within_bound(decoder.poses[decoder.valid], poses[decoder.valid])
 
 
 def test_late_joiner_needs_a_snapshot_and_is_complete_with_it() -> None:
