@@ -31,16 +31,16 @@ class ContactTables:
         names = body_names(model)
         id_of = {name: index for index, name in enumerate(names)}
         body_object = [_NONE] * model.nbody
-        for index, spec in enumerate(objects):
-            for body in tree.subtree(element_id(model, "body", spec.body, f"object {spec.name!r}: ")):
+        for index, item in enumerate(objects):
+            for body in tree.subtree(element_id(model, "body", item.body, f"object {item.name!r}: ")):
                 body_object[body] = index
-        #: Robot index of each body; of nested robots the deeper one.
+        #: Robot index of each body: of nested robots the deeper one, of a shared base nobody in particular.
         self.body_robot = [_NONE] * model.nbody
         #: Rigid finger of each body: the id of the body it is welded to, -1 for what is no finger.
         self.body_finger = [_NONE] * model.nbody
-        bases = [element_id(model, "body", spec.base_body, f"robot {spec.name!r}: ") for spec in robots]
-        for index in sorted(range(len(robots)), key=lambda i: len(tree.ancestors(bases[i]))):
-            for body in tree.subtree(bases[index]):
+        roots = [(i, root) for i, spec in enumerate(robots) for root in _roots(model, tree, spec)]
+        for index, root in sorted(roots, key=lambda pair: len(tree.ancestors(pair[1]))):
+            for body in tree.subtree(root):
                 self.body_robot[body] = index
         self._fingers_of: list[int] = []
         geom_finger_robot = np.full(model.ngeom + 1, _NONE, np.int64)
@@ -124,10 +124,18 @@ class ContactTables:
             return tuple(forces)
         efc_force = data.efc_force
         pyramidal = int(model.opt.cone) == _PYRAMIDAL
-        for (a, b), adr, dim in zip(robots[rows].tolist(), address[rows].tolist(), contact.dim[rows].tolist()):
+        dims = contact.dim[rows]
+        for (a, b), adr, dim in zip(robots[rows].tolist(), address[rows].tolist(), dims.tolist(), strict=True):
             # A pyramidal contact has 2 (dim - 1) edge forces whose sum is the normal force.
             width = 2 * (dim - 1) if pyramidal and dim > 1 else 1
             normal = float(efc_force[adr]) if width == 1 else float(sum(efc_force[adr : adr + width].tolist()))
             for robot in {a, b} - {_NONE}:
                 forces[robot] += normal
         return tuple(forces)
+
+
+def _roots(model: mujoco.MjModel, tree: Tree, spec: RobotSpec) -> tuple[int, int]:
+    """The base body of a robot, and the highest body that one of its joints moves."""
+    where = f"robot {spec.name!r}: "
+    moved = [tree.joint_body[element_id(model, "joint", j, where)] for j in spec.joints]
+    return element_id(model, "body", spec.base_body, where), min(moved, key=lambda b: len(tree.ancestors(b)))

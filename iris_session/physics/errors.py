@@ -41,7 +41,8 @@ class UnknownNameError(PhysicsError):
         self.name = name
         self.available = tuple(available)
         listed = ", ".join(self.available) or "none"
-        super().__init__(f"{where}{kind} {name!r} does not exist in the model. Available {kind}s: {listed}.")
+        kinds = "bodies" if kind == "body" else f"{kind}s"
+        super().__init__(f"{where}{kind} {name!r} does not exist in the model. Available {kinds}: {listed}.")
 
 
 class RobotsFileError(PhysicsError):

@@ -45,28 +45,28 @@ def _siblings(path: Path) -> str:
     return f"; its folder has {', '.join(found) or 'no model file'}"
 
 
-def model_bytes(model: mujoco.MjModel) -> bytes:
+def model_bytes(model: mujoco.MjModel) -> bytearray:
     """MJB bytes of `model`, asset paths blanked. Same model, same MuJoCo, same lengths of paths: same bytes."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    data = buffer.tobytes()
+    data = bytearray(mujoco.mj_sizeModel(model))
+    mujoco.mj_saveModel(model, None, np.frombuffer(data, np.uint8))
     paths = bytes(model.paths)
-    if not paths.strip(b"\0"):
-        return data
-    # The paths are one of the last of the model's arrays, so the last occurrence is the array itself.
-    return bytes(len(paths)).join(data.rsplit(paths, 1))
+    if paths.strip(b"\0"):
+        # The paths are among the last of the model's arrays, so the last occurrence is the array itself.
+        at = data.rfind(paths)
+        data[at : at + len(paths)] = bytes(len(paths))
+    return data
 
 
-def model_from_bytes(data: bytes) -> mujoco.MjModel:
+def model_from_bytes(data: bytes | bytearray) -> mujoco.MjModel:
     """Inverse of `model_bytes`. Raises `ModelInvalidError` for bytes of another format or MuJoCo version."""
     try:
-        return mujoco.MjModel.from_binary_path(_BUFFER_NAME, assets={_BUFFER_NAME: data})
+        return mujoco.MjModel.from_binary_path(_BUFFER_NAME, assets={_BUFFER_NAME: bytes(data)})
     except (ValueError, mujoco.FatalError) as error:
         raise ModelInvalidError(
             f"these {len(data)} bytes are no model of MuJoCo {mujoco.__version__}: {one_line(error)}"
         ) from error
 
 
-def scene_hash(data: bytes) -> str:
+def scene_hash(data: bytes | bytearray) -> str:
     """Identity of a scene: BLAKE2b of its model bytes, 32 hex characters."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -9,7 +9,6 @@ guessed: `AmbiguousModelError` says it and carries a robots file (`robots_toml`)
 
 from __future__ import annotations
 
-import os.path
 import re
 from dataclasses import dataclass, field
 from typing import Final
@@ -235,7 +234,8 @@ def _robot_names(tree: Tree, arms: list[_Arm]) -> list[str]:
 
 def _prefix(names: list[str]) -> str:
     """Common prefix up to its last separator: `left/waist, left/elbow` -> `left`; empty when there is none."""
-    common = os.path.commonprefix(names)
+    first, last = min(names), max(names)
+    common = first[: next((i for i, c in enumerate(first) if last[i : i + 1] != c), len(first))]
     cut = max(common.rfind(s) for s in _SEPARATORS)
     return common[:cut].strip(_SEPARATORS) if cut > 0 else ""
 

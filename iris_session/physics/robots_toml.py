@@ -164,7 +164,7 @@ def _base_body(tree: Tree, fields: dict[str, Any], joints: list[int], site: int,
     if not given or element_id(tree.model, "body", given, where) not in common:
         listed = ", ".join(named) or "none (they share no named body)"
         raise RobotsFileError(
-            f"{where}base_body {given!r} must carry all its joints and its site. Available bodys: {listed}."
+            f"{where}base_body {given!r} must carry all its joints and its site. Available bodies: {listed}."
         )
     return str(given)
 

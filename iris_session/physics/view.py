@@ -18,7 +18,6 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ObjectContact
 
-
 _T = TypeVar("_T")
 
 
@@ -43,7 +42,7 @@ class LiveView:
             for r in robots
         }
         self._body = {o.name: element_id(model, "body", o.body, f"object {o.name!r}: ") for o in objects}
-        self._robots = tuple(r.name for r in robots)
+        self._index = {r.name: i for i, r in enumerate(robots)}
         self._site_xpos, self._site_xmat = data.site_xpos, data.site_xmat
         self._xpos, self._xquat, self._q = data.xpos, data.xquat, data.qpos
         self._quat = np.empty(4)
@@ -95,9 +94,7 @@ class LiveView:
 
     def gripper_force(self, robot: str) -> float:
         """Sum of the normal contact forces on the finger bodies [N], as solved in the last tick."""
-        if robot not in self._site:
-            _known(self._site, "robot", robot)
-        return self._forces[self._robots.index(robot)]
+        return self._forces[_known(self._index, "robot", robot)]
 
 
 def _pose(p: list[float], q: list[float]) -> Pose:

@@ -1,6 +1,6 @@
 """`World`: the plant of a session. One MuJoCo model and its data, advanced tick by tick, saved and restored exactly.
 
-A tick is `mj_step2` then `mj_step1`: the same arithmetic as `mj_step` shifted by half a step, so that after a tick every
+A tick is `mj_step2` then `mj_step1`: the arithmetic of `mj_step` shifted by half a step, so that after a tick every
 derived quantity (poses, contacts) belongs to the new state. Write `ctrl` and `xfrc_applied` between ticks as usual.
 Mocap poses and `eq_active` enter MuJoCo's position stage: after writing those between ticks, call `refresh`.
 
@@ -36,7 +36,7 @@ from iris_session.protocol.specs import ObjectSpec, RobotSpec
 STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 HOME: Final = "home"
 
-#: Integrators whose `mj_step2` does exactly what `mj_step` does; the others (RK4, future ones) take `mj_step` + `mj_step1`.
+#: Integrators whose `mj_step2` does exactly what `mj_step` does; others (RK4) take `mj_step` and `mj_step1`.
 _SPLIT_INTEGRATORS: Final = frozenset(
     int(getattr(mujoco.mjtIntegrator, name))
     for name in ("mjINT_EULER", "mjINT_IMPLICIT", "mjINT_IMPLICITFAST", "mjINT_DISCRETE")
@@ -92,7 +92,7 @@ class World:
             _require_exact(model)
         self._shown: Any = mujoco.MjData(model)
         #: What control writes to: the user's data, or ours.
-        self.data: Any = data if self.user_owned else self._shown
+        self.data: Any = self._shown if data is None else data
         self._keyframe = _initial_keyframe(model, keyframe)
         self._split = int(model.opt.integrator) in _SPLIT_INTEGRATORS
         self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(model, STATE))
@@ -103,16 +103,15 @@ class World:
         self._body_ids: NDArray[np.int64] = np.array([b.id for b in self.bodies], np.int64)
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
         self.tick_period_ns = round(float(model.opt.timestep) * 1e9)
-        self._model_bytes = b""
-        self._scene_hash = ""
+        #: BLAKE2b of the model bytes, 32 hex characters.
+        self.scene_hash = scene_hash(model_bytes(model))
         self._tick = 0
         self._forces: tuple[float, ...] = (0.0,) * len(robots)
         #: Empty while all is well, else what went wrong; cleared by `reset` and `restore`.
         self.diverged = ""
+        self._user_time = float(self.data.time)
         if self.user_owned:
-            self._user_time = float(self.data.time)
             self.after_user_step()
-            self._set_tick(0)
         else:
             self.reset()
 
@@ -150,24 +149,27 @@ class World:
         self._check(data)
 
     def refresh(self) -> None:
-        """Recomputes what follows from the state after mocap poses, `eq_active` or `qpos` were written between ticks."""
+        """Recomputes what follows from the state, after mocap poses, `eq_active` or `qpos` were written."""
         self._require_owner(user=False)
         mujoco.mj_step1(self.model, self._shown)
         self._set_tick(self._tick)
 
     # --- a user's loop ------------------------------------------------------------------------------------------------
 
-    def after_user_step(self) -> None:
-        """Takes over the state of the user's data. Time that goes back counts as a reset: tick 0.
+    def after_user_step(self) -> bool:
+        """Takes over the state of the user's data. True when its time went back: a reset, the tick is 0 again.
 
+        The tick advances by the timesteps that passed, so several `mj_step` may lie between two calls.
         Raises `SimulationDivergedError` for numbers that are not finite.
         """
         self._require_owner(user=True)
         mujoco.mj_getState(self.model, self.data, self._state, STATE)
-        back = float(self.data.time) < self._user_time
-        self._user_time = float(self.data.time)
-        tick = 0 if back else self._tick + 1
-        self._show(tick)
+        time = float(self.data.time)
+        passed = time - self._user_time
+        self._user_time = time
+        ticks = max(1, round(passed / float(self.model.opt.timestep))) if passed > 0.0 else 0
+        self._show(0 if passed < 0.0 else self._tick + ticks)
+        return passed < 0.0
 
     def set_state_bytes(self, state: bytes) -> None:
         """Shows a plant that is advanced elsewhere (`state_bytes` of the same model). The tick follows from its time.
@@ -214,22 +216,13 @@ class World:
         return {text: counts[i] for text, i in _FULL.items() if counts[i]}
 
     def model_bytes(self) -> bytes:
-        """The model as MJB, asset paths blanked (see `load.model_bytes`); computed once."""
-        if not self._model_bytes:
-            self._model_bytes = model_bytes(self.model)
-        return self._model_bytes
-
-    @property
-    def scene_hash(self) -> str:
-        """BLAKE2b of the model bytes, 32 hex characters."""
-        if not self._scene_hash:
-            self._scene_hash = scene_hash(self.model_bytes())
-        return self._scene_hash
+        """The model as MJB, asset paths blanked (see `load.model_bytes`); made anew by every call."""
+        return bytes(model_bytes(self.model))
 
     # --- saving -------------------------------------------------------------------------------------------------------
 
     def state_bytes(self) -> bytes:
-        """`mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, activations, warm start, inputs."""
+        """`mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, warm start, inputs, ..."""
         mujoco.mj_getState(self.model, self._shown, self._state, STATE)
         return self._state.tobytes()
 
