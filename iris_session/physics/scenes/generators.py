@@ -39,7 +39,7 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
         size=[radius + 0.25, 0.02, 0],
         pos=[0, 0, -0.02],
-        rgba=[0.86, 0.84, 0.80, 1],
+        rgba=[0.66, 0.67, 0.66, 1],
     )
     spec.worldbody.add_geom(
         name="table_foot",
@@ -139,6 +139,7 @@ def _room(name: str, floor_z: float = -0.75) -> Any:
     spec.option.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     spec.option.cone = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
     spec.option.impratio = 10
+    spec.option.noslip_iterations = 3
     spec.visual.global_.offwidth = 1280
     spec.visual.global_.offheight = 960
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
@@ -193,10 +194,10 @@ def _add_object(spec: Any, k: int, count: int, radius: float) -> list[float]:
     body.add_freejoint()
     parts: list[dict[str, Any]]
     if k % 2:
-        parts = [{"size": [0.150, 0.028, 0.012], "mass": 0.26, "rgba": [0.72, 0.55, 0.37, 1]}]
+        parts = [{"size": [0.150, 0.028, 0.012], "mass": 0.26, "rgba": [0.66, 0.46, 0.27, 1]}]
     else:
         parts = [
-            {"size": [0.140, 0.012, 0.015], "mass": 0.13, "rgba": [0.72, 0.55, 0.37, 1]},
+            {"size": [0.140, 0.012, 0.015], "mass": 0.13, "rgba": [0.66, 0.46, 0.27, 1]},
             {"size": [0.016, 0.055, 0.016], "pos": [-0.148, 0, 0], "mass": 0.37, "rgba": [0.55, 0.57, 0.60, 1]},
         ]
     for part in parts:
