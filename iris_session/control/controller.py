@@ -65,6 +65,7 @@ class Controller:
         self._proximity = Proximity(model, self._robots, self._config)
         self._solve_ticks = max(1, math.ceil(1.0 / (self._config.solve_rate_hz * self._dt) - 1e-9))
         self._slow_interval = max(1.0 / self._config.sample_rate_min_hz, self._solve_ticks * self._dt)
+        self._refine_ticks = math.ceil(self._slow_interval / self._dt - 1e-9)
         self._proximity_ticks = max(1, round(self._config.proximity_period_s / self._dt))
         self._states = [RobotState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
@@ -241,7 +242,9 @@ class Controller:
             if r.latch is not None and not r.fresh and r.latch.kind == CommandKind.TWIST:
                 self._integrate(i, r, r.latch)
             if r.want_solve:
-                if solved < config.max_solves_per_tick and self._tick - r.last_solve >= self._solve_ticks:
+                # New targets first of all; refinement of an old one waits for the slowest device's next sample.
+                wait = self._solve_ticks if r.pending is not None else self._refine_ticks
+                if solved < config.max_solves_per_tick and self._tick - r.last_solve >= wait:
                     self._solve(i)
                     solved += 1
                     self._cursor = (i + 1) % n

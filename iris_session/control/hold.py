@@ -1,6 +1,6 @@
 """From commanded joint motion to `ctrl`, by actuator type; with the joints at rest this is the hold law of each type.
 
-* position (affine bias in the joint position): the `ctrl` whose equilibrium is the commanded position; constant at rest.
+* position (affine bias in the position): the `ctrl` whose equilibrium is the commanded position; at rest constant.
 * velocity (also integrated velocity): commanded velocity plus a correction of the joint error beyond a deadband. At
   rest: exactly zero within the deadband; outside it (gravity on a soft servo) the correction bounds the drift to
   `deadband + torque / (kv * gain)` where zero alone would creep without end.
