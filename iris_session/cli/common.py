@@ -1,0 +1,56 @@
+"""What commands share: options of a session, one-line errors, printing one JSON object."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from iris_session.protocol.names import AssignmentPolicy, LeaseMode
+
+
+class CommandError(Exception):
+    """The command cannot go on; the text is one line that says what would be right."""
+
+    def __init__(self, text: str, status: int = 2) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+def expected_errors() -> tuple[type[Exception], ...]:
+    """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
+    from iris_session.client import ClientError
+    from iris_session.control import ControlError
+    from iris_session.physics import PhysicsError
+    from iris_session.recording import RecordingError
+    from iris_session.runtime.errors import SessionError
+    from iris_session.transport import FrontError
+
+    return (SessionError, PhysicsError, ControlError, FrontError, RecordingError, ClientError)
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+
+
+def add_session_options(parser: argparse.ArgumentParser) -> None:
+    """Options that every command which opens a session takes."""
+    group = parser.add_argument_group("session")
+    group.add_argument("--name", default=None, help="name of the session (default: that of the scene)")
+    group.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDR", help="address to listen on (default: %(default)s)"
+    )
+    group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free one")
+    group.add_argument("--state-port", type=int, default=None, metavar="PORT", help="0: any free one")
+    group.add_argument("--curve-key", default="", metavar="FILE", help="the server's CURVE secret key (off loopback)")
+    group.add_argument(
+        "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
+    )
+    group.add_argument("--no-record", action="store_true", help="record nothing")
+    group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
+    group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """Exactly one JSON object on standard output."""
+    print(json.dumps(value, allow_nan=False), flush=True)

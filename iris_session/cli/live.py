@@ -1,0 +1,159 @@
+"""Shows a running session in the terminal, from a process of its own so that drawing never delays a tick.
+
+`LiveView` (in the authority's process) writes one JSON line per refresh into a pipe, without ever blocking;
+`python -m iris_session.cli.live` reads them and draws: a live table on a terminal, one line per event elsewhere.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, TextIO
+
+import msgspec
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from iris_session.protocol.server_messages import Event
+    from iris_session.runtime.session import Session
+
+#: Refresh of the display [s].
+REFRESH_S: Final = 0.5
+#: Event bodies that come in great numbers and say little to a person.
+QUIET: Final = frozenset({"engagement_changed", "samples_rejected"})
+
+
+def event_line(event: Event) -> str:
+    """One event as one line of text."""
+    body = msgspec.to_builtins(event.body)
+    kind = body.pop("event")
+    info = body.pop("participant", None)
+    if isinstance(info, dict):
+        body = {"participant": info["id"], "name": info["name"], "role": info["role"], **body}
+    elif info:
+        body = {"participant": info, **body}
+    if isinstance(body.get("alignment"), dict):
+        alignment = body.pop("alignment")
+        body["kind"] = alignment["kind"]
+        body["error_mm"] = round(alignment["error_at_robot_m"] * 1e3, 1)
+    if isinstance(body.get("lease"), dict):
+        lease = body.pop("lease")
+        body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
+    text = " ".join(f"{key}={value}" for key, value in body.items() if value not in ("", None))
+    return f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}"
+
+
+class LiveView:
+    """Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped`: refreshes that
+    the display was too slow for."""
+
+    def __init__(self, session: Session, out: TextIO, title: str) -> None:
+        self._session = session
+        self._out = out
+        self._title = title
+        self._next_s = 0.0
+        self._seen = 0
+        self._pipe = -1
+        self.skipped = 0
+
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """Starts the display, ends it after the last line."""
+        self._out.flush()
+        child = subprocess.Popen(
+            [sys.executable, "-m", "iris_session.cli.live", self._title], stdin=subprocess.PIPE, stdout=self._out
+        )
+        assert child.stdin is not None
+        self._pipe = child.stdin.fileno()
+        os.set_blocking(self._pipe, False)
+        try:
+            yield
+        finally:
+            self.update(force=True)
+            child.stdin.close()
+            child.wait(timeout=10.0)
+
+    def update(self, force: bool = False) -> None:
+        """Sends what is new to the display."""
+        now = time.monotonic()
+        if now < self._next_s and not force:
+            return
+        self._next_s = now + REFRESH_S
+        fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
+        lines = [event_line(e) for e in fresh if e.body.__struct_config__.tag not in QUIET]
+        line = json.dumps({"status": self._session.status().as_dict(), "events": lines}).encode() + b"\n"
+        try:
+            # A pipe takes a write of up to its free space: a refresh is either written whole or tried again later.
+            if os.write(self._pipe, line) != len(line):
+                self.skipped += 1
+        except (BlockingIOError, BrokenPipeError):
+            self.skipped += 1
+            return
+        if fresh:
+            self._seen = fresh[-1].event_seq
+
+
+def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableType:
+    from rich.console import Group
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(expand=True, box=None, padding=(0, 1))
+    for column in ("participant", "role", "robots", "alignment (p95 at robot)", "hand to robot"):
+        table.add_column(column)
+    for row in status["participants"]:
+        error = "" if row["alignment_mm"] is None else f" {row['alignment_mm']:.1f} mm"
+        delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
+        name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [lost]")
+        table.add_row(name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
+    late = status["lateness"]
+    state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
+    footer = (
+        f"{state}  tick {status['tick']}  late {late.get('late_share', 0.0) * 100:.2f} %  "
+        f"lateness p99 {late.get('p99_ms', 0.0):.2f} ms  handovers {len(status['handovers'])}  "
+        f"drops {sum(status['drops'].values())}"
+    )
+    log = Text("\n".join(events[-8:]), style="dim", no_wrap=True, overflow="ellipsis")
+    return Panel(Group(table, Text(footer), log), title=f"{title}  {status['session_time_s']:.1f} s")
+
+
+def _parsed(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
+    for line in lines:
+        try:
+            yield json.loads(line)
+        except ValueError:  # a refresh that was cut because the pipe was full
+            continue
+
+
+def main(title: str) -> int:
+    """The display process: draws until its standard input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session's process decides when this ends
+    refreshes = _parsed(iter(sys.stdin))
+    if sys.stdout.isatty():
+        try:
+            from rich.live import Live
+        except ImportError:
+            print("iris-session: no live table without rich: pip install 'iris-session[terminal]'", file=sys.stderr)
+        else:
+            events: list[str] = []
+            with Live(auto_refresh=False) as live:
+                for refresh in refreshes:
+                    events = (events + refresh["events"])[-8:]
+                    live.update(_table(title, refresh["status"], events), refresh=True)
+            return 0
+    for refresh in refreshes:
+        for line in refresh["events"]:
+            print(line, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

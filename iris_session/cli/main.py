@@ -1,0 +1,57 @@
+"""Entry point of the `iris-session` command: parses, dispatches, turns every expected error into one line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib.metadata import version
+
+from iris_session.cli import bench, demo, emulate, robots, serve, verify
+from iris_session.cli.common import CommandError, expected_errors
+
+_EPILOG = """examples:
+  iris-session demo handover                 two emulated operators hand a hammer over
+  iris-session serve scene.xml               share a MuJoCo scene on this machine
+  iris-session robots scene.xml              the robots found in a model, as TOML to edit
+  iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
+  iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
+  iris-session bench state --check           measure the state stream against its bars
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="iris-session",
+        description="One robot scene, several people in XR headsets.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (demo, serve, verify, emulate, robots, bench):
+        module.register(commands)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command; returns the exit status."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        status: int = arguments.run(arguments)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of a pipe has gone (`| head`)
+        sys.stderr.close()
+        return 1
+    except CommandError as error:
+        print(f"iris-session: {error}", file=sys.stderr)
+        return error.status
+    except expected_errors() as error:
+        print(f"iris-session: {error}", file=sys.stderr)
+        return 2
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

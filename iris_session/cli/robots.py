@@ -1,0 +1,38 @@
+"""`iris-session robots`: shows the robots found in a model, as a TOML file ready to edit."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from iris_session.cli.common import add_json, print_json
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "robots",
+        help="show the robots found in a model, as TOML to edit",
+        description="Prints the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
+        epilog="example:\n  iris-session robots scene.xml > robots.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scene", type=Path)
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints what `find_robots` sees; an ambiguous model is an error that carries the same TOML."""
+    import msgspec
+
+    from iris_session.physics import dump_robots_toml, find_objects, find_robots, load_model
+
+    model = load_model(arguments.scene)
+    robots = find_robots(model)
+    objects = find_objects(model)
+    if arguments.json:
+        print_json({"robots": msgspec.to_builtins(robots), "objects": msgspec.to_builtins(objects)})
+    else:
+        print(f"# {len(robots)} robots, {len(objects)} free objects: {', '.join(o.name for o in objects) or 'none'}")
+        print(dump_robots_toml(robots))
+    return 0

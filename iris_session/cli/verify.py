@@ -1,0 +1,43 @@
+"""`iris-session verify`: re-simulates recordings and compares every step bit for bit."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from iris_session.cli.common import add_json, print_json
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "verify",
+        help="re-simulate a recording and compare it bit for bit",
+        description="Re-simulates recordings. Exit status 0 only if every step of every file is identical.",
+        epilog="example:\n  iris-session verify sessions/*/session.rrd",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Verifies each file; the first problem of each is named with its step and entry."""
+    from iris_session.runtime.verification import verify_recording
+
+    reports = []
+    progress = sys.stderr.isatty()
+    for path in arguments.files:
+
+        def show(done: int, total: int, path: Path = path) -> None:
+            print(f"\r{path}: step {done} of {total}", end="" if done < total else "\n", file=sys.stderr)
+
+        report = verify_recording(path, show if progress else None)
+        reports.append(report)
+        if not arguments.json:
+            print(f"{path}: {report.line()}")
+    ok = all(report.ok for report in reports)
+    if arguments.json:
+        print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
+    return 0 if ok else 1

@@ -1,0 +1,65 @@
+"""`SessionConfig`: every setting of a session, each with a default that works. Nothing here is required."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from anchors.pose import IDENTITY_QUAT, PoseTuple
+from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig
+from iris_session.runtime.errors import ConfigError
+
+#: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
+DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """Settings of one session.
+
+    `record`: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
+    False records nothing. Port 0 takes any free one. `anchors`: `T_world_anchor` per anchor id. `curve_key`: file with
+    the server's CURVE secret key, required for any `host` that is not loopback. `keyframe_s`: distance of the
+    recording's keyframes [s].
+    """
+
+    name: str = "session"
+    host: str = "127.0.0.1"
+    control_port: int = 7721
+    state_port: int = 7722
+    state_hz: float = 60.0
+    record: bool | str | Path = True
+    anchors: Mapping[str, PoseTuple] = DEFAULT_ANCHORS
+    curve_key: str = ""
+    keyframe_s: float = 5.0
+    authority: AuthorityConfig = field(default_factory=AuthorityConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}", self.name):
+            raise ConfigError(
+                f"session name {self.name!r} cannot be used: 1 to 48 letters, digits, '.', '_' or '-', "
+                "beginning with a letter or digit"
+            )
+        for label, port in (("control_port", self.control_port), ("state_port", self.state_port)):
+            if not 0 <= port <= 65535:
+                raise ConfigError(f"{label} {port} is not a port: 0 (any free one) to 65535")
+        if not 1.0 <= self.state_hz <= 240.0:
+            raise ConfigError(f"state_hz {self.state_hz} is out of range: 1 to 240")
+        if not 0.5 <= self.keyframe_s <= 60.0:
+            raise ConfigError(f"keyframe_s {self.keyframe_s} is out of range: 0.5 to 60")
+
+    def recording_path(self) -> Path | None:
+        """Where this session records to, None when it does not. The name of a default folder is made at each call."""
+        if self.record is False:
+            return None
+        if self.record is True:
+            stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+            return Path("sessions") / f"{stamp}-{self.name}" / "session.rrd"
+        return Path(self.record)

@@ -1,0 +1,137 @@
+"""`SessionCore`: the session as a pure function of (initial state, configuration, journal).
+
+Composes authority, control and the plant for one step and takes the digest that replay compares. Reads no clock, no
+random source, no socket. Two classes (docs/architecture.md): `closed`, where our own physics advances, and `open`,
+where the plant's state comes from outside (a user's loop, a real robot) and is part of the journal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import msgspec
+import mujoco
+import numpy as np
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.control import ControlConfig, Controller
+from iris_session.physics import SimulationDivergedError, World
+from iris_session.physics.world import STATE
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import ControlStatus, Decision
+
+_encoder = msgspec.msgpack.Encoder()
+_decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
+
+
+class CoreConfig(msgspec.Struct, frozen=True):
+    """Everything besides the model that the session function depends on. Stored in the recording's header."""
+
+    authority: AuthorityConfig
+    control: ControlConfig
+    robots: tuple[RobotSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    #: `mjSTATE_INTEGRATION` to begin with and to reset to; empty: the model's own initial state.
+    initial_state: bytes = b""
+
+
+class StepOutcome(msgspec.Struct, frozen=True):
+    """What one step gave: the authority's decision, control's report, and the digest (16 bytes) of all of it."""
+
+    decision: Decision
+    status: tuple[ControlStatus, ...]
+    digest: bytes
+    #: Why physics stands still (numbers that are not finite), empty while all is well. A reset ends it.
+    diverged: str = ""
+
+
+class CoreState(msgspec.Struct, frozen=True):
+    """Snapshots of the three stateful parts, and the encoded control report that the next step's authority sees."""
+
+    plant: bytes
+    authority: bytes
+    controller: bytes
+    status: bytes
+
+
+class SessionCore:
+    """One session: robots and objects of one model, their authority and their control.
+
+    Raises the typed errors of `physics` and `control` when the model cannot be driven (for example a torque actuator
+    without a hold law).
+    """
+
+    def __init__(self, model: mujoco.MjModel, config: CoreConfig) -> None:
+        self.config = config
+        self.world = World(model, config.robots, config.objects)
+        self._reset_world()
+        self.authority = Authority(config.authority, config.robots, config.objects)
+        self.controller = Controller(model, config.robots, config.objects, config.control)
+        self.controller.reset(self.world.data)
+        self._status: tuple[ControlStatus, ...] = ()
+
+    def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> StepOutcome:
+        """One pass at session time `now_ns`, `n_ticks` >= 0 ticks of physics.
+
+        `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
+        write `world.data.ctrl` for the caller to apply, and do not advance physics.
+        """
+        world = self.world
+        if plant:
+            world.set_state_bytes(plant)
+        decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
+        if decision.reset:
+            self._reset_world()
+            self.controller.reset(world.data)
+        self.controller.begin(now_ns, n_ticks, decision, world.view())
+        for _ in range(0 if world.diverged else n_ticks):
+            self.controller.tick(world.data)
+            if not plant and not self._tick():
+                break
+        self._status = self.controller.status()
+        return StepOutcome(decision, self._status, self._digest(decision), world.diverged)
+
+    def _tick(self) -> bool:
+        """One tick of physics; False when the state is no longer finite: physics then stands still until a reset."""
+        try:
+            self.world.tick()
+        except SimulationDivergedError:
+            return False
+        return True
+
+    def _reset_world(self) -> None:
+        self.world.reset()
+        if self.config.initial_state:
+            self.world.set_state_bytes(self.config.initial_state)
+
+    def _digest(self, decision: Decision) -> bytes:
+        h = hashlib.blake2b(digest_size=16)
+        h.update(_encoder.encode(decision))
+        h.update(_encoder.encode(self._status))
+        h.update(self.world.state_bytes())
+        return h.digest()
+
+    def snapshot(self) -> CoreState:
+        """State after the last step; `restore` of it is invisible to everything that follows."""
+        return CoreState(
+            self.world.snapshot(),
+            self.authority.snapshot(),
+            self.controller.snapshot(),
+            _encoder.encode(self._status),
+        )
+
+    def restore(self, state: CoreState) -> None:
+        """Inverse of `snapshot`, into a core built with the same model and configuration."""
+        self.world.restore(state.plant)
+        self.authority.restore(state.authority)
+        self.controller.restore(state.controller)
+        self._status = _decode_status(state.status)
+
+
+def plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
+    """`mjSTATE_INTEGRATION` of `data`: what `step(plant=...)` and `CoreConfig.initial_state` take."""
+    state = np.empty(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    return state.tobytes()

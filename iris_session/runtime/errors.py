@@ -1,0 +1,25 @@
+"""Errors of a running session. Every text is one line that says what would be right.
+
+SessionError
+├── ConfigError          a value in the configuration cannot be used
+├── StartError           a process of the session did not come up (port in use, unwritable folder)
+└── OwnershipError       the call does not fit the way this session is driven
+"""
+
+from __future__ import annotations
+
+
+class SessionError(Exception):
+    """Base of all errors that a session raises to its owner."""
+
+
+class ConfigError(SessionError):
+    """A value in the configuration cannot be used."""
+
+
+class StartError(SessionError):
+    """A process of the session did not come up."""
+
+
+class OwnershipError(SessionError):
+    """The call does not fit the way this session is driven."""

@@ -1,0 +1,285 @@
+"""`Session`: one scene, its authority and its processes, driven by our loop or by the user's.
+
+    with Session(model, data) as session:      # our loop, recorded as `closed`
+        session.run()
+
+    with Session(model, data) as session:      # the user's loop, recorded as `open`
+        while True:
+            session.begin_tick()
+            mujoco.mj_step(model, data)
+            session.end_tick()
+
+    session = Session.attach(model, data)      # one line in an existing script: MuJoCo's control callback
+
+The process that makes the `Session` is the authority. Front and recorder are started by exec, watched, and replaced or
+announced when they die (`runtime.processes`).
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Final, Self
+
+import msgspec
+import mujoco
+
+from iris_session.physics import Pacer, find_objects, find_robots, load_model
+from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import EntryMessage, ExternalReset
+from iris_session.protocol.server_messages import Event
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.core import CoreConfig, SessionCore, plant_state
+from iris_session.runtime.errors import OwnershipError
+from iris_session.runtime.processes import SessionProcesses
+from iris_session.runtime.status import SessionStatus, make_status
+from iris_session.runtime.stepper import Stepper, session_clock
+from iris_session.runtime.user_loop import UserLoop
+
+#: Zero-tick steps while paused come at 100 Hz (DESIGN 5 asks for at least 50 Hz).
+PAUSED_STEP_S: Final = 0.01
+
+
+class Session:
+    """A shared session over one MuJoCo model.
+
+    `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,
+    else the model's default). With our loop a copy of it is advanced (`session.data` from then on). `robots`,
+    `objects`: None finds them in the model. Raises `AmbiguousModelError`, `ConfigError`, `StartError`.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel | str | Path,
+        data: mujoco.MjData | None = None,
+        config: SessionConfig | None = None,
+        *,
+        robots: Sequence[RobotSpec] | None = None,
+        objects: Sequence[ObjectSpec] | None = None,
+    ) -> None:
+        self.config = config or SessionConfig()
+        self.model = load_model(model) if isinstance(model, str | Path) else model
+        self.data = data
+        self.robots = tuple(find_robots(self.model) if robots is None else robots)
+        self.objects = tuple(find_objects(self.model) if objects is None else objects)
+        self._origin_ns = time.monotonic_ns()
+        self.clock = session_clock(self._origin_ns)
+        self._processes: SessionProcesses | None = None
+        self._stepper: Stepper | None = None
+        self._user_loop: UserLoop | None = None
+        self._pacer: Pacer | None = None
+        self._stop = threading.Event()
+        self._attached = False
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Opens the sockets and the recording. Called by `with`. Participants can connect from here on."""
+        if self._processes is None:
+            self._processes = SessionProcesses(self.config, self.model, self.robots, self.objects, self._origin_ns)
+            self._processes.start()
+
+    def close(self) -> None:
+        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice."""
+        self._stop.set()
+        if self._attached:
+            mujoco.set_mjcb_control(None)
+            self._attached = False
+        if self._user_loop is not None:
+            self._user_loop.close()
+        if self._processes is not None:
+            self._processes.close()
+            self._processes = None
+
+    # --- our loop ----------------------------------------------------------------------------------------------------
+
+    def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> None:
+        """Advances physics in real time until `stop()`, Ctrl-C or SIGTERM, `seconds` of session time, or `until()`.
+
+        One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
+        """
+        stepper = self._make_stepper(user_owned=False)
+        end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
+        pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
+        with self._signals():
+            while not self._stop.is_set():
+                now_ns = self.clock()
+                if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
+                    break
+                if stepper.paused:
+                    self._paused_step(stepper, pacer)
+                else:
+                    self._tick(stepper, pacer, now_ns)
+                self._live().watch(stepper)
+
+    def _tick(self, stepper: Stepper, pacer: Pacer, now_ns: int) -> None:
+        pacer.resume(now_ns)
+        wait_ns = pacer.next_deadline_ns - now_ns
+        if wait_ns > 0:
+            time.sleep(wait_ns * 1e-9)
+        else:
+            pacer.skip_backlog(now_ns)
+        stepper.step(1)
+        pacer.finished(self.clock())
+
+    def _paused_step(self, stepper: Stepper, pacer: Pacer) -> None:
+        """Zero ticks, or as many as a director asked for in the step before."""
+        assert stepper.last is not None
+        pacer.pause(self.clock())
+        time.sleep(PAUSED_STEP_S)
+        stepper.step(stepper.last.decision.step_ticks)
+
+    def stop(self) -> None:
+        """Ends `run()` after the step in progress. May be called from another thread or a signal handler."""
+        self._stop.set()
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM end `run()` in order; only possible, and only done, in the main thread."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def on_signal(number: int, _: FrameType | None) -> None:
+            if self._stop.is_set() and number == signal.SIGINT:
+                raise KeyboardInterrupt  # the second Ctrl-C does not wait
+            self._stop.set()
+
+        previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for s, handler in previous.items():
+                signal.signal(s, handler)
+
+    # --- the user's loop ---------------------------------------------------------------------------------------------
+
+    def begin_tick(self) -> None:
+        """Reads what participants want and writes `data.ctrl` of the robots; call right before `mj_step`."""
+        self._loop().begin_tick()
+
+    def end_tick(self) -> None:
+        """Publishes the state after the user's `mj_step`."""
+        self._loop().end_tick()
+
+    def targets(self) -> dict[str, Pose]:
+        """End-effector targets `T_world_tip` per robot, for an environment's own controller."""
+        return dict(self._make_stepper(user_owned=self._user_loop is not None).core.controller.targets())
+
+    @classmethod
+    def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
+        """Shares a script's own simulation: every `mj_step(model, data)` after this line is one tick of the session.
+
+        Uses MuJoCo's control callback, which is global to the process: it acts on `data` only, once per new time, and
+        takes time going back as a reset. RK4 calls it four times a step and is refused (`OwnershipError`), as is a
+        callback that is already set.
+        """
+        if int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
+            raise OwnershipError("attach() cannot be used with the RK4 integrator: set integrator='implicitfast'")
+        if mujoco.get_mjcb_control() is not None:
+            raise OwnershipError("MuJoCo's control callback is in use: call begin_tick() and end_tick() instead")
+        session = cls(model, data, config)
+        session.start()
+        loop = session._loop()
+
+        def on_control(_: mujoco.MjModel, callback_data: mujoco.MjData) -> None:
+            if callback_data is data:
+                loop.control_callback()
+
+        mujoco.set_mjcb_control(on_control)
+        session._attached = True
+        return session
+
+    def _loop(self) -> UserLoop:
+        if self._user_loop is None:
+            if self.data is None:
+                raise OwnershipError("begin_tick() needs the data that your loop advances: Session(model, data)")
+            stepper = self._make_stepper(user_owned=True)
+            self._user_loop = UserLoop(self.model, self.data, stepper, self._live())
+        return self._user_loop
+
+    # --- what the owner may do ---------------------------------------------------------------------------------------
+
+    def post(self, message: EntryMessage) -> None:
+        """Puts an input of the owner (connection 0, rights of a director) into the next step."""
+        self._make_stepper(user_owned=self._user_loop is not None).post(message)
+
+    def pause(self) -> None:
+        """Stops physics; leases, heartbeats and requests go on."""
+        self.post(Control(request_id=0, action="pause"))
+
+    def resume(self) -> None:
+        """Continues physics; robots hold until clutched again."""
+        self.post(Control(request_id=0, action="resume"))
+
+    def reset(self) -> None:
+        """Back to the initial state, in a new `scene_epoch`. In a user's loop: tells that the user did so."""
+        owned = self._user_loop is not None
+        self.post(ExternalReset() if owned else Control(request_id=0, action="reset"))
+
+    def estop(self, reason: str = "") -> None:
+        """Stops every robot, latched. Not a safety-rated stop."""
+        self.post(EStop(reason=reason))
+
+    def clear_estop(self) -> None:
+        self.post(ClearEStop(request_id=0))
+
+    def assign(self, robots: Sequence[str], participant: str = "") -> None:
+        """Gives robots to a participant, or frees them, whoever holds them."""
+        self.post(Assign(request_id=0, robots=tuple(robots), participant=participant))
+
+    def marker(self, text: str) -> None:
+        """A note in the recording."""
+        self.post(Marker(request_id=0, text=text))
+
+    def status(self) -> SessionStatus:
+        """Who is here, who holds what, how late ticks are, what was dropped."""
+        return make_status(self._stepper, self._pacer, self._processes)
+
+    def recent_events(self) -> list[Event]:
+        """The newest events, oldest first (at most 200; the recording has them all)."""
+        return [] if self._stepper is None else list(self._stepper.ledger.recent)
+
+    @property
+    def address(self) -> str:
+        """`host:port` of the control channel, which is all that a client needs."""
+        return self._live().address
+
+    @property
+    def recording(self) -> Path | None:
+        """Path of the recording, None when nothing is recorded."""
+        return None if self._processes is None else self._processes.recording
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _live(self) -> SessionProcesses:
+        if self._processes is None:
+            raise OwnershipError("the session is not started: use `with Session(...) as session`, or session.start()")
+        return self._processes
+
+    def _make_stepper(self, *, user_owned: bool) -> Stepper:
+        if self._stepper is None:
+            authority = msgspec.structs.replace(self.config.authority, user_owned_loop=user_owned)
+            initial = b"" if self.data is None else plant_state(self.model, self.data)
+            core_config = CoreConfig(authority, self.config.control, self.robots, self.objects, initial)
+            core = SessionCore(self.model, core_config)
+            self._stepper = self._live().make_stepper(core, self.clock, user_owned=user_owned)
+            if not user_owned:
+                self.data = core.world.data
+        return self._stepper

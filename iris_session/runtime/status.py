@@ -1,0 +1,152 @@
+"""What a session shows about itself: roster, leases, alignment, lateness, latency, drops. Plain values for people.
+
+`SessionLedger` follows the authority's own events, so it needs no snapshot and no question to the pure core.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from iris_session.client.session_state import SessionMirror
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import Event, Handover, Snapshot
+from iris_session.protocol.steps import ControlStatus, Decision
+
+if TYPE_CHECKING:
+    from iris_session.physics import Pacer
+    from iris_session.runtime.processes import SessionProcesses
+    from iris_session.runtime.stepper import Stepper
+
+#: Events kept for display; the recording has them all.
+RECENT_EVENTS: Final = 200
+
+
+class ParticipantStatus(msgspec.Struct, frozen=True):
+    """One row: `alignment_mm` is the stated p95 error at the robot, None without a measured alignment."""
+
+    id: str
+    name: str
+    role: str
+    connected: bool
+    robots: tuple[str, ...]
+    alignment: str
+    alignment_mm: float | None
+
+
+class HandoverStatus(msgspec.Struct, frozen=True):
+    object: str
+    giver: str
+    receiver: str
+    at_s: float
+    duration_s: float
+
+
+class SessionStatus(msgspec.Struct, frozen=True):
+    """`lateness`: ticks, late, late_share, p50_ms, p99_ms. `input_to_ctrl_ms`: capture of the newest applied sample to
+    the step that used it, per robot. `drops`: by reason, of front and recorder."""
+
+    session_time_s: float
+    tick: int
+    sim_time: float
+    paused: bool
+    estop: bool
+    participants: tuple[ParticipantStatus, ...]
+    handovers: tuple[HandoverStatus, ...]
+    lateness: dict[str, float]
+    input_to_ctrl_ms: dict[str, float]
+    drops: dict[str, int]
+    restarts: dict[str, int]
+
+    def as_dict(self) -> dict[str, Any]:
+        return dict(msgspec.to_builtins(self))
+
+
+class SessionLedger:
+    """Roster, leases and handovers as the decisions tell them."""
+
+    def __init__(self) -> None:
+        self.mirror = SessionMirror()
+        self.mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "", 0, 0.0, 0, participants=(), leases=()))
+        self.handovers: list[HandoverStatus] = []
+        self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
+        self.applied: dict[str, Applied] = {}
+
+    def follow(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
+        """Takes over one step."""
+        for event in decision.events:
+            self.mirror.apply_event(event)
+            self.recent.append(event)
+            if isinstance(event.body, Handover):
+                body = event.body
+                self.handovers.append(
+                    HandoverStatus(
+                        body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
+                    )
+                )
+        for robot in status:
+            if robot.applied is not None:
+                self.applied[robot.robot] = robot.applied
+
+    def participants(self) -> tuple[ParticipantStatus, ...]:
+        """The roster with what each participant holds."""
+        held: dict[str, list[str]] = {}
+        for lease in self.mirror.leases.values():
+            for holder in lease.sub_holders or ((lease.holder,) if lease.holder else ()):
+                held.setdefault(holder, []).append(lease.target)
+        rows = []
+        for info in self.mirror.participants.values():
+            alignment = info.alignment
+            measured = alignment is not None and alignment.kind == "measured"
+            rows.append(
+                ParticipantStatus(
+                    info.id,
+                    info.name,
+                    info.role,
+                    info.connected,
+                    tuple(held.get(info.id, ())),
+                    "none" if alignment is None else alignment.kind,
+                    alignment.error_at_robot_m * 1e3 if alignment is not None and measured else None,
+                )
+            )
+        return tuple(rows)
+
+    def input_to_ctrl_ms(self) -> dict[str, float]:
+        """Per robot: age of the newest applied sample when its step began to use it."""
+        return {name: (a.step_ns - a.capture_ns) * 1e-6 for name, a in self.applied.items()}
+
+
+def make_status(stepper: Stepper | None, pacer: Pacer | None, processes: SessionProcesses | None) -> SessionStatus:
+    """The status now; empty before the first step."""
+    drops = {} if processes is None else processes.drops()
+    restarts = {} if processes is None else processes.restarts()
+    if stepper is None or stepper.last is None:
+        return SessionStatus(0.0, 0, 0.0, False, False, (), (), {}, {}, drops, restarts)
+    now_ns = stepper.clock()
+    lateness = {}
+    if pacer is not None:
+        stats = pacer.stats(now_ns)
+        lateness = {
+            "ticks": stats.ticks,
+            "late": stats.late,
+            "late_share": stats.late_share,
+            "p50_ms": stats.p50_ns * 1e-6,
+            "p99_ms": stats.p99_ns * 1e-6,
+            "max_ms": stats.max_ns * 1e-6,
+        }
+    view, ledger, decision = stepper.core.world.view(), stepper.ledger, stepper.last.decision
+    return SessionStatus(
+        now_ns * 1e-9,
+        view.tick,
+        view.sim_time,
+        decision.paused,
+        decision.estop,
+        ledger.participants(),
+        tuple(ledger.handovers),
+        lateness,
+        ledger.input_to_ctrl_ms(),
+        drops,
+        restarts,
+    )

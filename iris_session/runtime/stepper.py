@@ -1,0 +1,187 @@
+"""One step of a live session: gathers entries, runs the core, sends the results out, journals. No pacing, no threads.
+
+Session time is stamped here, once per step, and handed to the pure core. Everything that goes out is bounded by the
+ports behind it (front link, recorder feed); what they drop they count.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.client_messages import Control, Marker
+from iris_session.protocol.common import Applied
+from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap, StalledGap
+from iris_session.protocol.server_messages import StateHeader
+from iris_session.protocol.steps import Decision
+from iris_session.recording.journal import JournalRow, Keyframe, make_row
+from iris_session.runtime.core import SessionCore, StepOutcome
+from iris_session.runtime.status import SessionLedger
+
+#: A pause between steps above which robots must be clutched again (the freshness bound of samples, DESIGN 5.3).
+GAP_NS: Final = 150_000_000
+#: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
+MAX_HOST_ENTRIES: Final = 256
+
+
+class FrontPort(Protocol):
+    """What the stepper needs of the front process."""
+
+    def poll(self) -> list[Entry]: ...
+
+    def send_decision(self, step: int, decision: Decision) -> None: ...
+
+    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None: ...
+
+
+class RecorderPort(Protocol):
+    """What the stepper needs of the recorder's feed."""
+
+    wants_keyframe: bool
+
+    def row(self, row: JournalRow) -> None: ...
+
+    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
+
+    def state(
+        self,
+        step: int,
+        tick: int,
+        sim_time: float,
+        session_time: int,
+        poses: NDArray[np.float64],
+        applied: Sequence[Applied] = (),
+    ) -> None: ...
+
+    def decision(self, step: int, session_time: int, decision: Decision) -> None: ...
+
+    def take_gap(self) -> int: ...
+
+
+class Stepper:
+    """Drives one `SessionCore` against a front and a recorder.
+
+    `clock` gives session time in nanoseconds. `state_period_ns`: how often rigid state is published and recorded.
+    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded).
+    """
+
+    def __init__(
+        self,
+        core: SessionCore,
+        front: FrontPort,
+        recorder: RecorderPort | None,
+        clock: Callable[[], int],
+        state_period_ns: int,
+        keyframe_period_ns: int,
+        chain: bytes = b"",
+    ) -> None:
+        self.core = core
+        self.front = front
+        self.recorder = recorder
+        self.clock = clock
+        self.step_count = 0
+        self.last: StepOutcome | None = None
+        self._host: deque[EntryMessage] = deque()
+        self._state_period_ns = state_period_ns
+        self._keyframe_period_ns = keyframe_period_ns
+        self._next_state_ns = 0
+        self._next_keyframe_ns = 0
+        self._chain = chain
+        self.ledger = SessionLedger()
+        self._last_now_ns = -1
+        self._poses = np.zeros((len(core.world.bodies), 7))
+
+    @property
+    def paused(self) -> bool:
+        return self.last is not None and self.last.decision.paused
+
+    def post(self, message: EntryMessage) -> None:
+        """Queues an input of the session's owner for the next step. Thread-safe (`deque.append`)."""
+        if len(self._host) >= MAX_HOST_ENTRIES:
+            raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
+        self._host.append(message)
+
+    def step(self, n_ticks: int, plant: bytes = b"") -> StepOutcome:
+        """Takes one step now. `plant`: see `SessionCore.step` (open sessions)."""
+        now_ns = self.clock()
+        if now_ns <= self._last_now_ns:  # one step per instant: session time strictly grows
+            now_ns = self._last_now_ns + 1
+        entries = self._gather(now_ns)
+        if self.step_count == 0:
+            self._keyframe(now_ns)
+        self._last_now_ns = now_ns
+        outcome = self.core.step(now_ns, entries, n_ticks, plant)
+        if outcome.diverged and (self.last is None or not self.last.diverged):
+            self.post(Control(request_id=0, action="pause"))
+            self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
+        self.last = outcome
+        self.front.send_decision(self.step_count, outcome.decision)
+        self.ledger.follow(outcome.decision, outcome.status)
+        if self.recorder is not None:
+            self._record(self.recorder, now_ns, n_ticks, entries, plant)
+        self.publish()
+        self.step_count += 1
+        return outcome
+
+    def _gather(self, now_ns: int) -> list[Entry]:
+        entries = self.front.poll()
+        host: list[Entry] = []
+        if self._last_now_ns >= 0 and now_ns - self._last_now_ns > GAP_NS:
+            host.append(Entry(HOST, HOST, now_ns, StalledGap(now_ns - self._last_now_ns)))
+        while self._host:
+            host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
+        return host + entries if host else entries
+
+    def publish(self) -> None:
+        """Sends the rigid state when it is due: its time is now, the end of the tick."""
+        end_ns = self.clock()
+        if self.last is None or end_ns < self._next_state_ns:
+            return
+        # Aims at a fixed rate; after a long gap it starts over instead of sending a burst.
+        self._next_state_ns = max(self._next_state_ns + self._state_period_ns, end_ns)
+        decision, world = self.last.decision, self.core.world
+        world.poses(self._poses)
+        applied = tuple(s.applied for s in self.last.status if s.applied is not None)
+        tick, sim_time = world.view().tick, world.view().sim_time
+        header = StateHeader(
+            decision.scene_epoch, decision.scene_revision, tick, sim_time, end_ns, 0, 0, 0, applied
+        )  # fmt: skip
+        self.front.send_state(header, self._poses)
+        if self.recorder is not None:
+            self.recorder.state(self.step_count, tick, sim_time, end_ns, self._poses, applied)
+
+    def _record(
+        self, recorder: RecorderPort, now_ns: int, n_ticks: int, entries: Sequence[Entry], plant: bytes
+    ) -> None:
+        assert self.last is not None
+        row = make_row(self._chain, self.step_count, now_ns, n_ticks, entries, self.last.digest, plant)
+        self._chain = row.chain
+        decision = self.last.decision
+        if decision.events or decision.outgoing or decision.presence:
+            recorder.decision(self.step_count, now_ns, decision)
+        recorder.row(row)
+        lost = recorder.take_gap()
+        if lost:
+            self.post(RecordingGap(lost))
+        if recorder.wants_keyframe or now_ns >= self._next_keyframe_ns:
+            self._keyframe(now_ns)
+
+    def _keyframe(self, now_ns: int) -> None:
+        """Stores the state after the newest step (-1: the initial state), so that verification can begin there."""
+        if self.recorder is None:
+            return
+        self._next_keyframe_ns = now_ns + self._keyframe_period_ns
+        state = self.core.snapshot()
+        step = self.step_count if self.last is not None else -1
+        frame = Keyframe(step, state.plant, state.authority, state.controller, state.status)
+        self.recorder.keyframe(frame, self._chain)
+
+
+def session_clock(origin_ns: int) -> Callable[[], int]:
+    """Session time [ns]: CLOCK_MONOTONIC minus the origin, the same in every process of this machine."""
+    return lambda: time.monotonic_ns() - origin_ns
