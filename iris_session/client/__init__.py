@@ -4,7 +4,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
-from iris_session.client.client import Client, poll_all
+from iris_session.client.client import Client, poll_all, wait_any
 from iris_session.client.errors import (
     ClientError,
     DeniedError,
@@ -29,6 +29,7 @@ __all__ = [
     "SessionMirror",
     "Shown",
     "poll_all",
+    "wait_any",
     "ClientError",
     "DeniedError",
     "IdentityError",

@@ -103,16 +103,20 @@ class Client(SceneView, Requests):
 
         Raises `RefusedError` (or `VersionError`) when the session says no, `NotConnectedError` when nobody answers.
         """
-        with self._lock:
-            if self.connection.phase is Phase.CLOSED:
-                raise NotConnectedError(self.connection.describe())
-            if self.connection.phase in (Phase.IDLE, Phase.REFUSED):
-                self.connection.open(time.monotonic_ns())
+        self.open()
         if not self.wait_for(lambda client: client.ready, timeout_s):
             raise NotConnectedError(
                 f"no session let us in at {self.address} within {timeout_s:g} s: is `iris-session serve` running there?"
             )
         return self
+
+    def open(self) -> None:
+        """Begins to join, without waiting: `poll` goes on with it until `ready`."""
+        with self._lock:
+            if self.connection.phase is Phase.CLOSED:
+                raise NotConnectedError(self.connection.describe())
+            if self.connection.phase in (Phase.IDLE, Phase.REFUSED):
+                self.connection.open(time.monotonic_ns())
 
     def close(self) -> None:
         """Leaves at once: leases are released without grace. Stops the thread of `start`."""
@@ -208,7 +212,11 @@ class Client(SceneView, Requests):
             self._send_soon()
             return queued
 
-    def send_sample(
+    def send_sample(self, device: str, pose: PoseTuple | None = None, **fields: Any) -> bool:
+        """Makes one sample of `device` with `make_sample` and sends it."""
+        return self.send(self.make_sample(device, pose, **fields))
+
+    def make_sample(
         self,
         device: str,
         pose: PoseTuple | None = None,
@@ -219,8 +227,8 @@ class Client(SceneView, Requests):
         capture_ns: int | None = None,
         tracking_epoch: int | None = None,
         **fields: Any,
-    ) -> bool:
-        """Sends one sample of `device`; epochs, versions, tokens and `seq` are filled in.
+    ) -> Sample:
+        """A sample of `device` as of now; epochs, versions, tokens and `seq` are filled in.
 
         `pose`: `T_tracking_device`. `robots`, `objects`: what it drives; those that are not ours are left out, so the
         sample is mere presence when none is. `capture_ns`: session time of capture, default now. `fields`: the other
@@ -230,7 +238,7 @@ class Client(SceneView, Requests):
             targets = [*self._targets(robots, "robot"), *self._targets(objects, "object")]
             seq = self._seq[device] = self._seq.get(device, 0) + 1
             alignment = self.alignment
-            sample = Sample(
+            return Sample(
                 device=device,
                 kind=kind,
                 seq=seq,
@@ -243,7 +251,18 @@ class Client(SceneView, Requests):
                 pose=None if pose is None else Pose(*pose),
                 **fields,
             )
-            return self.send(sample)
+
+    def submit(self, message: Any) -> int:
+        """Sends a message that has a `request_id` (which is filled in) without waiting; `answer` has the reply."""
+        with self._lock:
+            request_id = self.connection.request(message)
+            self._send_soon()
+            return request_id
+
+    def answer(self, request_id: int) -> Reply | None:
+        """The reply to a submitted request, once; `None` while there is none. Look at its `denial`."""
+        with self._lock:
+            return self.connection.take_reply(request_id)
 
     def request(self, message: Any, timeout_s: float = DEFAULT_TIMEOUT_S) -> Reply:
         """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
@@ -251,17 +270,15 @@ class Client(SceneView, Requests):
         Raises `DeniedError`, `RequestTimeoutError`, or `NotConnectedError` when the connection is lost meanwhile.
         """
         with self._lock:
-            request_id = self.connection.request(message)
             generation = self.connection.generation
-            self._send_soon()
+            request_id = self.submit(message)
         replies: list[Reply] = []
 
         def answered(client: Client) -> bool:
-            with client._lock:
-                reply = client.connection.take_reply(request_id)
-                if reply is not None:
-                    replies.append(reply)
-                return reply is not None or client.connection.generation != generation or not client.connection.joined
+            reply = client.answer(request_id)
+            if reply is not None:
+                replies.append(reply)
+            return reply is not None or client.connection.generation != generation or not client.connection.joined
 
         self.wait_for(answered, timeout_s)
         with self._lock:
@@ -359,20 +376,23 @@ class Client(SceneView, Requests):
                 self._changed.notify_all()
 
 
-def poll_all(clients: Sequence[Client], timeout_s: float) -> None:
-    """Polls several clients that have no thread: waits until one has something to do, at most `timeout_s`."""
+def wait_any(clients: Sequence[Client], timeout_s: float) -> None:
+    """Waits until one of several clients has something to do, at most `timeout_s`. Polls none of them."""
     now = time.monotonic_ns()
     deadline = now + int(timeout_s * 1e9)
     poller = zmq.Poller()
-    progressed = False
     for client in clients:
-        progressed |= client.poll(0.0)
-        deadline = min(deadline, client.connection.next_deadline_ns(now))
-        client._sockets.register(poller)
-    if not progressed and deadline > (now := time.monotonic_ns()):
-        poller.poll(_milliseconds(deadline - now))
-        for client in clients:
-            client.poll(0.0)
+        if client.connection.phase is not Phase.CLOSED:
+            deadline = min(deadline, client.connection.next_deadline_ns(now))
+            client._sockets.register(poller)
+    poller.poll(_milliseconds(deadline - now))
+
+
+def poll_all(clients: Sequence[Client], timeout_s: float = 0.0) -> None:
+    """Polls several clients that have no thread, after `wait_any`."""
+    wait_any(clients, timeout_s)
+    for client in clients:
+        client.poll(0.0)
 
 
 def _milliseconds(nanoseconds: int) -> int:

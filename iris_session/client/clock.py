@@ -11,13 +11,13 @@ from collections import deque
 from statistics import median
 from typing import NamedTuple
 
-WINDOW = 32  # exchanges; half a minute at one per second
+WINDOW = 32  # exchanges; a quarter of a minute at two per second
 MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
 SLEW = 0.01  # the estimate moves at most 10 ms per second: invisible in 150 ms freshness, monotonic
 DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
 BURST = 8  # exchanges at the start and after a reset ...
 BURST_PERIOD_NS = 25_000_000  # ... at this period, then
-PERIOD_NS = 1_000_000_000  # at this one
+PERIOD_NS = 500_000_000  # at this one; pongs also tell that the front lives
 
 
 class Exchange(NamedTuple):

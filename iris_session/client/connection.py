@@ -55,13 +55,16 @@ HELLO_TIMEOUT_NS: Final = 1_000_000_000
 BACKOFF_MIN_NS: Final = 100_000_000
 BACKOFF_MAX_NS: Final = 2_000_000_000
 SNAPSHOT_RETRY_NS: Final = 500_000_000
-SILENT_HEARTBEATS: Final = 3  # this many heartbeat periods without a word from the front: the connection is gone
+SILENT_HEARTBEATS: Final = 4  # this many heartbeat periods without a word from the front: the connection is gone
 MAX_OUTGOING: Final = 256
 MAX_INBOX: Final = 1024
 MAX_PENDING: Final = 64
 
 #: Refusals that pass: somebody who was in before keeps trying.
 TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
+
+#: Faults after which the front no longer knows this connection: hello is needed again.
+CONNECTION_ENDED: Final = frozenset({"session_ended", "dropped", "hello"})
 
 
 class Connection:
@@ -282,7 +285,7 @@ class Connection:
         self._deliver(fault)
         if fault.code in ("stalled", "recovered"):
             self.stalled = fault.code == "stalled"
-        elif fault.code in ("session_ended", "not_joined", "dropped", "slow"):
+        elif fault.code in CONNECTION_ENDED:
             self.lost(now_ns)
 
     def _reply(self, reply: Reply) -> None:
