@@ -1,0 +1,29 @@
+"""Fixtures of the transport tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tests.transport.harness import FrontSession
+
+
+@pytest.fixture
+def open_session() -> Iterator[Callable[..., FrontSession]]:
+    """Starts front processes with a configuration; they end with the test."""
+    opened: list[FrontSession] = []
+
+    def start(**config: object) -> FrontSession:
+        opened.append(FrontSession(**config))  # type: ignore[arg-type]
+        return opened[-1]
+
+    yield start
+    for front in opened:
+        front.close()
+
+
+@pytest.fixture
+def session(open_session: Callable[..., FrontSession]) -> FrontSession:
+    """A front process on free ports with a minimal authority."""
+    return open_session()

@@ -1,0 +1,191 @@
+"""Coalescing: newest pose, every edge, urgent first, bounded."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Bye,
+    EStop,
+    Heartbeat,
+    Marker,
+    Release,
+    Sample,
+    TrackingEpoch,
+)
+from iris_session.protocol.common import IDENTITY, Target
+from iris_session.protocol.entries import Entry, EntryMessage, Join, Lost
+from iris_session.transport.coalescer import Coalescer
+from iris_session.transport.config import FrontLimits
+from iris_session.transport.limiter import Drops
+
+SAMPLE = Sample("controller/right", "pose", 1, 0, 1, 0, 1, pose=IDENTITY, targets=(Target("left", 1),))
+
+
+def entry(message: EntryMessage, connection: int = 1, epoch: int | None = None) -> Entry:
+    return Entry(connection, connection if epoch is None else epoch, 0, message)
+
+
+def sample(seq: int, **changes: object) -> Sample:
+    return msgspec.structs.replace(SAMPLE, seq=seq, **changes)
+
+
+def coalescer(**limits: int) -> tuple[Coalescer, Drops]:
+    drops = Drops()
+    return Coalescer(FrontLimits(**limits), drops), drops
+
+
+def seqs(batch: list[Entry]) -> list[int]:
+    return [e.message.seq for e in batch if isinstance(e.message, Sample)]
+
+
+def test_only_the_newest_pose_of_a_device_waits() -> None:
+    waiting, _ = coalescer()
+    for seq in (1, 2, 3):
+        waiting.offer(entry(sample(seq)))
+    waiting.offer(entry(sample(9, device="head")))
+    assert seqs(waiting.take()) == [3, 9]
+    assert waiting.take() == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"clutch": True},
+        {"buttons": 1},
+        {"worn": False},
+        {"tracked": False},
+        {"gripper": 0.9},
+        {"scene_epoch": 2},
+        {"tracking_epoch": 2},
+        {"alignment_version": 2},
+        {"targets": (Target("left", 2),)},
+        {"kind": "twist"},
+    ],
+)
+def test_every_edge_is_kept(change: dict[str, object]) -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(sample(1)))
+    waiting.offer(entry(sample(2, **change)))
+    waiting.offer(entry(sample(3)))
+    waiting.offer(entry(sample(4)))
+    assert seqs(waiting.take()) == [1, 2, 4]
+
+
+def test_a_small_change_of_the_gripper_is_motion() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(sample(1, gripper=0.1)))
+    waiting.offer(entry(sample(2, gripper=0.4)))
+    assert seqs(waiting.take()) == [2]
+
+
+def test_old_sequence_numbers_and_forged_epochs_replace_nothing() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(sample(5)))
+    waiting.offer(entry(sample(4)))
+    waiting.offer(entry(sample(6), epoch=99))
+    assert seqs(waiting.take()) == [5, 4, 6]
+
+
+def test_messages_keep_their_place_among_samples() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(sample(1)))
+    waiting.offer(entry(Acquire(1, ("left",))))
+    waiting.offer(entry(sample(2)))
+    waiting.offer(entry(TrackingEpoch(1)))
+    kinds = [type(e.message) for e in waiting.take()]
+    assert kinds == [Acquire, Sample, TrackingEpoch]
+
+
+def test_urgent_comes_first_and_alone_when_credit_is_short() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(sample(1), connection=2))
+    waiting.offer(entry(Marker(1, "x"), connection=2))
+    waiting.offer(entry(EStop("stop")))
+    assert waiting.urgent
+    assert [type(e.message) for e in waiting.take(urgent_only=True)] == [EStop]
+    assert not waiting.urgent
+    assert [type(e.message) for e in waiting.take()] == [Sample, Marker]
+
+
+def test_release_overtakes_no_acquire_of_its_own() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(Acquire(1, ("left",))))
+    waiting.offer(entry(Release(2)))
+    assert [type(e.message) for e in waiting.take(urgent_only=True)] == [Acquire, Release]
+
+
+def test_loss_comes_after_the_join_and_drops_the_samples() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(Join("key", "operator", "Ann")))
+    waiting.offer(entry(sample(1)))
+    waiting.offer(entry(Heartbeat()))
+    waiting.offer(entry(Lost("closed")))
+    assert [type(e.message) for e in waiting.take()] == [Join, Lost]
+
+
+def test_an_estop_always_has_room_and_is_said_once() -> None:
+    waiting, drops = coalescer(pending_urgent=2)
+    for _ in range(5):
+        waiting.offer(entry(Release(1)))
+    for _ in range(100):
+        waiting.offer(entry(EStop()))
+    batch = waiting.take()
+    assert [type(e.message) for e in batch] == [Release, Release, EStop]
+    assert drops.by_reason == {"urgent_pending": 3}
+
+
+def test_bounds_are_counted_and_the_last_state_survives() -> None:
+    waiting, drops = coalescer(pending_messages=2, pending_samples=3, pending_devices=2)
+    for i in range(4):
+        waiting.offer(entry(Marker(i, "x")))
+    for seq in range(1, 9):
+        waiting.offer(entry(sample(seq, clutch=seq % 2 == 1)))
+    waiting.offer(entry(sample(1, device="head")))
+    waiting.offer(entry(sample(1, device="hand/left")))
+    assert drops.by_reason == {"messages_pending": 2, "samples_pending": 5, "devices_pending": 1}
+    assert drops.by_connection == {1: 8}
+    assert seqs(waiting.take()) == [1, 2, 8, 1]
+
+
+def test_a_full_batch_leaves_the_rest_for_the_next_one() -> None:
+    waiting, _ = coalescer(batch_entries=4)
+    for connection in (1, 2, 3):
+        for i in range(3):
+            waiting.offer(entry(Marker(i, "x"), connection))
+    assert [e.connection for e in waiting.take()] == [1, 1, 1, 2, 2, 2]
+    for i in range(3):
+        waiting.offer(entry(Marker(i, "x"), 1))
+    assert [e.connection for e in waiting.take()] == [3, 3, 3, 1, 1, 1]
+    assert not waiting.take()
+
+
+def test_forget_drops_what_waits_of_one_connection() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(Bye(), 1))
+    waiting.offer(entry(sample(1), 2))
+    waiting.forget(1)
+    assert [e.connection for e in waiting.take()] == [2]
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.booleans()), max_size=60))
+def test_edges_and_final_state_survive_any_interleaving(steps: list[tuple[bool, int, bool]]) -> None:
+    """The sequence of (clutch, buttons) without repeats, and the last sample, are those that were sent."""
+    waiting, drops = coalescer(pending_samples=100)
+    sent, received = [], []
+    for seq, (clutch, buttons, take) in enumerate(steps, 1):
+        sent.append((clutch, buttons))
+        waiting.offer(entry(sample(seq, clutch=clutch, buttons=buttons)))
+        if take:
+            received += waiting.take()
+    received += waiting.take()
+    edges = [s for i, s in enumerate(sent) if i == 0 or s != sent[i - 1]]
+    got = [(e.message.clutch, e.message.buttons) for e in received if isinstance(e.message, Sample)]
+    assert [s for i, s in enumerate(got) if i == 0 or s != got[i - 1]] == edges
+    assert seqs(received) == sorted(seqs(received))
+    assert not steps or seqs(received)[-1] == len(steps)
+    assert drops.by_reason == {}
