@@ -1,0 +1,76 @@
+"""`python -m iris_session.emulator`: emulated people from the command line, or driven by a parent with JSON lines."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from typing import Any
+
+import msgspec
+
+from iris_session.emulator.runner import run_headsets
+from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Exit status 0 when nobody failed."""
+    options = _parser().parse_args(argv)
+    try:
+        specs = _specs(options)
+    except (msgspec.MsgspecError, OSError, ValueError) as error:
+        print(f"emulator: {error}", file=sys.stderr)
+        return 2
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _frame: stopped.append(received))
+    say = _say_json if options.json else _say_line
+    reports = run_headsets(options.address, specs, options.seconds, say, lambda: bool(stopped))
+    for report in reports:
+        say(report, final=True)
+    return int(any(report.failed for report in reports))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m iris_session.emulator", description=__doc__)
+    parser.add_argument("--address", default="127.0.0.1:7721", help="control channel of the session, HOST:PORT")
+    parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person, see specs")
+    parser.add_argument("--specs", default="", metavar="FILE", help="JSON list of HeadsetSpec, - for standard input")
+    parser.add_argument("--seconds", type=float, default=None, help="at most this long")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
+    return parser
+
+
+def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
+    specs: list[HeadsetSpec] = []
+    if options.specs:
+        data = sys.stdin.buffer.read() if options.specs == "-" else _read(options.specs)
+        specs += msgspec.json.decode(data, type=list[HeadsetSpec])
+    for text in options.headset:
+        pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
+        specs.append(msgspec.convert(pairs, HeadsetSpec, strict=False))
+    if not specs:
+        raise ValueError("no headset: give --headset name=ann,behaviour=giver,robot=left or --specs FILE")
+    return specs
+
+
+def _read(path: str) -> bytes:
+    with open(path, "rb") as file:
+        return file.read()
+
+
+def _say_json(report: HeadsetReport, *, final: bool = False) -> None:
+    print(msgspec.json.encode({"final": final, **msgspec.to_builtins(report)}).decode(), flush=True)
+
+
+def _say_line(report: HeadsetReport, *, final: bool = False) -> None:
+    phase = next(reversed(report.phases), report.phase)
+    text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
+    text += f" age p99 {report.age_ms_p99:.1f} ms, alignment {report.alignment_error_mm:.1f} mm"
+    if report.failed:
+        text += f"  FAILED: {report.failed}"
+    print(("end  " if final else "     ") + text, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

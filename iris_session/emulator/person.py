@@ -1,0 +1,389 @@
+"""One emulated person: a client, a headset, and a behaviour. Joins, looks at the sheet, takes a robot, works.
+
+    join --> look --> acquire --> work --> done          any --> failed (`report.failed` says why)
+             ^---- the tracking frame jumped ----'
+
+`step` never waits and takes the time as an argument; the loop around it is in `runner`. All times are local monotonic
+nanoseconds unless named session time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from typing import Any, Final
+
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_yaw
+from iris_session.client import Client, NotConnectedError, PoseBuffer, SceneState, Shown
+from iris_session.client.scene_view import pose_at
+from iris_session.emulator.behaviours import Behaviour, HandInput, make_behaviour
+from iris_session.emulator.headset import Headset, look_at
+from iris_session.emulator.link import DelayLine
+from iris_session.emulator.specs import OBSERVER, HeadsetReport, HeadsetSpec
+from iris_session.protocol.client_messages import Acquire, ClientMessage
+from iris_session.protocol.common import Alignment
+from iris_session.protocol.names import AlignmentKind, CommandKind, Device, HoldReason, Role
+from iris_session.protocol.server_messages import Event, Handover, Notice
+
+#: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
+HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
+MOVE_S: Final = 0.4  # from one viewpoint to the next
+SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
+RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...
+RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
+AGES_KEPT: Final = 20_000
+RETRY_S: Final = 1.0
+
+#: Reasons of a hold that end by clutching again.
+CLUTCH_AGAIN: Final = frozenset(
+    {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.SCENE_CHANGED,
+     HoldReason.NO_SAMPLE, HoldReason.DISCONNECTED, HoldReason.ESTOP, HoldReason.UNTRACKED, HoldReason.NOT_WORN,
+     HoldReason.UNALIGNED}
+)  # fmt: skip
+
+
+class Display:
+    """What the person sees, world frame: `OperatorView` of the behaviours. The picture is late on purpose."""
+
+    def __init__(self, client: Client, delay_s: float) -> None:
+        self._client = client
+        self.buffer = PoseBuffer(int(delay_s * 1e9))
+        self.hands: dict[str, PoseTuple] = {}
+        self._epoch = 0
+        self._shown: Shown | None = None
+        self._now_ns = 0
+
+    def take(self, state: SceneState) -> None:
+        """A new state came."""
+        if state.header.scene_epoch != self._epoch:
+            self._epoch = state.header.scene_epoch
+            self.buffer.clear()
+        self.buffer.add(state.header.session_time, state.poses)
+
+    def refresh(self, session_ns: int) -> None:
+        """The next picture."""
+        self._now_ns = max(self._now_ns, session_ns)
+        self._shown = self.buffer.show(self._now_ns)
+
+    @property
+    def ready(self) -> bool:
+        return self._shown is not None
+
+    @property
+    def session_time_ns(self) -> int:
+        return self._now_ns
+
+    @property
+    def estop(self) -> bool:
+        return self._client.mirror.estop
+
+    def body_pose(self, name: str) -> PoseTuple | None:
+        index = self._client.mirror.body_index.get(name)
+        return None if index is None else self._pose(index)
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        info = self._client.mirror.robots.get(robot)
+        body = None if info is None else self._pose(info.site_body)
+        return None if info is None or body is None else compose(body, (info.T_body_site.p, info.T_body_site.q))
+
+    def lease_version(self, robot: str) -> int | None:
+        return self._client.lease_version(robot)
+
+    def device_pose(self, device: str) -> PoseTuple:
+        return self.hands[device]
+
+    def _pose(self, index: int) -> PoseTuple | None:
+        shown = self._shown
+        return None if shown is None or index >= len(shown.poses) else pose_at(shown.poses, index)
+
+
+class Person:
+    """See the module docstring. `report` is kept up to date."""
+
+    def __init__(self, address: str, spec: HeadsetSpec, start_ns: int) -> None:
+        self.spec = spec
+        self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
+        self.headset = Headset(spec.model, spec.seed, start_ns)
+        self.observer = spec.behaviour == OBSERVER
+        self.behaviour: Behaviour | None = None
+        if not self.observer:
+            self.behaviour = make_behaviour(
+                spec.behaviour, spec.robot, spec.object, spec.partner, spec.device, spec.seed
+            )
+        self.client = Client(
+            address,
+            role=Role.OBSERVER if self.observer else Role.OPERATOR,
+            name=spec.name,
+            devices=(Device.HEAD,) if self.observer else (Device.HEAD, spec.device),
+            identity=spec.identity_file or None,
+            software="iris-session emulator",
+            on_state=self._on_state,
+            on_event=self._on_event,
+        )
+        self.display = Display(self.client, spec.display_delay_s)
+        self._uplink: DelayLine[ClientMessage] = DelayLine(spec.model.link, self.headset.rng)
+        self._ages: deque[float] = deque(maxlen=AGES_KEPT)
+        self.started_ns = start_ns
+        self._joined_ns = 0
+        self._phase_ns = start_ns
+        self._viewpoint = 0
+        self._viewpoints_used = 0
+        self._seen_here = 0
+        self._moved_ns = 0
+        self._looked_ns = 0
+        self._request: int | None = None
+        self._retry_ns = 0
+        self._refused_because = ""
+        self._holding_since = 0
+        self._open_clutch = RECLUTCH_SAMPLES
+        self._jumps = sorted(spec.recentre_at_s)
+        self.head = look_at(spec.eye, spec.T_world_anchor[0])
+        yaw = math.atan2(spec.T_world_anchor[0][1] - spec.eye[1], spec.T_world_anchor[0][0] - spec.eye[0])
+        self.display.hands[spec.device] = compose((spec.eye, quat_from_yaw(yaw)), (HAND_AT_REST, (1.0, 0.0, 0.0, 0.0)))
+        self.client.open()
+
+    @property
+    def finished(self) -> bool:
+        """Done or failed. Observers are never done."""
+        return self.report.phase in ("done", "failed")
+
+    @property
+    def next_ns(self) -> int:
+        """When `step` has something to do at the latest."""
+        arrival = self._uplink.next_ns
+        return self.headset.next_sample_ns if arrival is None else min(arrival, self.headset.next_sample_ns)
+
+    def step(self, now_ns: int) -> None:
+        """One round of the loop, after `client.poll`."""
+        for message in self._uplink.pop(now_ns):
+            try:
+                self.report.samples += self.client.send(message)
+            except NotConnectedError:
+                self.report.samples_not_sent += 1
+        if not self.headset.sample_due(now_ns) or not self.client.ready:
+            return
+        if not self._joined_ns:
+            self._joined_ns = now_ns
+            self.report.joined_s = (now_ns - self.started_ns) / 1e9
+            self._enter("look", now_ns)
+        self._scheduled(now_ns)
+        self._sample(now_ns)
+        timeout = self.report.phase in ("look", "acquire") and now_ns - self._phase_ns > self.spec.phase_timeout_s * 1e9
+        if timeout:
+            self.fail(f"{self.report.phase} took too long: {self._refused_because or 'no answer'}", now_ns)
+
+    def fail(self, why: str, now_ns: int) -> None:
+        """Gives up."""
+        self.report.failed = why
+        self._enter("failed", now_ns)
+
+    def finish_report(self) -> HeadsetReport:
+        """Fills in what is computed at the end."""
+        report, client = self.report, self.client
+        ages = sorted(self._ages)
+        if ages:
+            report.age_ms_p50 = ages[len(ages) // 2]
+            report.age_ms_p99 = ages[min(len(ages) - 1, int(0.99 * len(ages)))]
+        report.participant = client.participant_id
+        report.rejected = self._rejected()
+        report.samples_not_sent += client.connection.counters.samples_not_sent
+        report.reconnects = client.connection.counters.reconnects
+        report.clock_error_ms = client.clock_error_ns() / 1e6
+        report.mirror_hash, report.event_seq = client.mirror.mirror_hash(), client.mirror.event_seq
+        return report
+
+    # --- one sampling instant -----------------------------------------------------------------------------------------
+
+    def _sample(self, now_ns: int) -> None:
+        self.display.refresh(self.client.session_now_ns())
+        if self.report.phase == "look":
+            self._look(now_ns)
+        elif self.report.phase == "acquire":
+            self._acquire(now_ns)
+        self._send(Device.HEAD, self.headset.track(self.head, now_ns), now_ns)
+        if not self.observer:
+            self._hands(now_ns)
+
+    def _hands(self, now_ns: int) -> None:
+        behaviour, alignment = self.behaviour, self._alignment()
+        if behaviour is None or alignment is None:
+            return
+        inputs: Iterable[HandInput] = ()
+        if self.report.phase == "work" and self.display.ready:
+            inputs = behaviour.update(self.display)
+            if behaviour.failed:
+                self.fail(f"{behaviour.phase}: {behaviour.failed}", now_ns)
+            elif behaviour.done:
+                self.report.done = True
+                self._enter("done", now_ns)
+            else:
+                self._note_phase(f"work/{behaviour.phase}", now_ns)
+        sent = False
+        for hand in inputs:
+            sent = True
+            self.display.hands[hand.device] = hand.pose_world
+            self._send_hand(hand, alignment, now_ns)
+        if not sent:
+            rest = HandInput(self.spec.device, self.spec.robot, self.display.hands[self.spec.device], False, math.nan)
+            self._send_hand(rest, alignment, now_ns)
+
+    def _send_hand(self, hand: HandInput, alignment: Alignment, now_ns: int) -> None:
+        """The person puts the hand where the display shows it, so the displayed world decides what is tracked."""
+        T_world_tracking: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
+        pose = self.headset.add_noise(compose(inverse(T_world_tracking), hand.pose_world))
+        self._send(
+            hand.device,
+            pose,
+            now_ns,
+            robots=(hand.robot,),
+            clutch=self._clutch(hand, now_ns),
+            gripper=None if math.isnan(hand.gripper) else hand.gripper,
+        )
+
+    def _send(self, device: str, pose: PoseTuple, now_ns: int, **fields: Any) -> None:
+        sample = self.client.make_sample(
+            device, pose, tracking_epoch=self.headset.tracking_epoch, worn=self.headset.worn, **fields
+        )
+        self._uplink.push(sample, now_ns)
+
+    def _clutch(self, hand: HandInput, now_ns: int) -> bool:
+        """The clutch as a person works it: when the robot holds although it is closed, open it and close it again."""
+        if self._open_clutch > 0:
+            self._open_clutch -= 1
+            return False
+        feedback = self.client.feedback.get(hand.robot)
+        holds = feedback is not None and feedback.state == CommandKind.HOLD and feedback.hold_reason in CLUTCH_AGAIN
+        if not (hand.clutch and holds) or self.display.estop:
+            self._holding_since = 0
+        elif not self._holding_since:
+            self._holding_since = now_ns
+        elif now_ns - self._holding_since > RECLUTCH_AFTER_S * 1e9:
+            self._holding_since = 0
+            self._open_clutch = RECLUTCH_SAMPLES
+            self.report.reclutches += 1
+        return hand.clutch
+
+    # --- phases -------------------------------------------------------------------------------------------------------
+
+    def _look(self, now_ns: int) -> None:
+        """Walks the head around the sheet; goes on when the session has accepted an alignment after the last look."""
+        spec = self.spec
+        if self._viewpoint < spec.viewpoints:
+            self.head = viewpoint_pose(spec, self._viewpoint)
+            if now_ns - self._moved_ns < MOVE_S * 1e9 or not self.headset.detection_due(now_ns):
+                return
+            seen = self.headset.observe(self.head, spec.T_world_anchor, now_ns, self._viewpoints_used)
+            self._seen_here += 1
+            if seen is not None:
+                self.report.observations += 1
+                self.client.observe(spec.anchor_id, seen, viewpoint_id=self._viewpoints_used, size_m=spec.sheet_m)
+            if self._seen_here >= spec.observations_per_viewpoint:
+                self._seen_here = 0
+                self._viewpoint += 1
+                self._viewpoints_used += 1
+                self._moved_ns = self._looked_ns = now_ns
+        elif now_ns - self._looked_ns > SETTLE_S * 1e9:
+            if self._alignment() is None:
+                self._viewpoint = 0  # look again
+                return
+            self.head = look_at(spec.eye, spec.T_world_anchor[0])
+            self.report.aligned_s = (now_ns - self.started_ns) / 1e9
+            self._judge(now_ns)
+            self._enter("watch" if self.observer else "acquire", now_ns)
+
+    def _acquire(self, now_ns: int) -> None:
+        if self.client.lease_version(self.spec.robot) is not None:
+            self._request = None
+            self._enter("work", now_ns)
+        elif self._request is None and now_ns >= self._retry_ns:
+            self._request = self.client.submit(Acquire(0, (self.spec.robot,), wait=True))
+            self._retry_ns = now_ns + int(RETRY_S * 1e9)
+        elif self._request is not None:
+            reply = self.client.answer(self._request)
+            if reply is not None or now_ns >= self._retry_ns:
+                self._request = None
+            if reply is not None and reply.denial is not None:
+                self._refused_because = f"{reply.denial.reason}: {reply.denial.message} {reply.denial.advice}"
+
+    def _scheduled(self, now_ns: int) -> None:
+        """What was planned for this moment: the tracking frame jumps, the headset comes off and on."""
+        elapsed = (now_ns - self._joined_ns) / 1e9
+        if self._jumps and elapsed >= self._jumps[0]:
+            self._jumps.pop(0)
+            self.headset.recentre(now_ns)
+            self.client.tracking_epoch = self.headset.tracking_epoch - 1
+            self.client.new_tracking_frame()
+            self._open_clutch = RECLUTCH_SAMPLES
+            if not self.finished:
+                self._viewpoint = 0
+                self._enter("look", now_ns)
+        doff, don = self.spec.doff_at_s, self.spec.don_at_s
+        worn = not (doff is not None and elapsed >= doff and (don is None or elapsed < don))
+        if worn != self.headset.worn:
+            self.headset.worn = self.client.worn = worn
+
+    def _enter(self, phase: str, now_ns: int) -> None:
+        self.report.phase = phase
+        self._phase_ns = now_ns
+        self._note_phase(phase, now_ns)
+
+    def _note_phase(self, phase: str, now_ns: int) -> None:
+        """Remembers when a phase began first, in seconds since the start."""
+        self.report.phases.setdefault(phase, round((now_ns - self.started_ns) / 1e9, 3))
+
+    # --- knowledge ----------------------------------------------------------------------------------------------------
+
+    def _alignment(self) -> Alignment | None:
+        """Our alignment, if it is one and of the present tracking frame."""
+        alignment = self.client.alignment
+        if alignment is None or alignment.kind not in (AlignmentKind.MEASURED, AlignmentKind.PLACED):
+            return None
+        return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
+
+    def _judge(self, now_ns: int) -> None:
+        """Compares the accepted alignment with the truth."""
+        alignment = self._alignment()
+        if alignment is None:
+            return
+        believed: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
+        true = self.headset.T_world_tracking(now_ns)
+        wrong = compose(believed, inverse(true))  # where a point of the world is displayed
+        sheet = self.spec.T_world_anchor[0]
+        x, y, z = sheet
+        around: list[Vec3] = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1)]
+        self.report.alignment_error_mm = 1e3 * distance(apply(wrong, sheet), sheet)
+        self.report.alignment_error_1m_mm = 1e3 * max(distance(apply(wrong, p), p) for p in around)
+        self.report.alignment_error_deg = math.degrees(quat_angle(believed[1], true[1]))
+        self.report.stated_error_mm = 1e3 * alignment.error_at_anchor_m
+
+    def _rejected(self) -> dict[str, int]:
+        total: dict[str, int] = {}
+        for feedback in self.client.feedback.values():
+            for reason, count in feedback.rejected.items():
+                total[reason] = max(total.get(reason, 0), count)
+        return total
+
+    def _on_state(self, state: SceneState) -> None:
+        self.report.frames += 1
+        self._ages.append(state.age_ns / 1e6)
+        self.display.take(state)
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event.body, Handover):
+            self.report.handovers += 1
+        elif isinstance(event.body, Notice):
+            self._refused_because = event.body.text
+
+
+def viewpoint_pose(spec: HeadsetSpec, index: int) -> PoseTuple:
+    """Where the head goes for the `index`-th look: 0.4 to 0.6 m from the sheet, spread +-50 deg about the seat."""
+    x, y, z = spec.T_world_anchor[0]
+    seat = math.atan2(spec.eye[1] - y, spec.eye[0] - x)
+    share = 0.5 if spec.viewpoints == 1 else index / (spec.viewpoints - 1)
+    azimuth = seat + math.radians(100.0) * (share - 0.5)
+    elevation = math.radians(40.0 if index % 2 else 60.0)
+    reach = 0.4 + 0.1 * (index % 3)
+    flat = reach * math.cos(elevation)
+    eye = (x + flat * math.cos(azimuth), y + flat * math.sin(azimuth), z + reach * math.sin(elevation))
+    return look_at(eye, (x, y, z))

@@ -1,0 +1,78 @@
+"""What an emulated person is told (`HeadsetSpec`) and what is told of them afterwards (`HeadsetReport`). Plain data."""
+
+from __future__ import annotations
+
+import msgspec
+
+from anchors.pose import PoseTuple, Vec3
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M, DEFAULT_T_WORLD_ANCHOR, HeadsetModel
+from iris_session.protocol.names import Device
+
+#: Behaviour of somebody who only looks.
+OBSERVER = "observer"
+
+
+class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One emulated person with one headset.
+
+    `behaviour`: `observer`, or a name of `emulator.behaviours`; then `robot` is what they drive with `device`.
+    `eye`: where the head is while working [m, world]. `T_world_anchor`: where the sheet truly lies, which need not be
+    what the session believes. `recentre_at_s`, `doff_at_s`, `don_at_s`: seconds after joining at which the tracking
+    frame jumps, the headset is taken off, and put on again. `display_delay_s`: how old the picture is on purpose
+    (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts.
+    """
+
+    name: str
+    behaviour: str = OBSERVER
+    robot: str = ""
+    object: str = "hammer"
+    partner: str = ""
+    device: str = Device.CONTROLLER_RIGHT
+    seed: int = 0
+    model: HeadsetModel = HeadsetModel()
+    eye: Vec3 = (0.0, -0.95, 0.55)
+    anchor_id: str = DEFAULT_ANCHOR_ID
+    T_world_anchor: PoseTuple = DEFAULT_T_WORLD_ANCHOR
+    sheet_m: float = DEFAULT_SHEET_M
+    viewpoints: int = 6
+    observations_per_viewpoint: int = 6
+    display_delay_s: float = 0.035
+    recentre_at_s: tuple[float, ...] = ()
+    doff_at_s: float | None = None
+    don_at_s: float | None = None
+    phase_timeout_s: float = 30.0
+    identity_file: str = ""
+
+
+class HeadsetReport(msgspec.Struct, kw_only=True):
+    """How it went. Errors of the alignment are against the truth that only the emulator knows.
+
+    `alignment_error_mm`: at the sheet; `alignment_error_1m_mm`: the worst of points 1 m around it. `age_ms_*`: from
+    the end of the tick to the hands of this program. `rejected`: samples the session did not count, by reason.
+    """
+
+    name: str
+    participant: str = ""
+    phase: str = "join"
+    done: bool = False
+    failed: str = ""
+    joined_s: float = 0.0
+    aligned_s: float = 0.0
+    alignment_error_mm: float = float("nan")
+    alignment_error_1m_mm: float = float("nan")
+    alignment_error_deg: float = float("nan")
+    stated_error_mm: float = float("nan")
+    observations: int = 0
+    samples: int = 0
+    samples_not_sent: int = 0
+    rejected: dict[str, int] = {}
+    reclutches: int = 0
+    frames: int = 0
+    age_ms_p50: float = float("nan")
+    age_ms_p99: float = float("nan")
+    clock_error_ms: float = float("nan")
+    reconnects: int = 0
+    handovers: int = 0
+    phases: dict[str, float] = {}
+    mirror_hash: str = ""
+    event_seq: int = 0
