@@ -8,31 +8,28 @@ No clock, no randomness; whatever is remembered is in `snapshot()`.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from anchors.pose import PoseTuple, compose, inverse
+from anchors.pose import PoseTuple
 from iris_session.control import clutch
-from iris_session.control.arm_model import ArmModel, Floats, moving_base, site_pose
+from iris_session.control.arm_model import ArmModel, moving_base, site_pose
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.errors import ControlError
 from iris_session.control.grasp import Grasps
 from iris_session.control.gripper import Grippers
 from iris_session.control.hold import ActuatorLaws
-from iris_session.control.ik import IkSolver
-from iris_session.control.interpolate import JointInterpolator
+from iris_session.control.interpolate import JointInterpolator, speed_limits
 from iris_session.control.leader import leader_goal, ramping
 from iris_session.control.proximity import Proximity
+from iris_session.control.reach import Reach
 from iris_session.control.state import ControllerState, RobotState, decode_state, encode_state
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, ControlStatus, Decision, WorldView
-
-_MAX_STALLS = 5  # solves without progress after which a target counts as out of reach
 
 
 class Controller:
@@ -57,35 +54,36 @@ class Controller:
         self._qpos = np.array([model.jnt_qposadr[j] for arm in self._arms for j in arm.joint_ids], dtype=np.intp)
         self._writes_ctrl = self._config.output == OUTPUT_CTRL
         self._laws = ActuatorLaws(model, self._robots, self._config)
-        self._solvers = [IkSolver(arm, self._config) for arm in self._arms] if self._writes_ctrl else []
-        self._joints = JointInterpolator(*self._speed_limits(model), self._dt)
-        self._rest = np.zeros(len(self._qpos))
+        self._joints = JointInterpolator(*speed_limits(model, self._robots, self._arms, self._config), self._dt)
+        self._reach = Reach(
+            self._robots, self._arms, self._columns, self._joints, (self._laws.lower, self._laws.upper), self._config
+        )
         self._grippers = Grippers(model, self._robots, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
         self._proximity = Proximity(model, self._robots, self._config)
-        self._solve_ticks = max(1, math.ceil(1.0 / (self._config.solve_rate_hz * self._dt) - 1e-9))
-        self._slow_interval = max(1.0 / self._config.sample_rate_min_hz, self._solve_ticks * self._dt)
-        self._refine_ticks = math.ceil(self._slow_interval / self._dt - 1e-9)
         self._proximity_ticks = max(1, round(self._config.proximity_period_s / self._dt))
         self._states = [RobotState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
         self._now_ns = 0
         self._tick = 0
         self._cursor = 0
+        self._ready = False
 
     # --- the contract -------------------------------------------------------------------------------------------------
 
     def reset(self, data: mujoco.MjData) -> None:
         """Everything is forgotten; targets are where the robots stand now (kinematics of `data` must be current)."""
         self._joints.place(data.qpos[self._qpos])
-        self._rest[:] = self._joints.q
+        self._reach.rest[:] = self._joints.q
         self._grippers.reset(data)
         self._grasps.reset(data)
         self._tick = self._cursor = self._now_ns = 0
+        self._ready = True
         self._states = [RobotState() for _ in self._robots]
         for i, arm in enumerate(self._arms):
-            self._states[i].T_world_root = _body_pose(data, arm.root_body)
-            self._states[i].commanded = self._solved_tip(i) if self._writes_ctrl else site_pose(data, arm.site_id)
+            r = self._states[i]
+            r.T_world_root = _body_pose(data, arm.root_body)
+            r.commanded = self._reach.tip(i, r) if self._writes_ctrl else site_pose(data, arm.site_id)
 
     def begin(self, now_ns: int, n_ticks: int, decision: Decision, view: WorldView) -> None:
         """Reads the commands of one step at session time `now_ns`. A robot without a command holds.
@@ -110,7 +108,12 @@ class Controller:
         self._grasps.command(decision.objects)
 
     def tick(self, data: mujoco.MjData) -> None:
-        """One physics tick: writes `data.ctrl` of the robots and `data.xfrc_applied` of grasped objects."""
+        """One physics tick: writes `data.ctrl` of the robots and `data.xfrc_applied` of grasped objects.
+
+        Raises `ControlError` when neither `reset` nor `restore` was called: where the robots stand is not known then.
+        """
+        if not self._ready:
+            raise ControlError("control does not know where the robots stand: call reset(data) or restore(bytes) first")
         if self._writes_ctrl:
             self._solve_due(data)
             if self._proximity.active and self._tick % self._proximity_ticks == 0:
@@ -144,7 +147,7 @@ class Controller:
                 self._tick,
                 self._cursor,
                 self._states,
-                self._rest.tobytes(),
+                self._reach.rest.tobytes(),
                 self._joints.state(),
                 self._joints.moving,
                 self._grippers.state(),
@@ -156,18 +159,19 @@ class Controller:
     def restore(self, data: bytes) -> None:
         """Inverse of `snapshot`. Raises `ControlError` for a snapshot of other robots."""
         state = decode_state(data)
-        if len(state.robots) != len(self._robots) or len(state.rest) != self._rest.nbytes:
+        if len(state.robots) != len(self._robots) or len(state.rest) != self._reach.rest.nbytes:
             raise ControlError(
                 f"snapshot is of {len(state.robots)} robots with {len(state.rest) // 8} joints; "
-                f"this controller has {len(self._robots)} with {len(self._rest)}"
+                f"this controller has {len(self._robots)} with {len(self._reach.rest)}"
             )
         self._now_ns, self._tick, self._cursor = state.now_ns, state.tick, state.cursor
         self._states = state.robots
-        self._rest[:] = np.frombuffer(state.rest)
+        self._reach.rest[:] = np.frombuffer(state.rest)
         self._joints.set_state(state.joints, state.moving)
         self._grippers.set_state(state.grippers)
         self._grasps.commanded = dict(state.grasp_poses)
         self._grasps.written = state.grasp_written
+        self._ready = True
 
     # --- once a step --------------------------------------------------------------------------------------------------
 
@@ -182,7 +186,7 @@ class Controller:
         self._grippers.stop(i)
         if self._writes_ctrl:
             self._joints.stop(self._columns[i])
-            r.commanded = self._solved_tip(i)
+            r.commanded = self._reach.tip(i, r)
         self._set_cap(i)
 
     def _drive(self, i: int, command: Command) -> None:
@@ -196,9 +200,11 @@ class Controller:
             r.latch = clutch.latch(command, scale, r.latch.target, r.latch)
             new = True
         self._grippers.command(i, command.gripper)
-        if not (new or r.fresh):
-            return
+        # The latching sample itself moved nothing: what it asks for, unless it is relative to itself, follows now.
+        late = r.fresh and any(source.absolute or source.pose_world is None for source in command.sources)
         r.fresh = False
+        if not (new or late):
+            return
         if command.kind == CommandKind.JOINTS:
             self._follow_joints(i, r.latch, command)
         else:
@@ -211,7 +217,7 @@ class Controller:
         """Latches the clutch against the commanded target; nothing moves in this step."""
         r = self._states[i]
         if self._writes_ctrl:
-            r.commanded = self._solved_tip(i)
+            r.commanded = self._reach.tip(i, r)
         r.latch = clutch.latch(command, scale, r.commanded)
         r.fresh, r.want_solve, r.ramping, r.stalls = True, False, False, 0
         r.pending = _newest(command)
@@ -222,9 +228,9 @@ class Controller:
         goal = np.minimum(np.maximum(goal, laws.lower[columns]), laws.upper[columns])
         r.ramping = ramping(r.ramping, float(np.abs(goal - self._joints.q[columns]).max()), self._config)
         self._set_cap(i)
-        self._joints.aim(columns, goal, self._interval(r))
+        self._joints.aim(columns, goal, self._reach.interval(r, self._tick))
         r.last_solve = self._tick
-        state.target = self._solved_tip(i)
+        state.target = self._reach.tip(i, r)
         if self._writes_ctrl:
             r.commanded = state.target
 
@@ -232,79 +238,29 @@ class Controller:
 
     def _solve_due(self, data: mujoco.MjData) -> None:
         """Integrates twists; solves for at most `max_solves_per_tick` robots, taking turns."""
-        n, solved, config = len(self._states), 0, self._config
+        n, left, start = len(self._states), self._config.max_solves_per_tick, self._cursor
         for i in self._moving_bases:
             self._states[i].T_world_root = _body_pose(data, self._arms[i].root_body)
-        start = self._cursor
-        for k in range(n):
-            i = (start + k) % n
+        for i in (*range(start, n), *range(start)):
             r = self._states[i]
-            if r.latch is not None and not r.fresh and r.latch.kind == CommandKind.TWIST:
+            if r.latch is None:
+                continue
+            if r.latch.kind == CommandKind.TWIST and not r.fresh:
                 self._integrate(i, r, r.latch)
-            if r.want_solve:
-                # New targets first of all; refinement of an old one waits for the slowest device's next sample.
-                wait = self._solve_ticks if r.pending is not None else self._refine_ticks
-                if solved < config.max_solves_per_tick and self._tick - r.last_solve >= wait:
-                    self._solve(i)
-                    solved += 1
-                    self._cursor = (i + 1) % n
-                    self._apply(r)
-            elif r.pending is not None:
+            if left and self._reach.due(r, self._tick):
+                self._reach.solve(i, r, r.latch, self._tick)
+                left -= 1
+                self._cursor = (i + 1) % n
+                self._apply(r)
+            elif r.pending is not None and not r.want_solve:
                 self._apply(r)
 
     def _integrate(self, i: int, r: RobotState, state: clutch.Latch) -> None:
         config = self._config
         if clutch.integrate(state, self._dt, config.tip_speed, config.tip_angular_speed, self._box(i)):
-            tip = self._solved_tip(i) if self._writes_ctrl else r.commanded
+            tip = self._reach.tip(i, r) if self._writes_ctrl else r.commanded
             state.target = clutch.toward(tip, state.target, config.twist_lead_m, config.twist_lead_rad)
             r.want_solve, r.stalls = True, 0
-
-    def _solve(self, i: int) -> None:
-        """One step of inverse kinematics from the last solution toward the target."""
-        r, columns, joints, config, laws = self._states[i], self._columns[i], self._joints, self._config, self._laws
-        if r.latch is None:
-            return
-        interval = self._interval(r)
-        q, commanded, speed = joints.goal[columns], joints.q[columns], joints.velocity[columns]
-        T_world_now = self._solved_tip(i)
-        r.commanded = clutch.toward(
-            T_world_now, r.latch.target, config.tip_speed * interval, config.tip_angular_speed * interval
-        )
-        lead = speed * config.lead_s
-        lower = np.maximum(laws.lower[columns], commanded - lead) - q
-        upper = np.minimum(laws.upper[columns], commanded + lead) - q
-        step = speed * interval
-        # A joint that stands outside its range may stay, and may come back at its own speed.
-        box_lower = np.minimum(np.maximum(lower, -step), 0.0)
-        box_upper = np.maximum(np.minimum(upper, step), 0.0)
-        result = self._solvers[i].step(
-            q, self._rest[columns], compose(inverse(r.T_world_root), r.commanded), box_lower, box_upper
-        )
-        joints.aim(columns, result.q, interval)
-        r.last_solve = self._tick
-        self._judge(i, r, r.latch, result.q - q, box_lower, box_upper, result.singular)
-
-    def _judge(
-        self, i: int, r: RobotState, state: clutch.Latch, dq: Floats, lower: Floats, upper: Floats, singular: bool
-    ) -> None:
-        """Decides whether solving goes on without new samples, and what is reported as limiting."""
-        config, columns, laws = self._config, self._columns[i], self._laws
-        distance, angle = clutch.separation(self._solved_tip(i), state.target)
-        error = max(distance / config.position_tolerance, angle / config.rotation_tolerance)
-        r.stalls = r.stalls + 1 if error > 0.99 * r.error else 0
-        r.error = error
-        r.want_solve = error > 1.0 and r.stalls < _MAX_STALLS
-        limits = []
-        goal = self._joints.goal[columns]
-        at_range = (goal <= laws.lower[columns] + 1e-6) | (goal >= laws.upper[columns] - 1e-6)
-        limits += [name for name, at in zip(self._robots[i].joints, at_range.tolist(), strict=True) if at]
-        if error > 1.0 and bool(((dq <= lower + 1e-9) | (dq >= upper - 1e-9))[~at_range].any()):
-            limits.append("speed")
-        if r.stalls >= _MAX_STALLS and error > 1.0:
-            limits.append("reach")
-        if singular:
-            limits.append("singular")
-        r.solver_limits = tuple(limits)
 
     def _slow_near_contact(self, data: mujoco.MjData) -> None:
         """Bounds the speed of robots that close in on each other, until the next check."""
@@ -344,14 +300,6 @@ class Controller:
             r.applied = Applied(p.robot, p.participant, p.device, p.seq, p.capture_ns, p.receive_ns, self._now_ns)
             r.pending = None
 
-    def _interval(self, r: RobotState) -> float:
-        """Time since the last solution [s], within what devices send: the time to arrive at the next one."""
-        return min(max(self._tick - r.last_solve, self._solve_ticks) * self._dt, self._slow_interval)
-
-    def _solved_tip(self, i: int) -> PoseTuple:
-        """`T_world_tip` of the joint goal: where the robot will stand when nothing else is asked of it."""
-        return compose(self._states[i].T_world_root, self._arms[i].fk(self._joints.goal[self._columns[i]]))
-
     def _box(self, i: int) -> clutch.Box | None:
         return self._config.workspaces.get(self._robots[i].name, self._config.workspace)
 
@@ -367,26 +315,6 @@ class Controller:
         if r.ramping:
             extra += ("leader_apart",)
         return r.solver_limits + extra
-
-    def _speed_limits(self, model: mujoco.MjModel) -> tuple[Floats, Floats]:
-        """Velocity and acceleration limits of all joints, shape (n,). Raises `ControlError` for unknown joint names."""
-        config = self._config
-        names = [name for robot in self._robots for name in robot.joints]
-        for name in (*config.velocity_limits, *config.acceleration_limits):
-            if name not in names:
-                raise ControlError(f"limit of joint {name!r}: no robot has it. Available joints: {', '.join(names)}")
-        slide = [
-            int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for arm in self._arms for j in arm.joint_ids
-        ]
-        velocity = [
-            config.velocity_limits.get(name, config.slide_velocity if s else config.joint_velocity)
-            for name, s in zip(names, slide, strict=True)
-        ]
-        acceleration = [
-            config.acceleration_limits.get(name, config.slide_acceleration if s else config.joint_acceleration)
-            for name, s in zip(names, slide, strict=True)
-        ]
-        return np.array(velocity), np.array(acceleration)
 
 
 def _newest(command: Command) -> Applied:

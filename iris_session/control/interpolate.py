@@ -7,9 +7,15 @@ exceed their limits, and every joint can always stop at its goal without passing
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import mujoco
 import numpy as np
 
-from iris_session.control.arm_model import Floats
+from iris_session.control.arm_model import ArmModel, Floats
+from iris_session.control.config import ControlConfig
+from iris_session.control.errors import ControlError
+from iris_session.protocol.specs import RobotSpec
 
 #: Arrival after this many sample intervals: above 1, so that motion between regular samples is even.
 ARRIVAL_INTERVALS = 1.5
@@ -87,3 +93,27 @@ class JointInterpolator:
         for array, raw in zip((self.q, self.v, self.goal, self.remaining, self.cap), arrays, strict=True):
             array[:] = np.frombuffer(raw)
         self.moving = moving
+
+
+def speed_limits(
+    model: mujoco.MjModel, robots: Sequence[RobotSpec], arms: Sequence[ArmModel], config: ControlConfig
+) -> tuple[Floats, Floats]:
+    """Velocity and acceleration limits of all robots' joints, shape (n,) each.
+
+    Raises `ControlError` when the configuration names a joint that no robot has.
+    """
+    names = [name for robot in robots for name in robot.joints]
+    for name in (*config.velocity_limits, *config.acceleration_limits):
+        if name not in names:
+            raise ControlError(f"limit of joint {name!r}: no robot has it. Available joints: {', '.join(names)}")
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    slides = [int(model.jnt_type[j]) == slide for arm in arms for j in arm.joint_ids]
+    velocity = [
+        config.velocity_limits.get(name, config.slide_velocity if s else config.joint_velocity)
+        for name, s in zip(names, slides, strict=True)
+    ]
+    acceleration = [
+        config.acceleration_limits.get(name, config.slide_acceleration if s else config.joint_acceleration)
+        for name, s in zip(names, slides, strict=True)
+    ]
+    return np.array(velocity), np.array(acceleration)

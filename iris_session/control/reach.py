@@ -1,0 +1,106 @@
+"""Reaching for a tip target: when an arm's inverse kinematics is due, one bounded step of it, and what limited it.
+
+A step starts at the last solution (the joint goal), not at the measured joints, so sag and lag never feed back. While a
+target is not reached, solving goes on without new samples, at the rate of the slowest device so that a refinement never
+delays a new sample, until the target is reached or no more progress is made (`reach`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.pose import PoseTuple, compose, inverse
+from iris_session.control import clutch
+from iris_session.control.arm_model import ArmModel, Floats
+from iris_session.control.config import OUTPUT_CTRL, ControlConfig
+from iris_session.control.ik import IkSolver
+from iris_session.control.interpolate import JointInterpolator
+from iris_session.control.state import RobotState
+from iris_session.protocol.names import CommandKind
+from iris_session.protocol.specs import RobotSpec
+
+_MAX_STALLS = 5  # solves without progress after which a target counts as out of reach
+
+
+class Reach:
+    """Inverse kinematics of all robots at their rates. `rest`: posture that redundant joints drift to, shape (n,)."""
+
+    def __init__(
+        self,
+        robots: Sequence[RobotSpec],
+        arms: Sequence[ArmModel],
+        columns: Sequence[slice],
+        joints: JointInterpolator,
+        bounds: tuple[Floats, Floats],
+        config: ControlConfig,
+    ) -> None:
+        """`bounds`: joint positions that may be commanded, lower and upper, shape (n,) each."""
+        self._robots, self._arms, self._columns = robots, arms, columns
+        self._joints, self._config = joints, config
+        self._lower, self._upper = bounds
+        self._solvers = [IkSolver(arm, config) for arm in arms] if config.output == OUTPUT_CTRL else []
+        self.rest: Floats = np.zeros(len(joints.q))
+        self._solve_ticks = max(1, math.ceil(1.0 / (config.solve_rate_hz * joints.dt) - 1e-9))
+        self._slow_interval = max(1.0 / config.sample_rate_min_hz, self._solve_ticks * joints.dt)
+        self._refine_ticks = math.ceil(self._slow_interval / joints.dt - 1e-9)
+
+    def due(self, r: RobotState, tick: int) -> bool:
+        """Whether this robot may be solved in this tick."""
+        if not r.want_solve:
+            return False
+        fed = r.pending is not None or (r.latch is not None and r.latch.kind == CommandKind.TWIST)
+        return tick - r.last_solve >= (self._solve_ticks if fed else self._refine_ticks)
+
+    def interval(self, r: RobotState, tick: int) -> float:
+        """Time since the last goal [s], within what devices send: the time to arrive at the next one."""
+        return min(max(tick - r.last_solve, self._solve_ticks) * self._joints.dt, self._slow_interval)
+
+    def tip(self, i: int, r: RobotState) -> PoseTuple:
+        """`T_world_tip` of the joint goal: where the robot will stand when nothing else is asked of it."""
+        return compose(r.T_world_root, self._arms[i].fk(self._joints.goal[self._columns[i]]))
+
+    def solve(self, i: int, r: RobotState, state: clutch.Latch, tick: int) -> None:
+        """One step from the last solution toward the target; the joints arrive about one sample later."""
+        columns, joints, config = self._columns[i], self._joints, self._config
+        interval = self.interval(r, tick)
+        goal, commanded, speed = joints.goal[columns], joints.q[columns], joints.velocity[columns]
+        r.commanded = clutch.toward(
+            self.tip(i, r), state.target, config.tip_speed * interval, config.tip_angular_speed * interval
+        )
+        lead, step = speed * config.lead_s, speed * interval
+        lower = np.maximum(self._lower[columns], commanded - lead) - goal
+        upper = np.minimum(self._upper[columns], commanded + lead) - goal
+        # A joint outside its range may stay there, and may come back at its own speed; it is never thrown back.
+        lower = np.minimum(np.maximum(lower, -step), 0.0)
+        upper = np.maximum(np.minimum(upper, step), 0.0)
+        T_root_target = compose(inverse(r.T_world_root), r.commanded)
+        q, singular = self._solvers[i].step(goal, self.rest[columns], T_root_target, lower, upper)
+        bounded = (q - goal <= lower + 1e-9) | (q - goal >= upper - 1e-9)
+        joints.aim(columns, q, interval)
+        r.last_solve = tick
+        self._judge(i, r, state.target, bounded, singular)
+
+    def _judge(
+        self, i: int, r: RobotState, T_world_target: PoseTuple, bounded: NDArray[np.bool_], singular: bool
+    ) -> None:
+        """Decides whether solving goes on without new samples, and names what is limiting."""
+        config, goal = self._config, self._joints.goal[self._columns[i]]
+        distance, angle = clutch.separation(self.tip(i, r), T_world_target)
+        error = max(distance / config.position_tolerance, angle / config.rotation_tolerance)
+        r.stalls = r.stalls + 1 if error > 0.99 * r.error else 0
+        r.error = error
+        reached, stuck = error <= 1.0, r.stalls >= _MAX_STALLS
+        r.want_solve = not (reached or stuck)
+        at_range = (goal <= self._lower[self._columns[i]] + 1e-6) | (goal >= self._upper[self._columns[i]] - 1e-6)
+        limits = [name for name, at in zip(self._robots[i].joints, at_range.tolist(), strict=True) if at]
+        if not reached and bool((bounded & ~at_range).any()):
+            limits.append("speed")
+        if stuck and not reached:
+            limits.append("reach")
+        if singular:
+            limits.append("singular")
+        r.solver_limits = tuple(limits)
