@@ -1,0 +1,291 @@
+"""A whole closed loop in one process: the real `World` and `Controller`, operators who see it late and noisily.
+
+Stands in for network, headset and authority only: states reach the operators 30 to 60 ms old with 1 mm and 0.3 deg of
+noise and stalls, their samples reach the session 8 to 25 ms later with the same noise on the hand. `Referee` judges the
+handover from contacts alone. `python -m tests.emulator.handover_rig 50` counts successes over 50 seeds.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+
+from anchors.pose import PoseTuple, distance, quat_from_rotvec, quat_from_yaw, quat_mul, quat_normalize
+from iris_session.control.controller import Controller
+from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver
+from iris_session.physics.objects import find_objects
+from iris_session.physics.robots import find_robots
+from iris_session.physics.scenes import scene_path
+from iris_session.physics.world import World
+from iris_session.protocol.common import Pose
+from iris_session.protocol.names import CommandKind, HoldReason
+from iris_session.protocol.steps import Command, CommandSource, Decision
+
+NOISE = (0.001, math.radians(0.3))  # per axis: m, rad
+STATE_S = 1.0 / 60.0
+SAMPLE_S = 1.0 / 72.0
+DEVICE = "controller/right"
+
+
+def shaken(pose: PoseTuple, rng: random.Random, noise: tuple[float, float]) -> PoseTuple:
+    (x, y, z), q = pose
+    metres, radians = noise
+    turn = quat_from_rotvec((rng.gauss(0, radians), rng.gauss(0, radians), rng.gauss(0, radians)))
+    return ((x + rng.gauss(0, metres), y + rng.gauss(0, metres), z + rng.gauss(0, metres)), quat_mul(turn, q))
+
+
+class LateView:
+    """`OperatorView` of one person: the newest state that has arrived, with noise; now and then the picture stalls."""
+
+    def __init__(self, rng: random.Random, noise: tuple[float, float] = NOISE, stalls: bool = True) -> None:
+        self.session_time_ns = 0
+        self.estop = False
+        self.lease: int | None = 1
+        self.hand: PoseTuple = ((rng.uniform(-1, 1), -1.2, 0.3), quat_normalize(tuple(rng.gauss(0, 1) for _ in "wxyz")))
+        self._rng, self._noise, self._stalls = rng, noise, stalls
+        self._frames: deque[tuple[float, dict[str, PoseTuple]]] = deque(maxlen=16)
+        self._stalled_until_s = 0.0
+        self._shown: dict[str, PoseTuple] = {}
+
+    def publish(self, now_s: float, poses: dict[str, PoseTuple]) -> None:
+        self._frames.append((now_s + self._rng.uniform(0.030, 0.060), poses))
+
+    def stalled(self, now_s: float) -> bool:
+        """Whether this person's computer stands still: 30 ms in every hundredth frame."""
+        if now_s >= self._stalled_until_s and self._stalls and self._rng.random() < 0.01:
+            self._stalled_until_s = now_s + 0.030
+        return now_s < self._stalled_until_s
+
+    def look(self, now_s: float) -> None:
+        self.session_time_ns = round(now_s * 1e9)
+        arrived = [poses for arrives_s, poses in self._frames if arrives_s <= now_s]
+        if arrived:
+            self._shown = {name: shaken(pose, self._rng, self._noise) for name, pose in arrived[-1].items()}
+
+    def body_pose(self, name: str) -> PoseTuple | None:
+        return self._shown.get(name)
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        return self._shown.get(f"tip:{robot}")
+
+    def lease_version(self, robot: str) -> int | None:
+        return self.lease
+
+    def device_pose(self, device: str) -> PoseTuple:
+        return self.hand
+
+
+class Referee:
+    """Follows one object by contacts: every stretch of time in the air, and who held it."""
+
+    def __init__(self, object: str) -> None:
+        self.object = object
+        self.flights: list[list[tuple[float, tuple[str, ...]]]] = []  # per flight: (from when, holders)
+        self.strangers: set[str] = set()  # robots that touched it in the air without being its holders
+        self._in_air = False
+        self.resting = True
+
+    def tick(self, world: World) -> None:
+        contact = next((c for c in world.view().object_contacts() if c.object == self.object), None)
+        others = contact.others if contact else ()
+        holders = contact.grippers if contact else ()
+        if others:
+            self._in_air = False
+        else:
+            if not self._in_air:
+                self.flights.append([])
+            self._in_air = True
+            flight = self.flights[-1]
+            if not flight or flight[-1][1] != holders:
+                flight.append((world.view().sim_time, holders))
+        self.resting = bool(others) and not (contact and contact.touching)
+
+    def handed_over(self, giver: str, receiver: str) -> bool:
+        """Whether one flight began in `giver`'s grip, passed through both, ended in `receiver`'s, never free."""
+        return any(_is_handover(flight, giver, receiver) for flight in self.flights)
+
+
+def _is_handover(flight: Sequence[tuple[float, tuple[str, ...]]], giver: str, receiver: str) -> bool:
+    held = [set(holders) for _, holders in flight]
+    free_s = sum(after - since for (since, holders), (after, _) in itertools.pairwise(flight) if not holders)
+    return (
+        free_s < 0.02  # a contact may flicker for a few ticks
+        and next((h for h in held if h), set()) == {giver}
+        and {giver, receiver} in held
+        and next((h for h in reversed(held) if h), set()) == {receiver}
+    )
+
+
+@dataclass
+class Rig:
+    """The scene, its controller and one operator per robot in `behaviours`."""
+
+    behaviours: Mapping[str, Behaviour]
+    seed: int = 0
+    object: str = "hammer"
+    shift: bool = True  # start the object up to 30 mm and 20 deg from its place
+    noise: tuple[float, float] = NOISE
+    watch: Callable[[Rig, str], None] | None = None  # called at every change of an operator's phase
+    views: dict[str, LateView] = field(default_factory=dict)
+    fastest_hand: float = 0.0  # m/s
+    model: Any = None
+
+    def __post_init__(self) -> None:
+        self.rng = random.Random(self.seed)
+        model = self.model or mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+        self.robots, self.objects = find_robots(model), find_objects(model)
+        self.world = World(model, self.robots, self.objects)
+        if self.shift:
+            self._shift_object()
+        self.controller = Controller(model, self.robots, self.objects)
+        self.controller.reset(self.world.data)
+        self.referee = Referee(self.object)
+        self.views = {robot: LateView(random.Random(self.rng.random()), self.noise) for robot in self.behaviours}
+        self._commands = {spec.name: Command(spec.name, CommandKind.HOLD, HoldReason.NO_SAMPLE) for spec in self.robots}
+        self._on_the_way: deque[tuple[float, HandInput]] = deque()
+        self._engagements = dict.fromkeys(self.behaviours, 0)
+        self._next_sample_s = {robot: self.rng.uniform(0, SAMPLE_S) for robot in self.behaviours}
+        self._next_state_s = 0.0
+        self._seq = 0
+
+    @property
+    def now_s(self) -> float:
+        return self.world.view().sim_time
+
+    def run(self, seconds: float, until: Callable[[Rig], bool] | None = None) -> None:
+        """Goes on until `until` holds (default: every operator is done), for at most `seconds` more."""
+        stop = until or (lambda rig: all(b.done for b in rig.behaviours.values()))
+        end_s = self.now_s + seconds
+        while self.now_s < end_s and not stop(self):
+            self._publish()
+            for robot in self.behaviours:
+                if self.now_s >= self._next_sample_s[robot]:
+                    self._next_sample_s[robot] += SAMPLE_S
+                    self._operate(robot)
+            self._receive()
+            decision = Decision(tuple(self._commands.values()))
+            self.controller.begin(round(self.now_s * 1e9), 1, decision, self.world.view())
+            self._commands = {name: _seen(command) for name, command in self._commands.items()}
+            self.controller.tick(self.world.data)
+            self.world.tick()
+            self.referee.tick(self.world)
+
+    def _publish(self) -> None:
+        if self.now_s < self._next_state_s:
+            return
+        self._next_state_s += STATE_S
+        data = self.world.data
+        poses: dict[str, PoseTuple] = {
+            body.name: (tuple(data.xpos[body.id].tolist()), tuple(data.xquat[body.id].tolist()))
+            for body in self.world.bodies
+        }
+        for spec in self.robots:
+            tip = self.world.view().tip_pose(spec.name)
+            poses[f"tip:{spec.name}"] = (tip.p, tip.q)
+        for view in self.views.values():
+            view.publish(self.now_s, poses)
+
+    def _operate(self, robot: str) -> None:
+        view, behaviour = self.views[robot], self.behaviours[robot]
+        if view.stalled(self.now_s):
+            return
+        before, phase = view.session_time_ns, behaviour.phase
+        view.look(self.now_s)
+        for hand in behaviour.update(view):
+            if hand.clutch and view.session_time_ns > before:
+                speed = distance(hand.pose_world[0], view.hand[0]) / ((view.session_time_ns - before) * 1e-9)
+                self.fastest_hand = max(self.fastest_hand, speed)
+            view.hand = hand.pose_world
+            noisy = HandInput(
+                hand.device, hand.robot, shaken(hand.pose_world, self.rng, self.noise), hand.clutch, hand.gripper
+            )
+            self._on_the_way.append((self.now_s + self.rng.uniform(0.008, 0.025), noisy))
+        if self.watch is not None and behaviour.phase != phase:
+            self.watch(self, robot)
+
+    def _receive(self) -> None:
+        while self._on_the_way and self._on_the_way[0][0] <= self.now_s:
+            hand = self._on_the_way.popleft()[1]
+            engaged = self._commands[hand.robot].kind == CommandKind.POSE
+            if not hand.clutch:
+                self._commands[hand.robot] = Command(hand.robot, CommandKind.HOLD, HoldReason.CLUTCH_OPEN)
+                continue
+            self._engagements[hand.robot] += not engaged
+            self._seq += 1
+            now_ns = round(self.now_s * 1e9)
+            source = CommandSource(
+                hand.robot,
+                hand.device,
+                self._engagements[hand.robot],
+                self._seq,
+                now_ns,
+                now_ns,
+                pose_world=Pose(*hand.pose_world),
+            )
+            self._commands[hand.robot] = Command(hand.robot, CommandKind.POSE, "", (source,), hand.gripper)
+
+    def _shift_object(self) -> None:
+        data = self.world.data
+        at = self.world.model.joint(self.object).qposadr[0]
+        data.qpos[at : at + 2] += (self.rng.uniform(-0.03, 0.03), self.rng.uniform(-0.03, 0.03))
+        data.qpos[at + 3 : at + 7] = quat_from_yaw(self.rng.uniform(-0.35, 0.35))
+        self.world.refresh()
+
+
+def _seen(command: Command) -> Command:
+    """The same command in a later step: its sample is not new any more."""
+    if command.kind != CommandKind.POSE or not command.sources[0].new:
+        return command
+    s = command.sources[0]
+    source = CommandSource(
+        s.participant, s.device, s.engagement, s.seq, s.capture_ns, s.receive_ns, new=False, pose_world=s.pose_world
+    )
+    return Command(command.robot, command.kind, "", (source,), command.gripper)
+
+
+def handover(seed: int, object: str = "hammer", giver: str = "left", receiver: str = "right", **options: Any) -> Rig:
+    """A rig with one giver and one receiver."""
+    behaviours = {giver: Giver(giver, object, receiver), receiver: Receiver(receiver, object, giver)}
+    return Rig(behaviours, seed, object, **options)
+
+
+def verdict(rig: Rig, giver: str, receiver: str) -> str:
+    """Empty when the handover succeeded, else what is wrong."""
+    for robot, behaviour in rig.behaviours.items():
+        if behaviour.failed or not behaviour.done:
+            return f"{robot} ({behaviour.phase}): {behaviour.failed or 'not done'}"
+    if not rig.referee.handed_over(giver, receiver):
+        return f"no clean handover: {rig.referee.flights}"
+    return "" if rig.referee.resting else "the object does not rest on the table alone"
+
+
+def main(runs: int, object: str, giver: str, receiver: str) -> None:
+    """Counts successes over `runs` seeds."""
+    good, times = 0, []
+    for seed in range(runs):
+        rig = handover(seed, object, giver, receiver)
+        rig.run(
+            90.0,
+            until=lambda r: all(b.done for b in r.behaviours.values()) or any(b.failed for b in r.behaviours.values()),
+        )
+        wrong = verdict(rig, giver, receiver)
+        good += not wrong
+        times.append(rig.now_s)
+        tries = [b.attempts for b in rig.behaviours.values()]
+        again = [b.hand.reclutches for b in rig.behaviours.values()]
+        if wrong or max(tries) > 1 or max(again) > 0 or rig.fastest_hand > 0.5:
+            notes = f"attempts {tries}, reclutched {again}, {rig.fastest_hand:.2f} m/s"
+            print(f"seed {seed}: {wrong or 'ok'}, {rig.now_s:.1f} s, {notes}", flush=True)
+    print(f"{object} {giver}->{receiver}: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), *(sys.argv[2:5] or ("hammer", "left", "right")))
