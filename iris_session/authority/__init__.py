@@ -1,1 +1,10 @@
-"""authority"""
+"""The session authority. Pure: no sockets, clocks, threads, MuJoCo or randomness.
+
+Roster, roles, assignment, leases, arbitration (samples -> one command per robot), grasps, episodes, e-stop, alignment
+gate, handovers, feedback. It decides; `control` moves, `physics` simulates.
+"""
+
+from iris_session.authority.authority import Authority
+from iris_session.authority.config import AuthorityConfig, SpeedLimit
+
+__all__ = ["Authority", "AuthorityConfig", "SpeedLimit"]

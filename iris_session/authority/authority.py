@@ -1,0 +1,315 @@
+"""`Authority`: one step of the session as a pure function of its state and `(now_ns, entries, n_ticks, view)`.
+
+Order within a step: urgent entries (e-stop, release, disconnect), membership and requests, samples, expiry, commands.
+Reads no clock, random source or set order; equal calls give equal decisions, and `restore(snapshot())` is invisible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from iris_session.authority import (
+    alignment,
+    arbitration,
+    episodes,
+    feedback,
+    grasps,
+    handover,
+    leases,
+    requests,
+    roster,
+    samples,
+    stops,
+)
+from iris_session.authority.config import AuthorityConfig
+from iris_session.authority.context import Context
+from iris_session.authority.state import HOST_ID, LeaseState, Participant, State
+from iris_session.protocol import client_messages as cm
+from iris_session.protocol import entries as em
+from iris_session.protocol.common import Denial
+from iris_session.protocol.entries import HOST, URGENT, Entry
+from iris_session.protocol.names import AssignmentPolicy, DenialReason, LeaseMode, RejectReason, Role, TargetKind
+from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply, Snapshot
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
+
+#: Requests that only a director (or the host) may make.
+DIRECTING: Final = (cm.Assign, cm.SetMode, cm.Control, cm.ClearEStop, cm.PlaceAlignment)
+#: Entries that only the process that owns the session may make.
+HOST_ONLY: Final = (em.ExternalReset, em.StalledGap, em.FrontRestarted, em.RecordingGap)
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(State)
+
+
+class Authority:
+    """The one truth of a session: who is in it, who drives which robot, and what every robot does in each step."""
+
+    def __init__(self, config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
+        """Raises `ValueError` for names that occur twice, unknown modes, policies, or robots in `assignments`."""
+        check_config(config, robots, objects)
+        modes = {r.name: config.default_mode or r.mode for r in robots}
+        state = State(
+            robots={r.name: LeaseState(r.name, TargetKind.ROBOT, modes[r.name]) for r in robots},
+            objects={o.name: LeaseState(o.name, TargetKind.OBJECT, LeaseMode.SHARED) for o in objects},
+            participants={HOST_ID: roster.host()},
+        )
+        self._ctx = Context(config, robots, objects, state)
+        self._commands = arbitration.Commands()
+
+    def step(
+        self,
+        now_ns: int,
+        entries: Sequence[Entry],
+        n_ticks: int,
+        view: WorldView,
+        control: Sequence[ControlStatus] = (),
+    ) -> Decision:
+        """Takes one step at session time `now_ns` (never decreasing, else `ValueError`) before `n_ticks` of physics.
+
+        `view`: the world after the last tick. `control`: what control reported after the previous step.
+        """
+        ctx = self._ctx
+        self._begin(now_ns, n_ticks, view, control)
+        others, observed = self._urgent(entries)
+        for entry in others:
+            self._request(entry)
+        for entry in observed:
+            if isinstance(entry.message, cm.Sample):
+                arbitration.sample(ctx, entry, entry.message)
+        roster.expire(ctx)
+        arbitration.expire_samples(ctx)
+        if ctx.state.queue or ctx.state.consents:
+            requests.advance(ctx)
+        handover.observe(ctx)
+        commands = self._commands.build(ctx)
+        objects = grasps.build(ctx) if ctx.held_objects else ()
+        feedback.report(ctx, commands)
+        for connection, request_id in ctx.snapshots.items():
+            if connection in ctx.by_connection:
+                ctx.outgoing.append(Outgoing(connection, self._snapshot(request_id)))
+        state = ctx.state
+        return Decision(
+            commands,
+            objects,
+            tuple(ctx.outgoing),
+            tuple(ctx.admitted),
+            tuple(ctx.dropped),
+            tuple(ctx.events),
+            tuple(ctx.presence.values()),
+            state.scene_epoch,
+            state.scene_revision,
+            state.event_seq,
+            ctx.reset,
+            state.paused,
+            state.estop,
+            ctx.step_ticks,
+        )
+
+    def snapshot(self) -> bytes:
+        """The whole state, as MessagePack."""
+        return _encoder.encode(self._ctx.state)
+
+    def restore(self, data: bytes) -> None:
+        """Continues from a snapshot of a session with the same robots and objects, else `ValueError`."""
+        state = _decoder.decode(data)
+        if tuple(state.robots) != tuple(self._ctx.robots) or tuple(state.objects) != tuple(self._ctx.objects):
+            raise ValueError(
+                f"the snapshot has robots {list(state.robots)} and objects {list(state.objects)}, "
+                f"this session has {list(self._ctx.robots)} and {list(self._ctx.objects)}"
+            )
+        self._ctx.adopt(state)
+        self._commands = arbitration.Commands()
+
+    # --- phases of a step ---
+
+    def _begin(self, now_ns: int, n_ticks: int, view: WorldView, control: Sequence[ControlStatus]) -> None:
+        ctx = self._ctx
+        before = ctx.state.now_ns
+        if n_ticks < 0 or (before is not None and now_ns < before):
+            raise ValueError(f"n_ticks {n_ticks} must be >= 0, and session time {now_ns} ns at least {before} ns")
+        ctx.now_ns = ctx.state.now_ns = now_ns
+        ctx.view, ctx.control = view, control
+        ctx.state.step += 1
+        ctx.clear_effects()
+        self._gap_seen = before is not None and now_ns - before > ctx.config.gap_ns
+        if before is not None and self._gap_seen:
+            stops.gap(ctx, now_ns - before)
+
+    def _urgent(self, entries: Sequence[Entry]) -> tuple[list[Entry], list[Entry]]:
+        """Applies the urgent lane and sorts the rest into requests and samples, within everyone's quota."""
+        ctx = self._ctx
+        others: list[Entry] = []
+        observed: list[Entry] = []
+        spent: dict[int, int] = {}
+        self._gone: list[int] = []
+        self._released: dict[int, int] = {}
+        for index, entry in enumerate(entries):
+            if isinstance(entry.message, URGENT):
+                self._apply_urgent(index, entry)
+        for index, entry in enumerate(entries):
+            m = entry.message
+            if isinstance(m, URGENT):
+                continue
+            n = spent.get(entry.connection, 0) + 1
+            spent[entry.connection] = n
+            if n > ctx.config.quota and entry.connection != HOST:
+                self._over_quota(entry)
+            elif isinstance(m, cm.Sample):
+                observed.append(entry)
+            elif isinstance(m, (cm.Acquire, cm.Grasp)) and index < self._released.get(entry.connection, -1):
+                self._deny(entry, Denial(DenialReason.INVALID, "released again within the same step", "acquire again"))
+            else:
+                others.append(entry)
+            p = ctx.by_connection.get(entry.connection)
+            if p is not None and entry.receive_ns > p.heard_ns:
+                p.heard_ns = min(entry.receive_ns, ctx.now_ns)
+        return others, observed
+
+    def _apply_urgent(self, index: int, entry: Entry) -> None:
+        ctx, m = self._ctx, entry.message
+        p = ctx.by_connection.get(entry.connection)
+        if p is None:
+            self._gone.append(entry.connection)
+            return
+        if isinstance(m, cm.EStop):
+            # An honest stop must not fail on a stale envelope: only the connection itself is checked.
+            stops.estop(ctx, p, m)
+        elif isinstance(m, em.Lost):
+            roster.lose(ctx, p, m.reason)
+            self._gone.append(entry.connection)
+        elif entry.connection_epoch != entry.connection:
+            samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
+        elif isinstance(m, cm.Bye):
+            roster.leave(ctx, p, m.reason)
+            self._gone.append(entry.connection)
+        elif isinstance(m, cm.Release):
+            leases.release(ctx, p, m)
+            self._released[entry.connection] = index
+
+    def _over_quota(self, entry: Entry) -> None:
+        ctx, m = self._ctx, entry.message
+        p = ctx.by_connection.get(entry.connection)
+        if p is not None and isinstance(m, cm.Sample):
+            samples.reject(ctx, p, m, RejectReason.QUOTA)
+        else:
+            samples.count(ctx, p, "", RejectReason.QUOTA)
+            denial = Denial(DenialReason.QUOTA, f"more than {ctx.config.quota} messages in one step", "send less")
+            self._deny(entry, denial)
+
+    def _deny(self, entry: Entry, denial: Denial) -> None:
+        """Answers a request that was not even looked at."""
+        request_id = getattr(entry.message, "request_id", None)
+        if request_id is not None:
+            self._ctx.outgoing.append(Outgoing(entry.connection, Reply(request_id, False, denial)))
+
+    def _request(self, entry: Entry) -> None:
+        """Everything that is neither urgent nor a sample."""
+        ctx, m = self._ctx, entry.message
+        if isinstance(m, em.Join):
+            if entry.connection not in self._gone:
+                roster.join(ctx, entry.connection, m)
+            return
+        p = ctx.by_connection.get(entry.connection)
+        if p is None:
+            samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
+            self._deny(entry, Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first"))
+        elif entry.connection_epoch != entry.connection and not isinstance(m, em.AlignmentProposal):
+            samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
+            denial = Denial(DenialReason.NOT_JOINED, "the envelope names another connection", "use the latest welcome")
+            self._deny(entry, denial)
+        elif isinstance(m, DIRECTING) and p.role != Role.DIRECTOR:
+            self._deny(entry, Denial(DenialReason.ROLE, f"role {p.role} may not do this", "ask a director"))
+        elif isinstance(m, HOST_ONLY):
+            if p.id == HOST_ID:
+                self._host(m)
+        else:
+            _HANDLERS[type(m)](ctx, p, m)
+
+    def _host(self, m: em.EntryMessage) -> None:
+        ctx = self._ctx
+        if isinstance(m, em.ExternalReset):
+            stops.new_scene(ctx, "external")
+        elif isinstance(m, em.FrontRestarted):
+            roster.lose_everyone(ctx, "front_restarted")
+        elif isinstance(m, em.RecordingGap):
+            ctx.emit(Gap("recording", 0))
+        elif isinstance(m, em.StalledGap) and not self._gap_seen:
+            self._gap_seen = True
+            stops.gap(ctx, m.duration_ns)
+
+    def _snapshot(self, request_id: int) -> Snapshot:
+        """What a late joiner needs; the front adds robots, bodies, scene hash and poses."""
+        ctx, state = self._ctx, self._ctx.state
+        return Snapshot(
+            request_id=request_id,
+            event_seq=state.event_seq,
+            scene_epoch=state.scene_epoch,
+            scene_revision=state.scene_revision,
+            scene_hash="",
+            tick=ctx.view.tick,
+            sim_time=ctx.view.sim_time,
+            session_time=ctx.now_ns,
+            participants=tuple(ctx.info(p) for p in state.participants.values() if p.id != HOST_ID),
+            leases=tuple(ctx.lease_info(lease) for lease in (*state.robots.values(), *state.objects.values())),
+            paused=state.paused,
+            estop=state.estop,
+            episode=state.episode,
+        )
+
+
+def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
+    """Raises `ValueError` that says what would have been right."""
+    names = [r.name for r in robots]
+    for kind, all_names in (("robot", names), ("object", [o.name for o in objects])):
+        if len(set(all_names)) != len(all_names):
+            raise ValueError(f"{kind} names must differ: {all_names}")
+    for mode in (config.default_mode or LeaseMode.EXCLUSIVE, *(r.mode for r in robots)):
+        if mode not in LeaseMode.ALL:
+            raise ValueError(f"unknown lease mode {mode!r}, known: {sorted(LeaseMode.ALL)}")
+    if config.policy not in AssignmentPolicy.ALL:
+        raise ValueError(f"unknown assignment policy {config.policy!r}, known: {sorted(AssignmentPolicy.ALL)}")
+    unknown = [r for given in config.assignments.values() for r in given if r not in names]
+    if unknown:
+        raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
+    if config.leader_apart not in ("ramp", "refuse"):
+        raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
+
+
+def _heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:
+    roster.set_worn(ctx, p, m.worn)
+
+
+def _marker(ctx: Context, p: Participant, m: cm.Marker) -> None:
+    ctx.emit(MarkerAdded(p.id, m.text))
+    ctx.accept(p, m.request_id)
+
+
+def _get_snapshot(ctx: Context, p: Participant, m: cm.GetSnapshot) -> None:
+    ctx.snapshots[p.connection] = m.request_id
+
+
+def _observation(ctx: Context, p: Participant, m: cm.Observation) -> None:
+    """Kept in the journal only; the estimator in the front makes proposals of it."""
+
+
+_HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
+    cm.Heartbeat: _heartbeat,
+    cm.GetSnapshot: _get_snapshot,
+    cm.Acquire: requests.acquire,
+    cm.Consent: requests.consent,
+    cm.Assign: requests.assign,
+    cm.SetMode: requests.set_mode,
+    cm.Grasp: requests.grasp,
+    cm.Observation: _observation,
+    em.AlignmentProposal: alignment.propose,
+    cm.PlaceAlignment: alignment.place,
+    cm.TrackingEpoch: alignment.tracking_epoch,
+    cm.Episode: episodes.episode,
+    cm.ClearEStop: stops.clear_estop,
+    cm.Control: stops.control,
+    cm.Marker: _marker,
+}

@@ -1,0 +1,82 @@
+"""Bounds and policies of the session authority: every number of DESIGN section 5 as a field with its default."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Name
+from iris_session.protocol.names import AssignmentPolicy, Device
+
+MS: Final = 1_000_000
+SECOND: Final = 1_000_000_000
+
+
+class SpeedLimit(msgspec.Struct, frozen=True):
+    """Fastest motion a device can make between two counted samples: [m/s] and [rad/s]."""
+
+    linear: float
+    angular: float
+
+
+#: People throw controllers at about 10 m/s; heads turn at up to 15 rad/s. Anything faster is a tracking jump.
+SPEED_LIMITS: Final[dict[str, SpeedLimit]] = {
+    Device.HEAD: SpeedLimit(5.0, 20.0),
+    Device.CONTROLLER_LEFT: SpeedLimit(10.0, 40.0),
+    Device.CONTROLLER_RIGHT: SpeedLimit(10.0, 40.0),
+    Device.HAND_LEFT: SpeedLimit(10.0, 40.0),
+    Device.HAND_RIGHT: SpeedLimit(10.0, 40.0),
+    Device.JOINTS: SpeedLimit(10.0, 20.0),
+    Device.GAZE: SpeedLimit(50.0, 50.0),
+    Device.DESKTOP: SpeedLimit(10.0, 40.0),
+    Device.TARGET: SpeedLimit(5.0, 20.0),
+}
+
+
+class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Configuration of `Authority`. Times in nanoseconds of session time, lengths in metres, angles in radians.
+
+    `assignments`: participant name -> robots (policy `config`). `leader_apart`: `ramp` (control ramps) or `refuse`.
+    `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    """
+
+    # samples
+    freshness_ns: int = 150 * MS  # oldest capture, longest wait without a counted sample
+    future_ns: int = 5 * MS
+    quaternion_tolerance: float = 1e-3
+    reach_m: float = 1000.0  # a finite number beyond this is rejected like an infinite one
+    speed_limits: dict[str, SpeedLimit] = msgspec.field(default_factory=lambda: dict(SPEED_LIMITS))
+    speed_slack_m: float = 0.02  # tracking noise and clock slew on top of speed * time
+    speed_slack_rad: float = 0.1
+    leader_apart: str = "ramp"
+    leader_apart_rad: float = 0.2
+    # membership
+    heartbeat_timeout_ns: int = 3 * SECOND
+    grace_ns: int = 30 * SECOND
+    gap_ns: int = 150 * MS  # a longer time between two steps is a gap: robots hold until clutched again
+    drain_ns: int = 250 * MS  # after a gap nothing expires before the waiting entries had this long to arrive
+    max_participants: int = 64
+    quota: int = 64  # entries per participant and step, urgent ones not counted
+    # leases
+    policy: Name = AssignmentPolicy.JOIN_ORDER
+    assignments: dict[str, tuple[str, ...]] = {}
+    default_mode: Name = ""  # empty: the mode of the robot's own specification
+    max_queue: int = 32
+    max_consents: int = 16
+    consent_timeout_ns: int = 15 * SECOND
+    max_sub_holders: int = 4  # people who share one robot, hands that hold one object
+    # alignment
+    max_error_at_robot_m: float = 0.05  # stated p95; above it the alignment is refused with advice
+    max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
+    min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
+    min_change_rad: float = 0.002
+    # handover: contact flickers for a few ticks at every change of grip
+    handover_hold_ns: int = 100 * MS  # giver must have held it alone this long; receiver afterwards too
+    handover_flicker_ns: int = 50 * MS
+    # output
+    feedback_ns: int = 50 * MS
+    report_ns: int = SECOND  # between two `samples_rejected` events of one kind
+    contact_step_n: float = 0.5  # contact force is reported in steps of this size [N]
+    max_step_ticks: int = 10_000
+    user_owned_loop: bool = False

@@ -1,0 +1,171 @@
+"""Membership: join, resume, lost connections, heartbeats, grace and expiry."""
+
+from __future__ import annotations
+
+from iris_session.authority import engagement, leases
+from iris_session.authority.context import Context
+from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
+from iris_session.protocol.common import IDENTITY, Alignment
+from iris_session.protocol.entries import HOST, Join
+from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RefusalCode, Role
+from iris_session.protocol.server_messages import ParticipantJoined, ParticipantLeft
+from iris_session.protocol.steps import Admitted, Dropped
+
+NOT_NEEDED = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
+#: A client sends the capability `run:<random>`, made anew at every start of its tracking, to keep its alignment when
+#: only the connection broke. A client that does not must be aligned again after a resume.
+RUN_PREFIX = "run:"
+
+
+def host() -> Participant:
+    """The process that owns the session: a director that never joins, times out or leaves."""
+    p = Participant(HOST_ID, HOST_ID, Role.DIRECTOR, "", HOST, False, 0)
+    p.alignment = NOT_NEEDED
+    return p
+
+
+def join(ctx: Context, connection: int, m: Join) -> None:
+    """Lets a connection in, or answers `Refused` with a code of `DenialReason` or `RefusalCode`."""
+    state = ctx.state
+    if connection in ctx.by_connection or connection <= state.last_connection:
+        return ctx.refuse(connection, DenialReason.ALREADY_JOINED, f"connection {connection} was used before")
+    state.last_connection = connection
+    if m.role not in Role.ALL:
+        known = ", ".join(sorted(Role.ALL))
+        return ctx.refuse(connection, DenialReason.UNKNOWN_VALUE, f"unknown role {m.role}", f"roles: {known}")
+    if m.alignment not in (AlignmentKind.MEASURED, AlignmentKind.NOT_NEEDED):
+        text, known = f"unknown alignment {m.alignment}", f"{AlignmentKind.MEASURED}, {AlignmentKind.NOT_NEEDED}"
+        return ctx.refuse(connection, DenialReason.UNKNOWN_VALUE, text, known)
+    if m.gateway:
+        gateway = ctx.by_connection.get(m.gateway)
+        if gateway is None or gateway.role != Role.GATEWAY:
+            text = f"connection {m.gateway} may not speak for others"
+            return ctx.refuse(connection, RefusalCode.GATEWAY_ONLY, text, "join with role gateway")
+    old = state.participants.get(m.resume_of) if m.resume_of != HOST_ID else None
+    if old is not None:
+        return _resume(ctx, connection, m, old)
+    if len(state.participants) > ctx.config.max_participants and not _evict(ctx):
+        text = f"the session is full: {ctx.config.max_participants} participants"
+        return ctx.refuse(connection, DenialReason.SESSION_FULL, text, "wait until somebody leaves")
+    p = Participant(
+        f"p{state.next_participant}", m.name, m.role, m.key_id, connection, m.alignment == AlignmentKind.MEASURED, 0
+    )
+    state.next_participant += 1
+    state.participants[p.id] = p
+    return _admit(ctx, p, connection, m, resumed=False)
+
+
+def _resume(ctx: Context, connection: int, m: Join, p: Participant) -> None:
+    if m.key_id != p.key_id or m.role != p.role:
+        text = f"{p.id} has another key or role"
+        return ctx.refuse(connection, RefusalCode.RESUME_TOKEN, text, "join without the resume token")
+    if p.connection != NO_CONNECTION:
+        ctx.dropped.append(Dropped(p.connection, "replaced"))
+        del ctx.by_connection[p.connection]
+    needs_alignment = m.alignment == AlignmentKind.MEASURED
+    if not p.run or p.run not in _runs(m) or needs_alignment != p.needs_alignment:
+        p.tracking_epoch = 0
+        p.alignment = p.offset = p.T_world_tracking_measured = None
+    p.name, p.needs_alignment = m.name, needs_alignment
+    p.seen.clear()
+    return _admit(ctx, p, connection, m, resumed=True)
+
+
+def _runs(m: Join) -> list[str]:
+    return [c for c in m.capabilities if c.startswith(RUN_PREFIX)]
+
+
+def _admit(ctx: Context, p: Participant, connection: int, m: Join, resumed: bool) -> None:
+    p.connection, p.gateway, p.heard_ns, p.expires_ns, p.worn = connection, m.gateway, ctx.now_ns, 0, True
+    p.devices, p.run = m.devices, next(iter(_runs(m)), "")
+    if not p.needs_alignment:
+        p.alignment = NOT_NEEDED
+    ctx.by_connection[connection] = p
+    ctx.admitted.append(Admitted(connection, p.id, p.role, resumed))
+    ctx.emit(ParticipantJoined(ctx.info(p), resumed))
+    if resumed:
+        leases.fence(ctx, p)
+
+
+def _evict(ctx: Context) -> bool:
+    """Makes room: forgets the first lost participant that holds nothing."""
+    for p in ctx.state.participants.values():
+        if p.connection == NO_CONNECTION and not ctx.leases_of(p):
+            remove(ctx, p, "expired")
+            return True
+    return False
+
+
+def lose(ctx: Context, p: Participant, reason: str) -> None:
+    """The connection is gone: its robots hold, and the grace period begins."""
+    if p.connection == NO_CONNECTION or p.id == HOST_ID:
+        return
+    del ctx.by_connection[p.connection]
+    connection, p.connection = p.connection, NO_CONNECTION
+    p.expires_ns = ctx.now_ns + ctx.config.grace_ns
+    leases.forget_requests(ctx, p, "")
+    ctx.emit(ParticipantLeft(p.id, reason, grace=True))
+    for lease in ctx.leases_of(p):
+        overrides = lease.override == p.id
+        for g in lease.grants:
+            if g.participant == p.id:
+                engagement.rearm(ctx, lease, g, HoldReason.DISCONNECTED)
+        if overrides:
+            engagement.give_back(ctx, lease)
+        ctx.publish(lease, "left", p.id)
+    _lose_clients(ctx, connection, reason)
+
+
+def leave(ctx: Context, p: Participant, reason: str) -> None:
+    """Bye: releases everything without grace."""
+    if p.id == HOST_ID:
+        return
+    connection = p.connection
+    ctx.dropped.append(Dropped(connection, "bye"))
+    del ctx.by_connection[connection]
+    p.connection = NO_CONNECTION
+    remove(ctx, p, "left", reason or "bye")
+    _lose_clients(ctx, connection, "gateway")
+
+
+def _lose_clients(ctx: Context, gateway: int, reason: str) -> None:
+    """Everyone for whom the gateway at that connection spoke is lost with it."""
+    for p in [p for p in ctx.by_connection.values() if p.gateway == gateway and gateway != HOST]:
+        lose(ctx, p, reason)
+
+
+def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
+    """Forgets a participant and frees what it holds."""
+    leases.free_all(ctx, p, cause)
+    for tracked in ctx.state.feedback.values():
+        tracked.sent.pop(p.id, None)
+    del ctx.state.participants[p.id]
+    ctx.emit(ParticipantLeft(p.id, reason or cause))
+
+
+def lose_everyone(ctx: Context, reason: str) -> None:
+    """The front was replaced: every connection is lost."""
+    for p in tuple(ctx.by_connection.values()):
+        lose(ctx, p, reason)
+
+
+def set_worn(ctx: Context, p: Participant, worn: bool) -> None:
+    """The headset was put on or taken off; taken off, everything it drives holds."""
+    if p.worn != worn:
+        p.worn = worn
+        if not worn:
+            engagement.rearm_participant(ctx, p, HoldReason.NOT_WORN)
+        ctx.publish_participant(p)
+
+
+def expire(ctx: Context) -> None:
+    """Heartbeats and grace periods, by session time; after the entries of the step were applied."""
+    if ctx.now_ns < ctx.state.hold_expiry_until_ns:
+        return
+    silent_before = ctx.now_ns - ctx.config.heartbeat_timeout_ns
+    for p in tuple(ctx.state.participants.values()):
+        if p.connection > HOST and p.heard_ns < silent_before:
+            ctx.dropped.append(Dropped(p.connection, "heartbeat"))
+            lose(ctx, p, "heartbeat")
+        elif p.expires_ns and ctx.now_ns >= p.expires_ns:
+            remove(ctx, p, "expired")

@@ -1,0 +1,197 @@
+"""Which samples count: every check of DESIGN 5.3, each with its typed reason, and what a rejection does.
+
+A rejection rearms only the latches of the sending participant's own device on the targets it names and holds. An old
+`seq` is only counted. NaN and infinity may arrive in any float: they are compared so that they fail.
+"""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import distance, quat_angle
+from iris_session.authority import alignment, engagement
+from iris_session.authority.context import Context, find_grant
+from iris_session.authority.state import DeviceState, Grant, LeaseState, Participant, Rejections
+from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.names import Device, HoldReason, RejectReason, Role, SampleKind, TargetKind
+from iris_session.protocol.server_messages import SamplesRejected
+
+Drive = tuple[LeaseState, Grant]
+UNSEEN = DeviceState()
+
+
+def check(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
+    """The `RejectReason` of a sample, or empty when it counts; then `drives` holds its targets' leases and grants."""
+    if entry.connection_epoch != entry.connection:
+        return RejectReason.CONNECTION_EPOCH
+    if s.device not in Device.ALL or s.kind not in SampleKind.ALL:
+        return RejectReason.UNKNOWN_VALUE
+    if (p.devices and s.device not in p.devices) or (s.kind == SampleKind.JOINTS) != (s.device == Device.JOINTS):
+        return RejectReason.DEVICE
+    seen = p.seen.get(s.device, UNSEEN)
+    if s.seq <= seen.seq:
+        return RejectReason.SEQ
+    if s.scene_epoch != ctx.state.scene_epoch:
+        return RejectReason.SCENE_EPOCH
+    if s.tracking_epoch != p.tracking_epoch:
+        return RejectReason.TRACKING_EPOCH
+    reason = _time(ctx, entry, s)
+    if not reason and s.targets:
+        reason = _targets(ctx, p, s, drives)
+    if not reason:
+        reason = _alignment(p, s, drives)
+    if not reason:
+        reason = _numbers(ctx, s)
+    if not reason and s.tracked and s.worn:
+        reason = _payload(ctx, s, seen) or (_engaging(ctx, p, s, drives) if s.clutch else "")
+    return reason
+
+
+def _time(ctx: Context, entry: Entry, s: Sample) -> str:
+    """Fresh and not from the future, by the capture time and by the time of receipt."""
+    oldest = ctx.now_ns - ctx.config.freshness_ns
+    if s.capture_ns < oldest or entry.receive_ns < oldest:
+        return RejectReason.STALE
+    if s.capture_ns - min(ctx.now_ns, entry.receive_ns) > ctx.config.future_ns:
+        return RejectReason.FUTURE
+    return RejectReason.FUTURE if entry.receive_ns - ctx.now_ns > ctx.config.future_ns else ""
+
+
+def _targets(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
+    if p.role not in Role.DRIVING:
+        return RejectReason.ROLE
+    for t in s.targets:
+        if t.kind not in (TargetKind.ROBOT, TargetKind.OBJECT):
+            return RejectReason.UNKNOWN_VALUE
+        lease = ctx.lease(t.kind, t.name)
+        if lease is None:
+            return RejectReason.UNKNOWN_TARGET
+        g = find_grant(lease, p.id, s.device)
+        if g is None:
+            return RejectReason.NOT_HOLDER
+        if not g.version <= t.lease_version <= lease.version:
+            return RejectReason.LEASE_VERSION
+        drives.append((lease, g))
+    return ""
+
+
+def _alignment(p: Participant, s: Sample, drives: list[Drive]) -> str:
+    """Poses and twists count in the alignment in force, or in the one frozen at this engagement."""
+    if not p.needs_alignment or s.kind == SampleKind.JOINTS:
+        return ""
+    if p.alignment is None:
+        return RejectReason.UNALIGNED if drives else ""
+    if s.alignment_version == p.alignment.version:
+        return ""
+    frozen = drives and all(
+        g.engagement and g.device == s.device and g.alignment_version == s.alignment_version for _, g in drives
+    )
+    return "" if frozen else RejectReason.ALIGNMENT_VERSION
+
+
+def _numbers(ctx: Context, s: Sample) -> str:
+    """Finite and within reach, whether or not this sample's payload will be used."""
+    total = sum(s.q) + sum(s.qd) + sum(s.hand_joints)
+    if s.gripper is not None:
+        total += s.gripper
+    if s.pose is not None:
+        reach = ctx.config.reach_m
+        x, y, z = s.pose.p
+        if not (-reach <= x <= reach and -reach <= y <= reach and -reach <= z <= reach):
+            return RejectReason.NOT_FINITE
+        total += sum(s.pose.q)
+    if s.twist is not None:
+        total += sum(s.twist)
+    return "" if math.isfinite(total) else RejectReason.NOT_FINITE
+
+
+def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
+    """Shape and possible speed of the payload that `kind` names."""
+    limit = ctx.config.speed_limits[s.device]
+    dt = max(0, s.capture_ns - seen.capture_ns) * 1e-9
+    if s.kind == SampleKind.POSE:
+        if s.pose is None:
+            return RejectReason.SHAPE
+        w, x, y, z = s.pose.q
+        if not abs(math.sqrt(w * w + x * x + y * y + z * z) - 1.0) <= ctx.config.quaternion_tolerance:
+            return RejectReason.NOT_UNIT
+        if seen.pose is None:
+            return ""
+        possible = (
+            distance(s.pose.p, seen.pose.p) <= limit.linear * dt + ctx.config.speed_slack_m
+            and quat_angle(seen.pose.q, s.pose.q) <= limit.angular * dt + ctx.config.speed_slack_rad
+        )
+    elif s.kind == SampleKind.TWIST:
+        if s.twist is None:
+            return RejectReason.SHAPE
+        vx, vy, vz, wx, wy, wz = s.twist
+        possible = (
+            vx * vx + vy * vy + vz * vz <= limit.linear * limit.linear
+            and wx * wx + wy * wy + wz * wz <= limit.angular * limit.angular
+        )
+    else:
+        if not s.q or (s.qd and len(s.qd) != len(s.q)):
+            return RejectReason.SHAPE
+        bound = limit.angular * dt + ctx.config.speed_slack_rad
+        possible = max(map(abs, (*s.q, *s.qd))) <= ctx.config.reach_m and (
+            len(seen.q) != len(s.q) or all(abs(a - b) <= bound for a, b in zip(s.q, seen.q, strict=True))
+        )
+    return "" if possible else RejectReason.TOO_FAST
+
+
+def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
+    """What must hold beyond the checks above for a robot to follow."""
+    for lease, g in drives:
+        if lease.kind == TargetKind.OBJECT:
+            if s.kind != SampleKind.POSE:
+                return RejectReason.SHAPE
+            continue
+        if s.kind == SampleKind.JOINTS and len(s.q) != len(ctx.robots[lease.target].joints):
+            return RejectReason.SHAPE
+        if g.engagement or s.device not in g.armed:
+            continue
+        if p.role == Role.LEADER and s.kind == SampleKind.JOINTS and ctx.config.leader_apart == "refuse":
+            apart = max(abs(a - b) for a, b in zip(s.q, ctx.view.joints(lease.target), strict=True))
+            if apart > ctx.config.leader_apart_rad:
+                return RejectReason.LEADER_APART
+        if s.kind != SampleKind.JOINTS and p.needs_alignment:
+            error = alignment.error_at(ctx, p, lease.target)
+            if error > ctx.config.max_error_at_robot_m:
+                alignment.refuse_at_robot(ctx, p, lease.target, error)
+                return RejectReason.UNALIGNED
+    return ""
+
+
+def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
+    """Counts a rejected sample and rearms what its sender's device drives of the targets it names."""
+    count(ctx, p, s.device, reason)
+    if reason == RejectReason.SEQ:
+        return
+    hold = HoldReason.UNALIGNED if reason == RejectReason.UNALIGNED else HoldReason.REJECTED
+    for t in s.targets:
+        lease = ctx.lease(t.kind, t.name)
+        g = find_grant(lease, p.id, s.device) if lease is not None else None
+        if lease is None or g is None:
+            continue
+        if s.device in g.armed:
+            g.armed.remove(s.device)
+        if not g.engagement:
+            # The cause of an earlier stop (e-stop, reset) stays visible until the clutch opens.
+            if hold == HoldReason.UNALIGNED or g.hold in (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN):
+                g.hold = hold
+        elif g.device == s.device:
+            engagement.end(ctx, lease, g, hold)
+
+
+def count(ctx: Context, p: Participant | None, device: str, reason: str, n: int = 1) -> None:
+    """Counts `n` rejections; an event at the first one of a kind, then at most one per report period."""
+    device = device if device in Device.ALL else ""
+    book = ctx.state.unattributed if p is None else p.rejections
+    if p is not None:
+        p.rejected[reason] = p.rejected.get(reason, 0) + n
+    entry = book.setdefault(f"{device} {reason}", Rejections())
+    entry.count += n
+    if entry.reported_ns is None or ctx.now_ns - entry.reported_ns >= ctx.config.report_ns:
+        entry.reported_ns = ctx.now_ns
+        ctx.emit(SamplesRejected(p.id if p is not None else "", device, reason, entry.count))

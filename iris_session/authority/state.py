@@ -1,0 +1,174 @@
+"""Everything the authority remembers between steps, as plain mutable structs. `State` is the whole snapshot.
+
+Nothing else in this room keeps state; caches elsewhere are derived from these structs and can be rebuilt at any time.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import IDENTITY, Alignment, Pose, Vec3
+from iris_session.protocol.names import HoldReason
+from iris_session.protocol.server_messages import EpisodeChanged, Feedback
+from iris_session.protocol.steps import CommandSource
+
+#: Participant id of the process that owns the session. It is not part of the roster.
+HOST_ID: Final = "host"
+#: `Participant.connection` while the connection is lost.
+NO_CONNECTION: Final = -1
+
+
+class DeviceState(msgspec.Struct):
+    """Newest counted sample of one device: what the next one is compared with. Pose in the tracking frame."""
+
+    seq: int = -1
+    capture_ns: int = 0
+    pose: Pose | None = None
+    q: tuple[float, ...] = ()
+
+
+class Rejections(msgspec.Struct):
+    """Rejected samples of one device for one reason."""
+
+    count: int = 0
+    reported_ns: int | None = None
+
+
+class Participant(msgspec.Struct):
+    """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
+
+    `run`: value of the capability `run:<id>`; a resumed connection with the same one continues the same tracking frame.
+    `T_world_tracking_measured` is the last measured alignment without the director's `offset`; `pivot_world` the point
+    at which its covariance is stated. `devices` empty: none declared, all known ones are taken.
+    """
+
+    id: str
+    name: str
+    role: str
+    key_id: str
+    connection: int
+    needs_alignment: bool
+    heard_ns: int
+    gateway: int = 0
+    run: str = ""
+    devices: tuple[str, ...] = ()
+    expires_ns: int = 0
+    worn: bool = True
+    tracking_epoch: int = 0
+    alignment_version: int = 0
+    alignment: Alignment | None = None
+    T_world_tracking_measured: Pose | None = None
+    offset: Pose | None = None
+    pivot_world: Vec3 = (0.0, 0.0, 0.0)
+    refused_ns: int | None = None
+    tilt_warned: bool = False
+    seen: dict[str, DeviceState] = {}
+    rejected: dict[str, int] = {}
+    rejections: dict[str, Rejections] = {}
+
+
+class Grant(msgspec.Struct):
+    """The right of one participant on one target, its clutch latches and its engagement.
+
+    `version`: fencing token; tokens from it up to the lease's own are valid, so a second sharer does not fence the
+    first. `hand`: the only device that may use it (objects taken with `grasp`). `armed`: devices whose clutch was seen
+    open since the last rearm. `engagement` 0: not engaged, and `hold` says why.
+    """
+
+    participant: str
+    version: int
+    weight: float = 1.0
+    hand: str = ""
+    armed: list[str] = []
+    hold: str = HoldReason.NO_SAMPLE
+    engagement: int = 0
+    device: str = ""
+    kind: str = ""
+    alignment_version: int = 0
+    T_world_tracking: Pose = IDENTITY
+    counted_ns: int = 0
+    counted_step: int = 0
+    source: CommandSource | None = None
+    gripper: float | None = None
+
+
+class LeaseState(msgspec.Struct):
+    """One robot or object. `override`: the human who has preempted the agent (mode `priority`).
+
+    Objects: `lead` is the engagement of the leading hand, `T_hand_object` its latched offset, `T_world_object` the
+    last commanded pose.
+    """
+
+    target: str
+    kind: str
+    mode: str
+    version: int = 0
+    grants: list[Grant] = []
+    override: str = ""
+    lead: int = 0
+    T_hand_object: Pose = IDENTITY
+    T_world_object: Pose = IDENTITY
+
+
+class Pending(msgspec.Struct):
+    """An `acquire` that has not been answered yet: it waits in the queue, or for consents.
+
+    `consents`: consent id -> robot whose holder has not answered. `expires_ns` 0: never.
+    """
+
+    participant: str
+    request_id: int
+    robots: tuple[str, ...]
+    objects: tuple[str, ...]
+    weight: float
+    any_robot: bool = False
+    consents: dict[int, str] = {}
+    expires_ns: int = 0
+
+
+class HandoverTrack(msgspec.Struct):
+    """Progress of one object from `giver` to `receiver`. Times: session time."""
+
+    giver: str = ""
+    alone_ns: int = 0
+    receiver: str = ""
+    both_from_ns: int | None = None
+    both_until_ns: int = 0
+    taken_ns: int | None = None
+    seen_ns: int = 0
+
+
+class FeedbackState(msgspec.Struct):
+    """What the holders of one robot were told last."""
+
+    due_ns: int = 0
+    sent: dict[str, Feedback] = {}
+
+
+class State(msgspec.Struct):
+    """The authority's whole memory."""
+
+    robots: dict[str, LeaseState]
+    objects: dict[str, LeaseState]
+    participants: dict[str, Participant]
+    step: int = 0
+    now_ns: int | None = None
+    event_seq: int = 0
+    scene_epoch: int = 1
+    scene_revision: int = 0
+    next_participant: int = 1
+    next_engagement: int = 1
+    next_consent: int = 1
+    last_connection: int = 0
+    queue: list[Pending] = []
+    consents: list[Pending] = []
+    estop: bool = False
+    paused: bool = False
+    hold_expiry_until_ns: int = 0
+    episode: EpisodeChanged | None = None
+    handovers: dict[str, HandoverTrack] = {}
+    handover_tick: int = -1
+    feedback: dict[str, FeedbackState] = {}
+    unattributed: dict[str, Rejections] = {}

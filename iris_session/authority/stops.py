@@ -1,0 +1,89 @@
+"""Everything that stops or restarts the whole session: e-stop, pause, reset, gaps, scene changes."""
+
+from __future__ import annotations
+
+from iris_session.authority import engagement
+from iris_session.authority.context import Context
+from iris_session.authority.state import NO_CONNECTION, Participant
+from iris_session.protocol.client_messages import ClearEStop, Control, EStop
+from iris_session.protocol.common import Denial
+from iris_session.protocol.names import ControlAction, DenialReason, HoldReason
+from iris_session.protocol.server_messages import EStopChanged, Gap, PauseChanged, SceneChanged
+
+
+def estop(ctx: Context, p: Participant, m: EStop) -> None:
+    """Latched; every robot holds from this step on."""
+    ctx.estop_arrived = True
+    if not ctx.state.estop:
+        ctx.state.estop = True
+        ctx.emit(EStopChanged(True, p.id, m.reason))
+        engagement.rearm_all(ctx, HoldReason.ESTOP)
+
+
+def clear_estop(ctx: Context, p: Participant, m: ClearEStop) -> None:
+    """Ends the e-stop; robots hold until clutched again. Denied in a step in which somebody stops."""
+    if ctx.estop_arrived:
+        denial = Denial(DenialReason.ESTOP, "somebody stopped the session in this very step", "look, then clear again")
+        return ctx.deny(p, m.request_id, denial)
+    if ctx.state.estop:
+        ctx.state.estop = False
+        ctx.emit(EStopChanged(False, p.id))
+        engagement.rearm_all(ctx, HoldReason.ESTOP)
+    return ctx.accept(p, m.request_id)
+
+
+def control(ctx: Context, p: Participant, m: Control) -> None:
+    """A director's pause, resume, step and reset."""
+    if m.action not in ControlAction.ALL:
+        known = f"actions: {', '.join(sorted(ControlAction.ALL))}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+    if ctx.config.user_owned_loop:
+        return ctx.deny(p, m.request_id, user_owned(m.action))
+    if m.action == ControlAction.STEP:
+        if not ctx.state.paused or not 1 <= m.ticks <= ctx.config.max_step_ticks:
+            text = f"step needs a paused session and 1 to {ctx.config.max_step_ticks} ticks"
+            return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "pause first"))
+        ctx.step_ticks = m.ticks
+    elif m.action == ControlAction.RESET:
+        reset(ctx)
+    elif ctx.state.paused != (m.action == ControlAction.PAUSE):
+        ctx.state.paused = not ctx.state.paused
+        ctx.emit(PauseChanged(ctx.state.paused, p.id))
+        # A hand moves on while physics stands still: motion must be latched anew.
+        engagement.rearm_all(ctx, HoldReason.GAP)
+    return ctx.accept(p, m.request_id)
+
+
+def user_owned(action: str) -> Denial:
+    """The denial of what only the owner of the loop can do."""
+    return Denial(DenialReason.USER_OWNED, f"{action}: the user's own loop drives physics", "do it in that program")
+
+
+def reset(ctx: Context) -> None:
+    """Back to the initial state before the ticks of this step: a new scene epoch, leases stay."""
+    if not ctx.reset:
+        ctx.reset = True
+        new_scene(ctx, "reset")
+
+
+def new_scene(ctx: Context, cause: str) -> None:
+    """Starts a scene epoch: whatever was sent for the old one no longer counts."""
+    ctx.state.scene_epoch += 1
+    ctx.state.handovers.clear()
+    engagement.rearm_all(ctx, HoldReason.SCENE_CHANGED)
+    for lease in ctx.state.objects.values():
+        lease.lead = 0
+    ctx.emit(SceneChanged(ctx.state.scene_epoch, ctx.state.scene_revision, cause))
+
+
+def gap(ctx: Context, duration_ns: int) -> None:
+    """No step was taken for a while: robots hold until clutched again, and nobody expires before the entries that
+    waited meanwhile were applied."""
+    ctx.state.hold_expiry_until_ns = ctx.now_ns + ctx.config.drain_ns
+    for p in ctx.state.participants.values():
+        if p.connection == NO_CONNECTION:
+            p.expires_ns = max(p.expires_ns, ctx.state.hold_expiry_until_ns)
+        else:
+            p.heard_ns = max(p.heard_ns, ctx.now_ns)
+    ctx.emit(Gap("stalled", max(0, duration_ns)))
+    engagement.rearm_all(ctx, HoldReason.GAP)
