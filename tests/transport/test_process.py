@@ -1,0 +1,231 @@
+"""Starting, failing, stalling, restarting and ending the front process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zmq
+
+from iris_session.protocol.client_messages import Heartbeat, Hello, envelope
+from iris_session.protocol.codec import decode_server, encode_client
+from iris_session.protocol.entries import FrontRestarted, Join
+from iris_session.protocol.server_messages import ProtocolFault, Snapshot
+from iris_session.transport import FrontConfig, FrontError, FrontProcess
+from tests.transport.harness import FrontSession, scene
+
+pytestmark = pytest.mark.e2e
+OpenSession = Callable[..., FrontSession]
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended; a zombie has, its parent has not collected it yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def wait(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what}"
+        time.sleep(0.005)
+
+
+def test_a_port_in_use_is_said_in_one_line_with_advice() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FrontError) as error:
+            FrontProcess(FrontConfig(control_port=port, state_port=0), scene()).start()
+    assert str(error.value) == (f"port {port} is in use (by another session?): pass --control-port 0 for any free one")
+
+
+def test_open_networks_need_keys() -> None:
+    with pytest.raises(FrontError, match="without encryption"):
+        FrontProcess(FrontConfig(host="0.0.0.0", control_port=0, state_port=0), scene()).start()
+
+
+def test_an_address_of_another_machine_is_named() -> None:
+    config = FrontConfig(host="127.0.0.1x", control_port=0, state_port=0, curve_secret_file="/nonexistent")
+    with pytest.raises(FrontError, match="folder with the public keys"):
+        FrontProcess(config, scene()).start()
+
+
+def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
+    process.start()
+    (folder,) = tmp_path.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    pid = process.pid
+    process.close()
+    process.close()
+    assert gone(pid)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clients_are_told_when_the_session_is_closed(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    session.process.close()
+    assert client.socket.poll(5000)
+    client.receive()
+    assert [f.code for f in client.got(ProtocolFault)] == ["session_ended"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_it_cleanly(session: FrontSession, number: signal.Signals) -> None:
+    client = session.client()
+    client.join()
+    os.kill(session.process.pid, number)
+    wait(lambda: not session.process.alive, "end of the front")
+    client.receive()
+    assert client.got(ProtocolFault)[-1].code == "session_ended"
+
+
+def test_a_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(session: FrontSession) -> None:
+    client = session.client()
+    token = client.join().resume_token
+    session.once()
+    ports = session.process.link.ports
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    session.process.restart()
+    session.pump(lambda: session.process.link.ports is not None, "new front")
+    assert session.process.link.ports == ports
+    assert session.process.restarts == 1
+    session.wait_entries(FrontRestarted)
+    client.send(Heartbeat())
+    session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault from the new front")
+    welcome = client.join(resume_token=token)
+    assert welcome.resumed
+    assert welcome.participant_id == "p1"
+    assert welcome.connection_epoch == 2
+
+
+def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:
+    import numpy as np
+
+    poses = np.zeros((3, 7))
+    client = session.client()
+    client.join()
+    for _ in range(50):
+        session.send_state(poses)
+        session.once()
+    client.send(_get_snapshot())
+    before = client.wait_for(Snapshot).state_seq
+    assert before == 50
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    session.process.restart()
+    session.pump(lambda: session.process.link.ports is not None, "new front")
+    session.send_state(poses)
+    client.join()
+    client.send(_get_snapshot())
+    assert client.wait_for(Snapshot, 2).state_seq > before
+
+
+def _get_snapshot() -> object:
+    from iris_session.protocol.client_messages import GetSnapshot
+
+    return GetSnapshot(1)
+
+
+def test_a_session_that_stands_still_is_reported_once_and_again_when_it_recovers(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    assert client.socket.poll(5000), "no word about the stall"
+    client.receive()
+    assert [f.code for f in client.got(ProtocolFault)] == ["stalled"]
+    assert client.socket.poll(300) == 0
+    session.pump(lambda: len(client.got(ProtocolFault)) == 2, "recovery")
+    assert client.got(ProtocolFault)[-1].code == "recovered"
+
+
+PARENT = """
+import sys, time
+from iris_session.transport import FrontConfig, FrontProcess
+from iris_session.protocol.steps import Admitted, Decision
+from iris_session.protocol.entries import Join
+from tests.transport.harness import scene
+process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
+print(process.start().control, process.pid, flush=True)
+while True:
+    joins = [e for e in process.link.poll() if isinstance(e.message, Join)]
+    admitted = tuple(Admitted(e.connection, "p1", "operator", False) for e in joins)
+    process.link.send_decision(0, Decision((), admitted=admitted))
+    time.sleep(0.002)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_front_does_not_outlive_its_parent(number: signal.Signals) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    port, pid = map(int, parent.stdout.readline().split())
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    client = context.socket(zmq.DEALER)
+    client.linger = 0
+    client.connect(f"tcp://127.0.0.1:{port}")
+    client.send(encode_client(envelope(Hello("operator", "Ann", secret=b"s" * 16))))
+    assert client.poll(5000)
+    client.recv()
+    parent.send_signal(number)
+    parent.wait()
+    parent.stdout.close()
+    wait(lambda: gone(pid), "end of the front")
+    messages = []
+    while client.poll(100):
+        messages.append(decode_server(client.recv()).message)
+    assert [m.code for m in messages if isinstance(m, ProtocolFault)][-1] == "session_ended"
+    context.destroy(linger=0)
+
+
+def test_curve_lets_in_listed_keys_only_and_names_clients_by_key(open_session: OpenSession, tmp_path: Path) -> None:
+    keys = tmp_path / "clients"
+    keys.mkdir()
+    server_public, _ = _certificate(tmp_path, "server")
+    ann = _certificate(keys, "ann")
+    eve = _certificate(tmp_path, "eve")
+    session = open_session(curve_secret_file=str(tmp_path / "server.key_secret"), curve_clients_dir=str(keys))
+    assert session.ports.key_fingerprint
+    allowed = session.client(curve=(server_public, *ann))
+    again = session.client(curve=(server_public, *ann))
+    allowed.send(Hello("operator", "Ann"))  # no secret: the key is the identity
+    again.send(Hello("operator", "Ann"))
+    first, second = (e.message for e in session.wait_entries(Join, 2))
+    assert isinstance(first, Join)
+    assert isinstance(second, Join)
+    assert first.key_id == second.key_id
+    unknown = session.client(curve=(server_public, *eve))
+    unknown.send(Hello("operator", "Eve"))
+    assert session.wait_drops("unknown_key") >= 1
+    (keys / "eve.key").write_bytes((tmp_path / "eve.key").read_bytes())
+    late = session.client(curve=(server_public, *eve))
+    late.send(Hello("operator", "Eve"))
+    session.wait_entries(Join, 3)
+    plain = session.client()
+    plain.send(Hello("operator", "Mallory", secret=b"s" * 16))
+    late.send(Heartbeat(), epoch=3)
+    session.wait_entries(Heartbeat)
+    assert len(session.wait_entries(Join)) <= 4
+    assert "Mallory" not in {e.message.name for e in session.wait_entries(Join) if isinstance(e.message, Join)}
+
+
+def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
+    import zmq.auth
+
+    zmq.auth.create_certificates(folder, name)
+    public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
+    assert secret is not None
+    (folder / f"{name}.key").exists()
+    return public, secret
