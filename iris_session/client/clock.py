@@ -1,7 +1,8 @@
 """Estimate of session time from four-timestamp exchanges. Pure: the caller passes its own monotonic clock in.
 
 Each exchange gives an offset `((t1 - t0) + (t2 - t3)) / 2` whose error is at most half its round trip, whatever the
-path's asymmetry. The estimate is the median offset of the quickest quarter of a window. After the first exchange it is
+path's asymmetry, and drift since. The estimate is the median offset of the quickest quarter of a window, kept within
+the intersection of those intervals (Marzullo), which is also the stated error bound. After the first exchange it is
 slewed and never stepped, so that session time read from it never runs backwards.
 """
 
@@ -45,7 +46,8 @@ class ClockSync:
         self._offset = 0
         self._offset_at = 0
         self._rtt = 0
-        self._best_at = 0
+        self._low = 0
+        self._high = 0
         self._next_ping = 0
         self._sent = 0
 
@@ -88,9 +90,9 @@ class ClockSync:
         fresh = [e for e in self._window if t3_ns - e.at_ns <= MAX_AGE_NS]
         fresh.sort(key=lambda e: e.rtt_ns)
         quickest = fresh[: max(1, len(fresh) // 4)]
-        self._target = int(median(e.offset_ns for e in quickest))
+        self._low, self._high = _intersection(fresh, t3_ns)
+        self._target = max(self._low, min(self._high, int(median(e.offset_ns for e in quickest))))
         self._rtt = quickest[0].rtt_ns
-        self._best_at = quickest[0].at_ns
         self._offset, self._offset_at = now_offset, t3_ns
 
     def session_ns(self, local_ns: int) -> int:
@@ -102,10 +104,20 @@ class ClockSync:
         return session_ns - self._target
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Bound of the error of `session_ns(local_ns)`: half the round trip, drift since, and slew still to do."""
-        drift = int(DRIFT * abs(local_ns - self._best_at))
-        return self._rtt // 2 + drift + abs(self._target - self._slewed(local_ns))
+        """Bound of the error of `session_ns(local_ns)`: round trips, drift, and slew still to do."""
+        offset = self._slewed(local_ns)
+        return max(self._high - offset, offset - self._low) + int(DRIFT * abs(local_ns - self._offset_at))
 
     def _slewed(self, local_ns: int) -> int:
         room = int(SLEW * max(0, local_ns - self._offset_at))
         return self._offset + max(-room, min(room, self._target - self._offset))
+
+
+def _intersection(exchanges: list[Exchange], now_ns: int) -> tuple[int, int]:
+    """Offsets (lowest, highest) that agree with the exchanges, quickest first; one that contradicts is left out."""
+    low, high = -(2**63), 2**63
+    for exchange in exchanges:
+        reach = exchange.rtt_ns // 2 + int(DRIFT * (now_ns - exchange.at_ns)) + 1
+        if exchange.offset_ns - reach <= high and exchange.offset_ns + reach >= low:
+            low, high = max(low, exchange.offset_ns - reach), min(high, exchange.offset_ns + reach)
+    return low, high

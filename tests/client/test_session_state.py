@@ -1,0 +1,149 @@
+"""Mirror of the session: snapshot plus events in any delivery give what the session has."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.client import SessionMirror
+from iris_session.protocol.common import IDENTITY, Alignment, Lease
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    BodyInfo,
+    EpisodeChanged,
+    EStopChanged,
+    Event,
+    EventKind,
+    LeaseChanged,
+    Notice,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PauseChanged,
+    SceneChanged,
+    Snapshot,
+)
+
+BODIES = (BodyInfo(0, "world", False), BodyInfo(3, "hammer", True, True))
+
+names = st.sampled_from(["p1", "p2", "p3", "p4"])
+flags = st.booleans()
+counts = st.integers(1, 9)
+bodies = st.one_of(
+    st.builds(lambda p, w: ParticipantJoined(ParticipantInfo(p, "ann", "operator", True, worn=w)), names, flags),
+    st.builds(lambda p: ParticipantChanged(ParticipantInfo(p, "bob", "observer", True)), names),
+    st.builds(ParticipantLeft, names, st.just("silent"), flags),
+    st.builds(lambda p, v: LeaseChanged(Lease("left", "robot", "exclusive", p, v), "acquired"), names, counts),
+    st.builds(lambda p, v: AlignmentChanged(p, Alignment(v, "measured", IDENTITY)), names, counts),
+    st.builds(SceneChanged, counts, counts, st.just("reset")),
+    st.builds(EStopChanged, flags, names),
+    st.builds(PauseChanged, flags),
+    st.builds(EpisodeChanged, counts, st.sampled_from(["running", "success"])),
+    st.just(Notice("info", "hello")),
+)
+
+
+def event(seq: int, body: EventKind) -> Event:
+    return Event(seq, seq, 0, body)
+
+
+def snapshot(mirror: SessionMirror | None = None) -> Snapshot:
+    """What the session would send now, if `mirror` is what the session has."""
+    if mirror is None:
+        return Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES)
+    return Snapshot(
+        0, mirror.event_seq, mirror.scene_epoch, mirror.scene_revision, mirror.scene_hash, 0, 0.0, 0,
+        tuple(mirror.participants.values()), tuple(mirror.leases.values()), tuple(mirror.robots.values()),
+        mirror.bodies, mirror.paused, mirror.estop, mirror.episode,
+    )  # fmt: skip
+
+
+def synced() -> SessionMirror:
+    mirror = SessionMirror()
+    mirror.apply_snapshot(snapshot())
+    return mirror
+
+
+@given(st.lists(bodies, max_size=30), st.data())
+@settings(max_examples=150, deadline=None)
+def test_any_joining_moment_and_any_loss_end_in_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
+    events = [event(i + 1, kind) for i, kind in enumerate(kinds)]
+    truth = synced()
+    joined_at = data.draw(st.integers(0, len(events)))
+    lost = data.draw(st.sets(st.integers(0, max(0, len(events) - 1))))
+    late, lossy = SessionMirror(), synced()
+    for i, one in enumerate(events):
+        if i == joined_at:
+            late.apply_snapshot(snapshot(truth))
+        truth.apply_event(one)
+        late.apply_event(one)
+        late.apply_event(one)  # repeated
+        if i not in lost:
+            lossy.apply_event(one)
+    if not late.synced:
+        late.apply_snapshot(snapshot(truth))
+    if not lossy.synced or lossy.event_seq != truth.event_seq:
+        lossy.apply_snapshot(snapshot(truth))
+    assert late.mirror_hash() == truth.mirror_hash()
+    assert lossy.mirror_hash() == truth.mirror_hash()
+
+
+def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None:
+    mirror, truth = synced(), synced()
+    events = [event(i, EStopChanged(i % 2 == 1, f"p{i}")) for i in range(1, 6)]
+    mirror.apply_event(events[0])
+    assert not mirror.apply_event(events[2])
+    assert not mirror.synced
+    assert mirror.gaps == 1
+    mirror.apply_event(events[3])
+    for one in events[:3]:
+        truth.apply_event(one)
+    assert [e.event_seq for e in mirror.apply_snapshot(snapshot(truth))] == [4]
+    assert mirror.synced
+    assert mirror.event_seq == 4
+    assert mirror.discarded == 1  # event 3 was in the snapshot
+
+
+def test_an_older_snapshot_is_discarded() -> None:
+    mirror = synced()
+    old = snapshot(mirror)
+    mirror.apply_event(event(1, EStopChanged(True, "p1")))
+    assert mirror.apply_snapshot(old) == []
+    assert mirror.estop
+    assert mirror.discarded == 1
+
+
+def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
+    mirror = synced()
+    mirror.apply_event(event(1, SceneChanged(2, 0, "reset")))
+    assert mirror.synced
+    mirror.apply_event(event(2, SceneChanged(3, 0, "new_scene")))
+    assert not mirror.synced
+    assert mirror.scene_epoch == 3
+
+
+def test_hash_tells_different_states_apart_and_ignores_order() -> None:
+    a, b = synced(), synced()
+    for mirror, order in ((a, ("p1", "p2")), (b, ("p2", "p1"))):
+        for i, name in enumerate(order):
+            mirror.apply_event(event(i + 1, ParticipantJoined(ParticipantInfo(name, name, "operator", True))))
+    assert a.mirror_hash() == b.mirror_hash()
+    b.apply_event(event(3, EStopChanged(True, "p1")))
+    a.apply_event(event(3, EStopChanged(False, "p1")))
+    assert a.mirror_hash() != b.mirror_hash()
+
+
+def test_lease_version_is_only_for_its_holders() -> None:
+    mirror = synced()
+    shared = Lease("left", "robot", "shared", "p1", 7, sub_holders=("p1", "p2"), weights=(0.5, 0.5))
+    mirror.apply_event(event(1, LeaseChanged(shared, "acquired")))
+    assert [mirror.lease_version("left", p) for p in ("p1", "p2", "p3")] == [7, 7, None]
+    assert mirror.lease_version("right", "p1") is None
+
+
+def test_held_events_are_bounded() -> None:
+    mirror = SessionMirror()
+    for i in range(1000):
+        mirror.apply_event(event(i + 1, Notice("info", "x")))
+    assert mirror.held_overflow == 1000 - 256
