@@ -20,12 +20,12 @@ class Grippers:
         fitted = [(i, r) for i, r in enumerate(robots) if r.gripper_actuator]
         self._row = {i: k for k, (i, _) in enumerate(fitted)}
         self._open = [r.gripper_open for _, r in fitted]
-        self._stroke = [r.gripper_closed - r.gripper_open for _, r in fitted]
+        self._closed = [r.gripper_closed for _, r in fitted]
         self._actuators = np.array(
             [named_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, r.gripper_actuator, "actuator") for _, r in fitted],
             dtype=np.intp,
         )
-        self._step = np.abs(np.array(self._stroke)) * (config.gripper_speed * dt)
+        self._step = np.abs(np.subtract(self._closed, self._open)) * (config.gripper_speed * dt)
         self.ctrl = np.zeros(len(fitted))
         self.goal = np.zeros(len(fitted))
 
@@ -38,7 +38,8 @@ class Grippers:
         """Closing share 0 (open) to 1 (closed); `None` leaves the goal as it is."""
         row = self._row.get(robot)
         if row is not None and closed is not None and math.isfinite(closed):
-            self.goal[row] = self._open[row] + min(max(closed, 0.0), 1.0) * self._stroke[row]
+            share = min(max(closed, 0.0), 1.0)
+            self.goal[row] = (1.0 - share) * self._open[row] + share * self._closed[row]
 
     def stop(self, robot: int) -> None:
         """Stays at the present `ctrl`."""

@@ -1,0 +1,108 @@
+"""Joint motion never exceeds its limits, never passes its goal, arrives in time and stops exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.control import ControlConfig, ControlError
+from iris_session.control.arm_model import ArmModel
+from iris_session.control.interpolate import JointInterpolator, speed_limits
+from tests.control.rigs import iiwa_model, iiwa_spec
+
+DT = 0.002
+ALL = slice(0, 3)
+
+
+def make(velocity: float = 2.0, acceleration: float = 30.0) -> JointInterpolator:
+    joints = JointInterpolator(np.full(3, velocity), np.full(3, acceleration), DT)
+    joints.place(np.zeros(3))
+    return joints
+
+
+goals = st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 3), min_size=1, max_size=12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(goals, st.integers(1, 12), st.floats(0.3, 4.0), st.floats(2.0, 60.0), st.booleans())
+def test_limits_hold_for_any_goals(
+    sequence: list[tuple[float, ...]], every: int, velocity: float, acceleration: float, stop: bool
+) -> None:
+    joints = make(velocity, acceleration)
+    q, v = joints.q.copy(), joints.v.copy()
+
+    def tick() -> None:
+        nonlocal q, v
+        joints.advance()
+        now = (joints.q - q) / DT
+        assert (np.abs(now) <= velocity + 1e-6).all()
+        assert (np.abs(now - v) <= acceleration * DT + 1e-6).all()
+        q, v = joints.q.copy(), now
+
+    for goal in sequence:
+        joints.aim(ALL, np.array(goal), every * DT)
+        for _ in range(every):
+            tick()
+    if stop:
+        # The stop is the shortest one, or the goal when that is nearer and ahead.
+        shortest = q + np.sign(joints.v) * (joints.v**2 / (2 * acceleration) + np.abs(joints.v) * DT / 2)
+        joints.stop(ALL)
+        assert (np.abs(joints.goal - q) <= np.abs(shortest - q) + 1e-12).all()
+    for _ in range(20000):
+        if not joints.moving:
+            break
+        side = np.sign(joints.goal - joints.q)
+        slow = np.abs(joints.v) <= np.sqrt(2 * acceleration * np.abs(joints.goal - joints.q))
+        tick()
+        passed = (np.sign(joints.goal - joints.q) * side < 0) & slow & (np.abs(joints.goal - joints.q) > 1e-9)
+        assert not passed.any()
+    assert not joints.moving
+    assert (joints.q == joints.goal).all()
+    assert (joints.v == 0.0).all()
+
+
+def test_regular_goals_give_even_motion() -> None:
+    joints, speeds = make(acceleration=60.0), []
+    for sample in range(1, 80):
+        joints.aim(ALL, np.full(3, 0.8 * sample * 7 * DT), 7 * DT)
+        for _ in range(7):
+            joints.advance()
+            speeds.append(joints.v[0])
+    settled = np.array(speeds[200:])
+    assert abs(settled.mean() - 0.8) < 0.01
+    assert settled.std() < 0.04
+
+
+def test_at_rest_nothing_changes() -> None:
+    joints = make()
+    joints.aim(ALL, np.full(3, 0.01), 0.014)
+    while joints.moving:
+        joints.advance()
+    before = joints.state()
+    joints.advance()
+    assert joints.state() == before
+
+
+def test_a_stop_while_standing_or_moving_away_stays_near() -> None:
+    joints = make()
+    joints.aim(ALL, np.array([0.5, 0.5, 0.0]), 0.014)
+    for _ in range(10):
+        joints.advance()
+    joints.aim(ALL, np.array([0.5, -0.5, 0.3]), 0.014)  # 0 goes on, 1 must turn round, 2 stands still
+    q, v = joints.q.copy(), joints.v.copy()
+    joints.stop(ALL)
+    assert joints.goal[2] == q[2]
+    assert q[1] < joints.goal[1] < q[1] + v[1] ** 2 / 60 + v[1] * DT
+    assert q[0] < joints.goal[0] < 0.5
+
+
+def test_speed_limits_by_name_and_by_kind() -> None:
+    model, robot = iiwa_model(), iiwa_spec()
+    config = ControlConfig(velocity_limits={"joint2": 0.7}, acceleration_limits={"joint7": 9.0})
+    velocity, acceleration = speed_limits(model, [robot], [ArmModel(model, robot)], config)
+    assert velocity.tolist() == [2.5, 0.7, 2.5, 2.5, 2.5, 2.5, 2.5]
+    assert acceleration.tolist() == [40.0] * 6 + [9.0]
+    with pytest.raises(ControlError, match=r"limit of joint 'elbow': no robot has it. Available joints: joint1"):
+        speed_limits(model, [robot], [ArmModel(model, robot)], ControlConfig(velocity_limits={"elbow": 1.0}))
