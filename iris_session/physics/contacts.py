@@ -61,6 +61,8 @@ class ContactTables:
         self._partner_names = (*names, *flex_names)
         self._robot_names = tuple(spec.name for spec in robots)
         self._object_names = tuple(spec.name for spec in objects)
+        self._last_keys = b""
+        self._last_contacts: tuple[ObjectContact, ...] = ()
         self.has_fingers = bool((geom_finger_robot >= 0).any())
 
     def object_contacts(self, data: Any) -> tuple[ObjectContact, ...]:
@@ -75,8 +77,16 @@ class ContactTables:
             partners = np.where(geom < 0, self._flex_first + contact.flex, partners)
         active = contact.dist < contact.includemargin
         keys = np.where(objects >= 0, objects * self._n_partners + partners[:, ::-1], _NONE)[active]
+        # The same pairs as at the last call, as for most ticks, have the same answer.
+        fingerprint = keys.tobytes()
+        if fingerprint != self._last_keys:
+            self._last_keys = fingerprint
+            self._last_contacts = self._group(sorted(set(keys.ravel().tolist()) - {_NONE}))
+        return self._last_contacts
+
+    def _group(self, pairs: list[int]) -> tuple[ObjectContact, ...]:
+        """One `ObjectContact` per object from sorted pairs `object * n_partners + partner`."""
         found: list[ObjectContact] = []
-        pairs = sorted(set(keys.ravel().tolist()) - {_NONE})
         start = 0
         while start < len(pairs):
             index = pairs[start] // self._n_partners

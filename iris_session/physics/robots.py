@@ -121,6 +121,9 @@ def _spec(tree: Tree, arm: _Arm, name: str, arms: list[_Arm]) -> RobotSpec:
     site = _choose_site(tree, arm)
     actuators = _choose_actuators(tree, arm)
     gripper = find_gripper(tree, arm.link, arm.fingers, site) if arm.fingers else None
+    base = _base(tree, arm, arms)
+    if not base:
+        arm.problems.append(f"body {tree.joint_body[arm.joints[0]]} needs a name of 1 to 64 characters in the model")
     gripper_actuator, opened, closed = "", 0.0, 0.0
     if gripper:
         problem = describe(tree, gripper)
@@ -137,7 +140,7 @@ def _spec(tree: Tree, arm: _Arm, name: str, arms: list[_Arm]) -> RobotSpec:
         joints=tuple(_named(tree, arm, "joint", j) for j in arm.joints),
         actuators=actuators,
         site=element_name(model, "site", site) if site is not None else "",
-        base_body=_base(tree, arm, arms),
+        base_body=base,
         gripper_actuator=gripper_actuator,
         gripper_open=opened,
         gripper_closed=closed,
@@ -205,8 +208,6 @@ def _base(tree: Tree, arm: _Arm, arms: list[_Arm]) -> str:
     others = {tree.joint_body[a.joints[0]] for a in arms if a is not arm}
     names = [element_name(tree.model, "body", b) for b in path]
     free = [n for b, n in zip(path, names, strict=True) if wire_name(n) and not others.intersection(tree.subtree(b))]
-    if not free:
-        arm.problems.append(f"the body of its first joint {path[0]} needs a name of 1 to 64 characters in the model")
     return free[-1] if free else ""
 
 
@@ -218,9 +219,9 @@ def _robot_names(tree: Tree, arms: list[_Arm]) -> list[str]:
     names: list[str] = []
     for arm in arms:
         stem = _prefix([element_name(tree.model, "joint", j) for j in arm.joints])
-        base = _base(tree, _Arm(arm.joints, []), arms)
-        if not stem and base.lower() not in _GENERIC_BASES:
-            stem = _prefix([base, base]) or base
+        folder, _, base = _base(tree, arm, arms).rpartition("/")
+        if not stem:
+            stem = folder or ("" if base.lower() in _GENERIC_BASES else base)
         if not stem and len(arms) == 1:
             stem = _model_name(tree.model)
         stem = (stem or "robot")[:60]

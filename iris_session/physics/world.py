@@ -24,6 +24,7 @@ from iris_session.physics.errors import (
     NotOwnerError,
     SimulationDivergedError,
     SnapshotError,
+    one_line,
 )
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.physics.names import body_names, element_id, element_names
@@ -138,13 +139,16 @@ class World:
         if self.user_owned or self.diverged:
             self._require_owner(user=False)
             raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
-        if self._split:
-            mujoco.mj_step2(model, data)
-        else:
-            mujoco.mj_step(model, data)
-        # Contact forces exist only until mj_step1 rebuilds the constraints.
-        self._forces = self._tables.gripper_forces(model, data)
-        mujoco.mj_step1(model, data)
+        try:
+            if self._split:
+                mujoco.mj_step2(model, data)
+            else:
+                mujoco.mj_step(model, data)
+            # Contact forces exist only until mj_step1 rebuilds the constraints.
+            self._forces = self._tables.gripper_forces(model, data)
+            mujoco.mj_step1(model, data)
+        except mujoco.FatalError as error:  # out of memory in the middle of a step
+            self.diverged = one_line(error)
         self._set_tick(self._tick + 1)
         self._check(data)
 
@@ -261,11 +265,11 @@ class World:
         self._view.advance(tick, self._forces)
 
     def _check(self, data: Any) -> None:
-        """Raises when MuJoCo met bad numbers in this tick. It resets `data` by itself then, warnings aside."""
+        """Raises when MuJoCo gave up or met bad numbers in this tick. For those it has reset `data` itself."""
         counts = data.warning.number.tolist()
         found = [text for index, text in _BAD if counts[index]]
-        if found:
-            self.diverged = "; ".join(found)
+        if found or self.diverged:
+            self.diverged = self.diverged or "; ".join(found)
             raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
 
     def _require_owner(self, *, user: bool) -> None:

@@ -1,0 +1,53 @@
+"""Files and bytes to models: every failure is one line that says what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model, model_bytes, model_from_bytes
+from tests.physics.models import clutter
+
+XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+
+
+def test_xml_and_mjb_give_the_same_model(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(XML)
+    m = load_model(tmp_path / "scene.xml")
+    (tmp_path / "scene.mjb").write_bytes(model_bytes(m))
+    again = load_model(str(tmp_path / "scene.mjb"))
+    assert again.nq == 7
+    assert model_bytes(again) == model_bytes(m)
+
+
+def test_bytes_round_trip(aloha: mujoco.MjModel) -> None:
+    for m in (clutter(), aloha):
+        again = model_from_bytes(model_bytes(m))
+        assert (again.nq, again.nu, again.ngeom) == (m.nq, m.nu, m.ngeom)
+        assert (again.geom_pos == m.geom_pos).all()
+        assert bytes(again.names) == bytes(m.names)
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "good.xml").write_text(XML)
+    (tmp_path / "bad.xml").write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    (tmp_path / "broken.xml").write_text("<mujoco>")
+    (tmp_path / "robot.stl").write_bytes(b"solid")
+    (tmp_path / "bad.mjb").write_bytes(b"no model at all")
+    cases = [
+        ("gone.xml", ModelNotFoundError, "does not exist; its folder has bad.mjb, bad.xml, broken.xml, good.xml"),
+        ("no/where.xml", ModelNotFoundError, "neither does its folder"),
+        ("robot.stl", ModelNotFoundError, "must end in one of .xml, .mjcf, .urdf, .mjb"),
+        ("bad.xml", ModelInvalidError, "bad.xml: Error: mass and inertia"),
+        ("broken.xml", ModelInvalidError, "broken.xml: "),
+        ("bad.mjb", ModelInvalidError, "bad.mjb: "),
+    ]
+    for name, kind, text in cases:
+        with pytest.raises(kind) as caught:
+            load_model(tmp_path / name)
+        assert text in str(caught.value)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ModelInvalidError, match="these 4 bytes are no model of MuJoCo"):
+        model_from_bytes(b"nope")

@@ -1,0 +1,186 @@
+"""Robots found in real models and in every shape of arm and gripper that decides a rule."""
+
+from __future__ import annotations
+
+import mujoco
+import pytest
+
+from iris_session.physics import AmbiguousModelError, find_robots, load_robots_toml
+from iris_session.protocol.specs import RobotSpec
+from tests.physics.models import FINGERS, GRIPPER_TENDON, arm, model, scene
+
+VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+
+
+def test_aloha(aloha: mujoco.MjModel) -> None:
+    assert find_robots(aloha) == tuple(
+        RobotSpec(
+            name=side,
+            joints=tuple(f"{side}/{j}" for j in VIPERX),
+            actuators=tuple(f"{side}/{j}" for j in VIPERX),
+            site=f"{side}/gripper",
+            base_body=f"{side}/base_link",
+            gripper_actuator=f"{side}/gripper",
+            gripper_open=0.037,
+            gripper_closed=0.002,
+            finger_bodies=(f"{side}/left_finger_link", f"{side}/right_finger_link"),
+        )
+        for side in ("left", "right")
+    )
+
+
+def test_iiwa(iiwa: mujoco.MjModel) -> None:
+    assert find_robots(iiwa) == (
+        RobotSpec(
+            name="iiwa14",
+            joints=tuple(f"joint{i}" for i in range(1, 8)),
+            actuators=tuple(f"actuator{i}" for i in range(1, 8)),
+            site="attachment_site",
+            base_body="base",
+        ),
+    )
+
+
+def test_handover(handover: mujoco.MjModel) -> None:
+    left, right = find_robots(handover)
+    assert (left.name, right.name) == ("left", "right")
+    assert left.joints == tuple(f"left/joint{i}" for i in range(1, 8))
+    assert left.site == "left/tcp"
+    assert left.gripper_actuator == "left/gripper"
+    assert left.finger_bodies == ("left/finger_left", "left/finger_right")
+    assert left.gripper_open > left.gripper_closed
+
+
+def test_a_scene_without_robots() -> None:
+    assert find_robots(model("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")) == ()
+    assert find_robots(scene(*arm("door", joints=2))) == ()
+
+
+def test_gripper_on_a_tendon_where_larger_ctrl_closes() -> None:
+    body, actuators = arm(joints=5, end=FINGERS)
+    closing = '<general name="grip" tendon="split" gear="-1" ctrlrange="0 255"/>'
+    (robot,) = find_robots(scene(body, actuators + closing, GRIPPER_TENDON, name="pandalike scene"))
+    assert robot.name == "pandalike"
+    assert robot.site == "pinch"
+    assert (robot.gripper_actuator, robot.gripper_open, robot.gripper_closed) == ("grip", 0.0, 255.0)
+    assert robot.finger_bodies == ("left_pad", "right_pad")
+
+
+@pytest.mark.parametrize(("slope", "axis", "opened"), [(1, "0 -1 0", 0.04), (-1, "0 1 0", 0.04), (1, "0 1 0", None)])
+def test_gripper_with_a_coupled_finger(slope: int, axis: str, opened: float | None) -> None:
+    """One finger is driven, the other follows by an equality; moving in parallel neither opens nor closes."""
+    fingers = FINGERS.replace('axis="0 -1 0" range="0 .04"', f'axis="{axis}" range="{min(0, slope) * 0.04} .04"')
+    body, actuators = arm("a", end=fingers)
+    equality = f'<equality><joint joint1="a/finger_r" joint2="a/finger_l" polycoef="0 {slope} 0 0 0"/></equality>'
+    grip = '<position name="a/grip" joint="a/finger_l" ctrlrange="0 .04"/>'
+    if opened is None:
+        with pytest.raises(AmbiguousModelError, match="which end of gripper actuator 'a/grip' is open"):
+            find_robots(scene(body, actuators + grip, equality.replace("0 1 0 0 0", "0 1 0 0 0")))
+        return
+    (robot,) = find_robots(scene(body, actuators + grip, equality))
+    assert (robot.gripper_open, robot.gripper_closed) == (opened, 0.0)
+
+
+def test_a_jaw_at_the_end_of_the_chain_belongs_to_the_gripper() -> None:
+    jaw = """<site name="{p}grasp" pos="0 0 .1"/><body name="{p}moving" pos=".02 0 0">
+      <joint name="{p}jaw" axis="0 1 0" range="0 1"/><geom type="box" size=".005 .01 .05" pos="0 0 .05"/></body>"""
+    body, actuators = arm("so", joints=5, end=jaw)
+    jaw_actuator = '<position name="so/jaw" joint="so/jaw" ctrlrange="0 1"/>'
+    (robot,) = find_robots(scene(body, actuators + jaw_actuator))
+    assert len(robot.joints) == 5
+    assert (robot.gripper_actuator, robot.gripper_open, robot.gripper_closed) == ("so/jaw", 1.0, 0.0)
+    assert robot.finger_bodies == ("so/moving",)
+    # The same without a telling name: the site on the link before decides.
+    (robot,) = find_robots(scene(body.replace("so/jaw", "so/j9"), actuators + jaw_actuator.replace("so/jaw", "so/j9")))
+    assert (len(robot.joints), robot.gripper_actuator) == (5, "so/j9")
+
+
+def test_a_torso_with_two_arms_and_two_separate_arms() -> None:
+    left, right = arm("l"), arm("r", actuator="motor")
+    torso = f"""<body name="torso"><joint name="yaw" axis="0 0 1"/><geom size=".1"/>{left[0]}{right[0]}</body>"""
+    robots = find_robots(scene(torso, '<position name="yaw" joint="yaw"/>' + left[1] + right[1]))
+    assert [(r.name, r.base_body, len(r.joints)) for r in robots] == [("l", "l/base", 4), ("r", "r/base", 4)]
+    robots = find_robots(scene(left[0] + right[0], left[1] + right[1]))
+    assert [r.name for r in robots] == ["l", "r"]
+
+
+def test_a_mobile_base_is_part_of_its_arm_and_a_camera_is_not() -> None:
+    body, actuators = arm("arm")
+    camera = '<body name="cam"><joint name="pan" axis="0 0 1"/><geom size=".02"/></body>'
+    cart = f"""<body name="cart"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+      <geom size=".1"/>{camera}{body}</body>"""
+    drive = "".join(f'<velocity name="{j}" joint="{j}" kv="10"/>' for j in ("x", "y", "pan"))
+    (robot,) = find_robots(scene(cart, drive + actuators))
+    assert robot.joints == ("x", "y", "arm/j0", "arm/j1", "arm/j2", "arm/j3")
+    assert robot.base_body == "cart"
+    assert robot.name == "cart"
+
+
+def test_names_without_a_prefix() -> None:
+    body, actuators = arm(joint_name="spin{i}")
+    (robot,) = find_robots(scene(body, actuators, name="thing"))
+    assert robot.name == "thing"
+    named = scene(body.replace('"base"', '"crane"'), actuators, name="thing")
+    assert [r.name for r in find_robots(named)] == ["crane"]
+    twins = "".join(
+        arm(f"t{i}", joint_name=f"{'ab'[i]}{{i}}")[0].replace(f'"t{i}/base"', f'"m{i}/base"') for i in range(2)
+    )
+    acts = "".join(arm(f"t{i}", joint_name=f"{'ab'[i]}{{i}}")[1] for i in range(2))
+    assert [r.name for r in find_robots(scene(twins, acts))] == ["m0", "m1"]
+    assert [r.name for r in find_robots(scene(twins.replace("m0/base", "base"), acts))] == ["robot", "m1"]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "extra", "text"),
+    [
+        ({"end": ""}, "", "no end-effector site on its last link 'a/link3'"),
+        ({"end": '<site name="p1"/><site name="p2"/>'}, "", r"2 sites on its last link .* \(p1, p2\)"),
+        ({"end": '<site name="tcp"/><site name="b/tcp"/>'}, "", r"\(tcp, b/tcp\)"),
+        ({}, '<velocity name="twice" joint="a/j1"/>', r"joint 'a/j1' has 2 actuators \(a/a1, twice\)"),
+        ({"end": FINGERS}, "", ""),
+        (
+            {"end": FINGERS},
+            '<position name="f1" joint="a/finger_l"/><position name="f2" joint="a/finger_r"/>',
+            r"2 actuators move its gripper \(f1, f2\)",
+        ),
+        ({"end": FINGERS}, '<motor name="f1" joint="a/finger_l"/>', "gripper actuator 'f1' has no ctrlrange"),
+        ({"end": FINGERS}, '<position joint="a/finger_l" ctrlrange="0 .04"/>', "actuator 4 needs a name"),
+    ],
+)
+def test_what_is_ambiguous_is_one_line_and_a_file_to_edit(kwargs: dict[str, str], extra: str, text: str) -> None:
+    body, actuators = arm("a", **kwargs)  # type: ignore[arg-type]
+    m = scene(body, actuators + extra)
+    if not text:
+        assert find_robots(m)[0].gripper_actuator == ""
+        return
+    with pytest.raises(AmbiguousModelError, match=text) as caught:
+        find_robots(m)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("robot 'a': ")
+    assert '[[robot]]\nname = "a"\njoints = ["a/j0", "a/j1", "a/j2", "a/j3"]' in caught.value.toml
+
+
+def test_the_file_in_the_error_works_once_completed() -> None:
+    body, actuators = arm("a", end='<site name="p1"/><site name="p2"/>')
+    m = scene(body, actuators)
+    with pytest.raises(AmbiguousModelError) as caught:
+        find_robots(m)
+    assert "# choose one of: p1, p2" in caught.value.toml
+    (robot,) = load_robots_toml(caught.value.toml.replace('site = ""', 'site = "p2"'), m)
+    assert robot.site == "p2"
+    assert robot.base_body == "a/base"
+
+
+def test_a_hand_of_long_fingers_is_not_guessed() -> None:
+    fingers = "".join(arm(f"f{n}", joints=3, end="")[0] for n in range(2))
+    acts = "".join(arm(f"f{n}", joints=3, end="")[1] for n in range(2))
+    body, actuators = arm("a", end='<site name="tcp"/>' + fingers)
+    with pytest.raises(AmbiguousModelError, match="robot 'a': it ends in 2 chains of 3 or more actuated joints"):
+        find_robots(scene(body, actuators + acts))
+
+
+def test_unnamed_joints_are_refused() -> None:
+    body, actuators = arm("a")
+    unnamed = scene(body, actuators.replace('name="a/a2" ', ""))
+    with pytest.raises(AmbiguousModelError, match="actuator 2 needs a name of 1 to 64 characters"):
+        find_robots(unnamed)

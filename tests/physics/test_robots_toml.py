@@ -1,0 +1,119 @@
+"""The robots file: what it derives, and a one-line error that lists what would have been right for every mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from iris_session.physics import PhysicsError, RobotsFileError, dump_robots_toml, find_robots, load_robots_toml
+from tests.physics.models import arm, scene
+
+
+@pytest.mark.parametrize("name", ["aloha", "iiwa", "handover"])
+def test_what_was_found_is_read_back(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    m = request.getfixturevalue(name)
+    robots = find_robots(m)
+    text = dump_robots_toml(robots)
+    assert load_robots_toml(text, m) == robots
+    (tmp_path / "robots.toml").write_text(text)
+    assert load_robots_toml(tmp_path / "robots.toml", m) == load_robots_toml(str(tmp_path / "robots.toml"), m) == robots
+
+
+def test_three_keys_are_enough(iiwa: mujoco.MjModel) -> None:
+    joints = ", ".join(f'"joint{i}"' for i in range(1, 8))
+    text = f'[[robot]]\nname = "k"\njoints = [{joints}]\nsite = "attachment_site"\nhold = "gravity_pd"\n'
+    (robot,) = load_robots_toml(text, iiwa)
+    assert robot.actuators == tuple(f"actuator{i}" for i in range(1, 8))
+    assert robot.base_body == "link1"
+    assert robot.mode == "exclusive"
+    assert robot.hold == "gravity_pd"
+    assert load_robots_toml("\n", iiwa) == ()
+
+
+GOOD = {
+    "name": '"l"',
+    "joints": '["left/joint1", "left/joint2", "left/joint3", "left/joint4", "left/joint5", "left/joint6"]',
+    "site": '"left/tcp"',
+}
+GRIP = {"gripper_actuator": '"left/gripper"', "gripper_open": "0.04", "gripper_closed": "0"}
+ACTS = '["left/joint1", "left/joint2", "left/joint3", "left/joint4", "left/joint5", "left/joint6"]'
+MISTAKES = [
+    ({"joints": '["left_j1"]'}, "joint 'left_j1' does not exist in the model. Available joints: left/joint1, left/"),
+    ({"site": '"tip"'}, "site 'tip' does not exist in the model. Available sites: "),
+    ({"site": "7"}, "'site' must be a string, not 7"),
+    ({"joints": '"left/joint1"'}, "'joints' must be a list of strings"),
+    ({"gripper_open": '"wide"'}, "'gripper_open' must be a number"),
+    ({"gripper_open": "true"}, "'gripper_open' must be a number"),
+    ({"joint": "[]"}, "unknown key 'joint'. Available keys: name, joints, actuators"),
+    ({"site": '""'}, "'site' is missing or empty"),
+    ({"name": '"' + "x" * 65 + '"'}, "longer than 64 characters"),
+    ({"joints": '["left/joint1", "left/joint1"]'}, "joint 'left/joint1' is listed twice"),
+    ({"joints": '["left/finger_joint_left"]'}, "needs one named actuator, has none"),
+    ({"actuators": '["left/joint1"]'}, "6 joints but 1 actuators"),
+    ({"actuators": ACTS.replace("left/joint3", "left/joint7")}, "actuator 'left/joint7' does not drive joint"),
+    ({"actuators": ACTS.replace("left/joint3", "nope")}, "actuator 'nope' does not exist in the model. Available act"),
+    ({"base_body": '"table"'}, "base_body 'table' must carry all its joints and its site. Available bodies: left/"),
+    ({"base_body": '"tabel"'}, "body 'tabel' does not exist in the model. Available bodies: "),
+    ({"finger_bodies": '["left/thumb"]', **GRIP}, "body 'left/thumb' does not exist in the model. Available bodies"),
+    ({"finger_bodies": '["left/finger_left"]'}, "gripper values or finger bodies without a gripper_actuator"),
+    ({**GRIP, "gripper_open": "0"}, "gripper_open and gripper_closed are both 0.0"),
+    ({**GRIP, "gripper_open": "4"}, "gripper value 4.0 is outside the ctrlrange 0.0 to 0.04 of 'left/gripper'"),
+    ({**GRIP, "gripper_actuator": '"left/joint1"'}, "is also an actuator of the arm"),
+    ({**GRIP, "gripper_actuator": '"grip"'}, "actuator 'grip' does not exist"),
+    ({"mode": '"mine"'}, "mode 'mine' is none of exclusive, priority, request, shared, takeover"),
+    ({"hold": '"magic"'}, "hold 'magic' must be empty or 'gravity_pd'"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), MISTAKES)
+def test_every_mistake_says_what_would_have_been_right(
+    change: dict[str, str], text: str, handover: mujoco.MjModel
+) -> None:
+    toml = "[[robot]]\n" + "".join(f"{k} = {v}\n" for k, v in {**GOOD, **change}.items())
+    with pytest.raises(PhysicsError) as caught:
+        load_robots_toml(toml, handover)
+    assert text in str(caught.value)
+    assert str(caught.value).startswith("robots, robot 1")
+    assert "\n" not in str(caught.value)
+
+
+def test_two_robots_share_nothing(handover: mujoco.MjModel) -> None:
+    left, right = (dict(_dumped(spec)) for spec in find_robots(handover))
+    cases = [
+        ({"name": left["name"]}, "name 'left' belongs to robot 'left' and to robot 'left'"),
+        ({k: left[k] for k in ("joints", "actuators", "site", "base_body")}, "joint 'left/joint1' belongs to robot"),
+        ({"gripper_actuator": left["gripper_actuator"]}, "actuator 'left/gripper' belongs to robot 'left' and to rob"),
+    ]
+    for change, text in cases:
+        tables = [left, {**right, **change}]
+        toml = "".join("[[robot]]\n" + "".join(f"{k} = {v}\n" for k, v in t.items()) for t in tables)
+        with pytest.raises(RobotsFileError) as caught:
+            load_robots_toml(toml, handover)
+        assert text in str(caught.value)
+
+
+def _dumped(spec: object) -> list[tuple[str, str]]:
+    lines = dump_robots_toml([spec]).splitlines()  # type: ignore[list-item]
+    return [(k, v) for line in lines if " = " in line for k, v in [line.split(" = ", 1)]]
+
+
+def test_files_that_are_none(handover: mujoco.MjModel, tmp_path: Path) -> None:
+    with pytest.raises(RobotsFileError, match=r"robots file .*gone\.toml' cannot be read"):
+        load_robots_toml(tmp_path / "gone.toml", handover)
+    (tmp_path / "bad.toml").write_text("[[robot]\nname = 3")
+    with pytest.raises(RobotsFileError, match=r"^bad\.toml: .*line 1"):
+        load_robots_toml(tmp_path / "bad.toml", handover)
+    for text, found in (("robot = 3", "robot"), ("[robots]\n", "robots"), ("[robot]\nname='x'", "robot")):
+        with pytest.raises(RobotsFileError, match=rf"expected only \[\[robot\]\] tables, found {found}$"):
+            load_robots_toml(text, handover)
+
+
+def test_free_joints_and_strange_names() -> None:
+    body, actuators = arm("é'", joints=3)
+    m = scene(body + '<body name="b"><freejoint name="float"/><geom size=".1"/></body>', actuators)
+    (robot,) = find_robots(m)
+    assert load_robots_toml(dump_robots_toml([robot]), m) == (robot,)
+    with pytest.raises(RobotsFileError, match="joint 'float' is a free or ball joint"):
+        load_robots_toml(dump_robots_toml([robot]).replace("joints = [", 'joints = ["float", '), m)

@@ -1,0 +1,218 @@
+"""The live view against MuJoCo's own numbers: poses, contacts of objects, grip and its force."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.physics import UnknownNameError, World, find_objects, find_robots
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import ObjectContact, WorldView
+from tests.physics.models import GRIPPER_TENDON, model
+
+#: A gripper that closes on a box which lies on a table; the plain arm `other` is a post that can be pushed over.
+GRASP = (
+    """<mujoco><compiler angle="radian"/><option timestep="0.002" cone="{cone}" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="table"><geom type="box" size=".5 .5 .05" pos="0 0 -.05"/></body>
+    <body name="cube" pos="0 0 .02"><freejoint/><geom type="box" size=".02 .02 .02" mass=".1" condim="4"/>
+      <body name="lid" pos="0 0 .025"><geom type="box" size=".005 .005 .005" mass=".01"/></body></body>
+    <body name="spare" pos=".3 .3 .0199"><freejoint/><geom type="sphere" size=".02" mass=".1"/></body>
+    <body name="lonely" pos="0 0 2" gravcomp="1"><freejoint/><geom size=".02"/></body>
+    <body name="base" gravcomp="1" pos="0 0 .3">
+      <joint name="j0" type="slide" axis="0 0 1"/><geom size=".01" mass="1" pos="0 0 .1"/>
+      <body name="l1" gravcomp="1"><joint name="j1" type="slide" axis="1 0 0"/><geom size=".01" mass="1" pos="0 0 .1"/>
+      <body name="l2" gravcomp="1"><joint name="j2" type="slide" axis="0 1 0"/><geom size=".01" mass="1" pos="0 0 .1"/>
+        <site name="tcp" pos="0 0 -.28" euler="0 .3 0"/>
+        <body name="left_pad" gravcomp="1" pos="0 0 -.28">
+          <joint name="finger_l" type="slide" axis="0 1 0" range="0 .04"/>
+          <geom type="box" size=".01 .005 .01" pos="0 .03 0" condim="4" mass=".1"/></body>
+        <body name="right_pad" gravcomp="1" pos="0 0 -.28">
+          <joint name="finger_r" type="slide" axis="0 -1 0" range="0 .04"/>
+          <geom type="box" size=".01 .005 .01" pos="0 -.03 0" condim="4" mass=".1"/></body>
+      </body></body></body>
+  </worldbody>"""
+    + GRIPPER_TENDON
+    + """
+  <equality><joint joint1="finger_l" joint2="finger_r"/></equality>
+  <actuator>
+    <position name="a0" joint="j0" kp="3000" dampratio="1"/><position name="a1" joint="j1" kp="3000" dampratio="1"/>
+    <position name="a2" joint="j2" kp="3000" dampratio="1"/>
+    <general name="grip" tendon="split" ctrlrange="-20 20"/>
+  </actuator></mujoco>"""
+)
+
+
+def grasp_world(cone: str) -> World:
+    m = model(GRASP.format(cone=cone).replace('range="0 .04"', 'range="-.04 .04"'))
+    robots = find_robots(m)
+    assert [r.name for r in robots] == ["robot"]
+    assert robots[0].finger_bodies == ("left_pad", "right_pad")
+    assert (robots[0].gripper_open, robots[0].gripper_closed) == (20.0, -20.0)
+    return World(m, robots, find_objects(m))
+
+
+def contacts_of(world: World) -> dict[str, ObjectContact]:
+    return {c.object: c for c in world.view().object_contacts()}
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_a_grasp_is_seen_with_its_force(cone: str) -> None:
+    world = grasp_world(cone)
+    view: WorldView = world.view()
+    for _ in range(50):
+        world.tick()
+    assert contacts_of(world) == {
+        "cube": ObjectContact("cube", (), (), ("table",)),
+        "spare": ObjectContact("spare", (), (), ("table",)),
+    }
+    assert view.gripper_force("robot") == 0.0
+    world.ctrl[3] = -20.0
+    for _ in range(500):
+        world.tick()
+    assert contacts_of(world)["cube"] == ObjectContact("cube", ("robot",), ("robot",), ("table",))
+    # The tendon carries 20 N at coefficient 1/2, so each of the two fingers presses with 10 N.
+    assert view.gripper_force("robot") == pytest.approx(20.0, rel=0.02)
+    world.ctrl[0] = 0.1
+    for _ in range(500):
+        world.tick()
+    assert contacts_of(world)["cube"] == ObjectContact("cube", ("robot",), ("robot",), ())
+    assert view.object_pose("cube").p[2] > 0.1
+    restored = grasp_world(cone)
+    restored.restore(world.snapshot())
+    assert restored.view().gripper_force("robot") == view.gripper_force("robot") > 19.0
+    assert restored.view().object_contacts() == view.object_contacts()
+
+
+def test_gripper_force_is_that_of_mj_contact_force() -> None:
+    world = grasp_world("elliptic")
+    world.ctrl[3] = -20.0
+    for _ in range(300):
+        world.tick()
+    mujoco.mj_forward(world.model, world.data)
+    fingers = {mujoco.mj_name2id(world.model, int(mujoco.mjtObj.mjOBJ_BODY), n) for n in ("left_pad", "right_pad")}
+    expected, force = 0.0, np.zeros(6)
+    for i in range(int(world.data.ncon)):
+        if fingers & set(world.model.geom_bodyid[world.data.contact[i].geom].tolist()):
+            mujoco.mj_contactForce(world.model, world.data, i, force)
+            expected += force[0]
+    assert expected > 15.0
+    world.set_state_bytes(world.state_bytes())
+    assert world.view().gripper_force("robot") == pytest.approx(expected, rel=1e-6)
+
+
+def test_one_finger_holds_only_when_it_is_the_only_one() -> None:
+    world = grasp_world("elliptic")
+    m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
+    push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.refresh())  # noqa: E731
+    push(world)
+    assert contacts_of(world)["cube"].touching == ("robot",)
+    assert contacts_of(world)["cube"].grippers == ()
+    one = World(m, [RobotSpec(**{**_fields(robots[0]), "finger_bodies": ("left_pad",)})], objects)
+    push(one)
+    assert contacts_of(one)["cube"].grippers == ("robot",)
+
+
+def _fields(spec: RobotSpec) -> dict[str, object]:
+    return {name: getattr(spec, name) for name in spec.__struct_fields__}
+
+
+def test_objects_touch_each_other_the_world_and_cloth() -> None:
+    m = model("""<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 1"/>
+      <body name="low" pos="0 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+      <body name="high" pos="0 0 .2997"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+      <body name="wide" pos="1 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1" gap=".05"/></body>
+      <body name="near" pos="1 0 .33"><freejoint/><geom type="box" size=".1 .1 .1" gap=".05"/></body>
+      <flexcomp name="cloth" type="grid" count="6 6 1" spacing=".08 .08 .08" pos="0 0 .408" dim="2" mass=".3"
+        radius=".01"><edge equality="true"/></flexcomp></worldbody></mujoco>""")
+    world = World(m, (), find_objects(m))
+    for _ in range(3):
+        world.tick()
+    found = contacts_of(world)
+    assert found["low"].others == ("world", "high")
+    assert found["high"].others == ("low", "cloth")
+    assert found["wide"].others == ("world",)
+    assert "near" not in found, "within the gap, but not touching"
+
+
+def slow_contacts(world: World, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> set[tuple[str, str]]:
+    """Touching (object, body) pairs, one contact at a time."""
+    m, d = world.model, world.data
+    pairs = set()
+    for i in range(int(d.ncon)):
+        c = d.contact[i]
+        if c.efc_address >= 0:
+            a, b = (m.body(int(m.geom_bodyid[g])).name for g in c.geom)
+            pairs |= {(x, y) for x, y in ((a, b), (b, a)) if x in {o.body for o in objects}}
+    return pairs
+
+
+def test_contacts_match_a_plain_loop_in_the_handover_scene(handover: mujoco.MjModel) -> None:
+    robots, objects = find_robots(handover), find_objects(handover)
+    world = World(handover, robots, objects)
+    seen = set()
+    for k in range(600):
+        world.ctrl[:7] = handover.key_ctrl[0][:7] + 0.7 * np.sin(0.01 * k) * np.array([1, 1, 0, -1, 0, 1, 0])
+        world.tick()
+        pairs = slow_contacts(world, robots, objects)
+        found = {
+            (c.object, other)
+            for c in world.view().object_contacts()
+            for other in (*c.others, *(f"{r}/" for r in c.touching))
+        }
+        assert {(o, b.split("/")[0] + "/" if "/" in b else b) for o, b in pairs} == found
+        seen |= found
+    assert ("hammer", "table") in seen
+    assert ("board", "table") in seen
+
+
+def test_poses_and_joints(iiwa: mujoco.MjModel) -> None:
+    world = World(iiwa, find_robots(iiwa), ())
+    view = world.view()
+    assert view.tick == 0
+    for _ in range(20):
+        world.tick()
+    assert (view.tick, view.sim_time) == (20, float(world.data.time))
+    site = world.data.site("attachment_site")
+    pose = view.tip_pose("iiwa14")
+    assert pose.p == tuple(site.xpos.tolist())
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.array(pose.q))
+    assert np.allclose(matrix, site.xmat, atol=1e-12)
+    assert view.joints("iiwa14") == tuple(world.data.qpos.tolist())
+    world.tick()
+    assert view.tip_pose("iiwa14") != pose
+
+
+def test_unknown_names_are_listed(handover: mujoco.MjModel) -> None:
+    view = World(handover, find_robots(handover), find_objects(handover)).view()
+    with pytest.raises(UnknownNameError, match=r"robot 'lift' does not exist .* robots: left, right\."):
+        view.tip_pose("lift")
+    with pytest.raises(UnknownNameError, match="robot 'lift'"):
+        view.gripper_force("lift")
+    with pytest.raises(UnknownNameError, match=r"object 'nail' .* hammer, board"):
+        view.object_pose("nail")
+
+
+def test_two_arms_on_a_shared_base_keep_their_contacts_apart() -> None:
+    """A robots file may give two arms the same base; each body still belongs to the arm whose joints move it."""
+    arm = """<body name="{s}1" pos="{x} 0 1"><joint name="{s}j1" axis="0 1 0"/><geom size=".03"/>
+      <body name="{s}2"><joint name="{s}j2" axis="1 0 0"/><geom size=".03"/>
+      <body name="{s}3"><joint name="{s}j3" axis="0 0 1"/><geom name="{s}g" size=".05" pos="0 0 -.1"/>
+      <site name="{s}tcp"/></body></body></body>"""
+    bodies = arm.format(s="l", x=-0.5) + arm.format(s="r", x=0.5)
+    m = model(
+        f"""<mujoco><worldbody><body name="torso">{bodies}</body>
+        <body name="ball" pos="-.5 0 .82"><freejoint/><geom size=".05"/></body></worldbody>
+        <actuator>{"".join(f'<motor name="{s}a{i}" joint="{s}j{i}"/>' for s in "lr" for i in (1, 2, 3))}</actuator>
+        </mujoco>"""
+    )
+    specs = tuple(
+        RobotSpec(s, tuple(f"{s}j{i}" for i in (1, 2, 3)), tuple(f"{s}a{i}" for i in (1, 2, 3)), f"{s}tcp", "torso")
+        for s in "lr"
+    )
+    world = World(m, specs, find_objects(m))
+    assert contacts_of(world)["ball"].touching == ("l",)

@@ -1,0 +1,416 @@
+"""`World`: ticks equal plain `mj_step` bit for bit, and saving is invisible, in this process and in another one."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.physics import (
+    ModelUnsupportedError,
+    NotOwnerError,
+    SimulationDivergedError,
+    SnapshotError,
+    UnknownNameError,
+    World,
+    find_objects,
+    find_robots,
+    model_from_bytes,
+)
+from iris_session.physics.world import STATE
+from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import ObjectSpec
+from tests.physics.models import clutter, model
+
+INTEGRATORS = [n.removeprefix("mjINT_") for n in dir(mujoco.mjtIntegrator) if n.startswith("mjINT_")]
+CASES = [
+    *((name, "", "") for name in INTEGRATORS),
+    ("implicitfast", 'cone="elliptic" impratio="10" noslip_iterations="3"', ""),
+    ("Euler", 'solver="PGS"', ""),
+    ("Euler", 'solver="CG" jacobian="sparse"', '<flag warmstart="disable" energy="enable"/>'),
+]
+SLEEPS = hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP")
+
+
+def state_of(m: mujoco.MjModel, d: mujoco.MjData) -> bytes:
+    array = np.empty(mujoco.mj_stateSize(m, STATE))
+    mujoco.mj_getState(m, d, array, STATE)
+    return array.tobytes()
+
+
+def drive(data: mujoco.MjData, k: int) -> None:
+    """The k-th inputs: actuators, and everything else that may be written between ticks."""
+    data.ctrl[:] = np.sin(0.05 * k + np.arange(len(data.ctrl)))
+    data.xfrc_applied[-2, :3] = (0.3 * np.cos(0.1 * k), 0.0, 0.2)
+    data.qfrc_applied[0] = 0.1 * np.sin(0.2 * k)
+    data.userdata[:1] = k
+
+
+@pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
+def test_ticks_are_mj_steps_bit_for_bit(integrator: str, option: str, flag: str) -> None:
+    names = {"EULER": "Euler", "RK4": "RK4"}
+    m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
+    plain, world = mujoco.MjData(m), World(m, (), ())
+    contacts = 0
+    for k in range(600):
+        drive(plain, k)
+        drive(world.data, k)
+        mujoco.mj_step(m, plain)
+        world.tick()
+        contacts = max(contacts, int(plain.ncon))
+        assert world.state_bytes() == state_of(m, plain), f"tick {k}"
+    assert contacts > 8
+
+
+@pytest.mark.parametrize("name", ["aloha", "iiwa", "handover"])
+def test_real_models_tick_like_mj_step_and_restore(name: str, request: pytest.FixtureRequest) -> None:
+    m = request.getfixturevalue(name)
+    robots, objects = find_robots(m), find_objects(m)
+    world, plain = World(m, robots, objects), mujoco.MjData(m)
+    mujoco.mj_resetDataKeyframe(m, plain, 0)
+    assert world.state_bytes() == state_of(m, plain)
+    start = world.data.ctrl.copy()
+    for k in range(300):
+        ctrl = start + 0.2 * np.sin(0.02 * k)
+        plain.ctrl[:] = ctrl
+        world.ctrl[:] = ctrl
+        mujoco.mj_step(m, plain)
+        world.tick()
+        if k == 150:
+            saved = world.snapshot()
+    assert world.state_bytes() == state_of(m, plain)
+    other = World(m, robots, objects)
+    other.restore(saved)
+    for k in range(151, 300):
+        other.ctrl[:] = start + 0.2 * np.sin(0.02 * k)
+        other.tick()
+    assert other.snapshot() == world.snapshot()
+
+
+def test_state_holds_every_input(handover: mujoco.MjModel) -> None:
+    """Everything that a person or a script may write into `MjData` is part of `state_bytes`."""
+    m = clutter()
+    world = World(m, (), ())
+    before = world.state_bytes()
+    for field in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "userdata"):
+        array = getattr(world.data, field)
+        kept = array.copy()
+        array.flat[-1] += 0.25
+        assert world.state_bytes() != before, field
+        array[...] = kept
+    world.data.eq_active[0] = 1
+    assert world.state_bytes() != before
+    world.data.eq_active[0] = 0
+    world.data.qacc_warmstart[0] = 1.0
+    assert world.state_bytes() != before
+
+
+@pytest.mark.parametrize(("integrator", "option", "flag"), CASES)
+def test_restore_is_invisible(integrator: str, option: str, flag: str) -> None:
+    """A world saved and restored after every 37th tick, and one restored elsewhere, stay equal to an untouched one."""
+    names = {"EULER": "Euler", "RK4": "RK4"}
+    m = clutter(names.get(integrator, integrator if integrator == "Euler" else integrator.lower()), option, flag)
+    objects = find_objects(m)
+    world, saved_often, other = (World(m, (), objects) for _ in range(3))
+    shared = b""
+    for k in range(400):
+        for w in (world, saved_often, other) if k >= 200 else (world, saved_often):
+            drive(w.data, k)
+            if k in (50, 230):
+                w.data.mocap_pos[0] = (0.1 * k / 50, 0.0, 0.05)
+                w.data.eq_active[0] = k == 50
+                w.refresh()
+            w.tick()
+        if k % 37 == 0:
+            snapshot = saved_often.snapshot()
+            saved_often.restore(snapshot)
+            assert saved_often.snapshot() == snapshot
+        if k == 199:
+            shared = world.snapshot()
+            other.tick()
+            other.restore(shared)
+        assert saved_often.snapshot() == world.snapshot()
+        assert saved_often.view().object_contacts() == world.view().object_contacts()
+    assert other.snapshot() == world.snapshot()
+    poses = np.zeros((2, len(world.bodies), 7))
+    world.poses(poses[0])
+    other.poses(poses[1])
+    assert poses[0].tobytes() == poses[1].tobytes()
+    assert other.view().object_contacts() == world.view().object_contacts() != ()
+
+
+CONTINUE = """
+import hashlib, sys, numpy as np
+from pathlib import Path
+from iris_session.physics import World, find_objects, find_robots, model_from_bytes
+folder = Path(sys.argv[1])
+model = model_from_bytes((folder / "model.mjb").read_bytes())
+world = World(model, find_robots(model), find_objects(model))
+world.restore((folder / "snapshot").read_bytes())
+for k in range(200):
+    world.ctrl[:] = world.ctrl + 0.001 * np.cos(0.1 * k)
+    world.tick()
+print(hashlib.blake2b(world.snapshot()).hexdigest())
+"""
+
+
+def test_another_process_continues_bit_for_bit(handover: mujoco.MjModel, tmp_path: Path) -> None:
+    world = World(handover, find_robots(handover), find_objects(handover))
+    for k in range(100):
+        world.ctrl[:] = world.ctrl + 0.002 * np.sin(0.1 * k)
+        world.tick()
+    (tmp_path / "model.mjb").write_bytes(world.model_bytes())
+    (tmp_path / "snapshot").write_bytes(world.snapshot())
+    command = [sys.executable, "-c", CONTINUE, str(tmp_path)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    for k in range(200):
+        world.ctrl[:] = world.ctrl + 0.001 * np.cos(0.1 * k)
+        world.tick()
+    assert output.strip() == hashlib.blake2b(world.snapshot()).hexdigest()
+
+
+def test_derived_quantities_belong_to_the_new_state() -> None:
+    m = clutter()
+    world = World(m, (), find_objects(m))
+    for _ in range(150):
+        world.tick()
+    fresh = mujoco.MjData(m)
+    mujoco.mj_setState(m, fresh, np.frombuffer(world.state_bytes()), STATE)
+    mujoco.mj_forward(m, fresh)
+    assert world.data.xpos.tobytes() == fresh.xpos.tobytes()
+    assert int(world.data.ncon) == int(fresh.ncon) > 0
+    assert world.data.contact.dist.tobytes() == fresh.contact.dist.tobytes()
+    out = np.zeros((len(world.bodies), 7))
+    world.poses(out)
+    assert (out[:, :3] == fresh.xpos[1:]).all()
+    assert (out[:, 3:] == fresh.xquat[1:]).all()
+
+
+def test_reset_takes_home_then_the_first_keyframe_then_the_default(aloha: mujoco.MjModel) -> None:
+    xml = """<mujoco><worldbody><body><joint/><geom size=".1"/></body></worldbody>{}</mujoco>"""
+    keys = '<keyframe><key name="up" qpos="1"/><key name="home" qpos="2" time="3"/></keyframe>'
+    world = World(model(xml.format(keys)), (), ())
+    assert world.data.qpos[0] == 2.0
+    assert world.view().sim_time == 3.0
+    for _ in range(3):
+        world.tick()
+    assert world.view().tick == 3
+    first = World(model(xml.format(keys)), (), ()).snapshot()
+    world.reset()
+    assert world.snapshot() == first
+    assert world.view().tick == 0
+    assert World(model(xml.format(keys)), (), (), keyframe="up").data.qpos[0] == 1.0
+    assert World(model(xml.format("")), (), ()).data.qpos[0] == 0.0
+    with pytest.raises(UnknownNameError, match=r"keyframe 'down' does not exist .* Available keyframes: up, home\."):
+        World(model(xml.format(keys)), (), (), keyframe="down")
+    assert (World(aloha, (), ()).data.qpos == aloha.key_qpos[0]).all()
+
+
+def test_bodies_of_a_scene_with_flexes_mocap_and_unnamed_bodies() -> None:
+    m = model("""<mujoco><option timestep="0.005"/><worldbody>
+      <body><geom size=".1"/><body name="body_1" pos="1 0 0"><joint/><geom size=".1"/></body></body>
+      <body name="ball" pos="0 0 2"><freejoint/><geom size=".1"/></body>
+      <body name="hand" mocap="true"><geom size=".1"/></body>
+      <flexcomp name="cloth" type="grid" count="4 4 1" spacing=".1 .1 .1" pos="0 0 4" dim="2" mass=".3" radius=".01">
+        <edge equality="true"/><pin id="0"/></flexcomp>
+      <flexcomp name="brick" type="grid" count="3 3 3" spacing=".1 .1 .1" pos="2 0 4" dim="3" mass="1" rigid="true"/>
+      </worldbody></mujoco>""")
+    objects = find_objects(m)
+    assert [o.name for o in objects] == ["ball"]
+    world = World(m, (), objects)
+    assert m.nbody > 16
+    assert world.bodies[:4] == (
+        BodyInfo(1, "body_1~2", moving=False),
+        BodyInfo(2, "body_1", moving=True),
+        BodyInfo(3, "ball", moving=True, object=True),
+        BodyInfo(4, "hand", moving=True),
+    )
+    assert {b.name for b in world.bodies[4:]} <= {"brick"}
+    assert world.tick_period_ns == 5_000_000
+    for _ in range(5):
+        world.tick()
+    out = np.full((len(world.bodies), 7), np.nan)
+    world.poses(out)
+    assert out[2, 2] < 2.0
+    assert np.allclose(np.linalg.norm(out[:, 3:], axis=1), 1.0)
+
+
+def test_robot_infos(handover: mujoco.MjModel) -> None:
+    world = World(handover, find_robots(handover), find_objects(handover))
+    left = world.robot_infos[0]
+    by_id = {b.id: b for b in world.bodies}
+    assert by_id[left.base_body].name == "left/base"
+    assert left.gripper
+    assert by_id[left.site_body].moving
+    tip = world.view().tip_pose("left")
+    body = world.data.xpos[left.site_body]
+    turned = np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, np.array(left.T_body_site.p), world.data.xquat[left.site_body])
+    assert np.allclose(body + turned, tip.p, atol=1e-12)
+
+
+def test_divergence_is_a_typed_error_until_reset() -> None:
+    m = clutter()
+    world = World(m, (), ())
+    good = world.snapshot()
+    world.data.qvel[3] = 1e14
+    with pytest.raises(SimulationDivergedError, match=r"diverged at tick 1 .*huge"):
+        world.tick()
+    with pytest.raises(SimulationDivergedError):
+        world.tick()
+    assert world.diverged
+    world.reset()
+    world.tick()
+    world.ctrl[0] = np.nan
+    with pytest.raises(SimulationDivergedError, match="ctrl is NaN"):
+        world.tick()
+    world.restore(good)
+    world.tick()
+    assert not world.diverged
+    assert world.view().tick == 1
+    assert world.trouble == {}
+
+
+def pile(memory: str) -> mujoco.MjModel:
+    """Twenty boxes inside each other: hundreds of contacts."""
+    boxes = "".join(
+        f'<body pos="0 0 {0.09 + 0.02 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(20)
+    )
+    plane = '<geom type="plane" size="1 1 1"/>'
+    return model(f'<mujoco><size memory="{memory}"/><worldbody>{plane}{boxes}</worldbody></mujoco>')
+
+
+def test_full_memory_is_counted() -> None:
+    world = World(pile("300K"), (), ())
+    world.tick()
+    assert sum(world.trouble.values()) > 0
+    world.restore(world.snapshot())
+    world.reset()
+    assert world.diverged == ""
+
+
+def test_memory_that_is_too_small_for_a_tick_is_a_typed_error() -> None:
+    world = World(pile("130K"), (), ())
+    with pytest.raises(SimulationDivergedError, match="out of memory"):
+        world.tick()
+    assert "out of memory" in world.diverged
+    world.reset()
+    assert world.diverged == ""
+
+
+def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
+    world = World(clutter(), (), ())
+    with pytest.raises(SnapshotError, match="no world snapshot"):
+        world.restore(b"nonsense")
+    with pytest.raises(SnapshotError, match=r"snapshot of scene [0-9a-f]{32}, but this world is scene"):
+        world.restore(World(handover, (), ()).snapshot())
+    with pytest.raises(SnapshotError, match="state of 8 bytes"):
+        world.set_state_bytes(bytes(8))
+    with_robots = World(handover, find_robots(handover), ())
+    with pytest.raises(SnapshotError, match="0 robots, but this world has 2"):
+        with_robots.restore(World(handover, (), ()).snapshot())
+
+
+def test_unknown_object_body_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"object 'x': body 'nope' does not exist .*box0, box1"):
+        World(clutter(), (), (ObjectSpec("x", "nope"),))
+
+
+@pytest.mark.skipif(not SLEEPS, reason="this MuJoCo has no sleeping islands")
+def test_sleeping_islands_are_refused_in_our_loop_only() -> None:
+    m = clutter(flag='<flag sleep="enable"/>')
+    with pytest.raises(ModelUnsupportedError, match="sleeping islands"):
+        World(m, (), ())
+    World(m, (), (), mujoco.MjData(m))
+
+
+def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path, iiwa: mujoco.MjModel) -> None:
+    first = World(iiwa, (), ())
+    data = first.model_bytes()
+    assert str(data_dir).encode() in bytes(iiwa.paths)
+    assert str(data_dir).encode() not in data
+    again = World(model_from_bytes(data), (), ())
+    assert again.scene_hash == first.scene_hash
+    assert len(first.scene_hash) == 32
+    assert World(clutter(), (), ()).scene_hash != first.scene_hash
+
+
+# --- a user's loop ----------------------------------------------------------------------------------------------------
+
+
+def test_a_users_data_is_only_read_and_the_view_shows_its_new_state(handover: mujoco.MjModel) -> None:
+    robots, objects = find_robots(handover), find_objects(handover)
+    plain, user = mujoco.MjData(handover), mujoco.MjData(handover)
+    for d in (plain, user):
+        mujoco.mj_resetDataKeyframe(handover, d, 0)
+    world = World(handover, robots, objects, user)
+    ours = World(handover, robots, objects)
+    assert world.view().tick == 0
+    for k in range(200):
+        for d in (plain, user, ours.data):
+            d.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.03 * k)
+        mujoco.mj_step(handover, plain)
+        mujoco.mj_step(handover, user)
+        ours.tick()
+        assert world.after_user_step() is False
+    assert state_of(handover, user) == state_of(handover, plain) == world.state_bytes()
+    assert user.xpos.tobytes() == plain.xpos.tobytes()
+    view, expected = world.view(), ours.view()
+    assert view.tick == expected.tick == 200
+    assert view.tip_pose("left") == expected.tip_pose("left")
+    assert view.joints("right") == expected.joints("right")
+    assert view.object_pose("hammer") == expected.object_pose("hammer")
+    assert view.object_contacts() == expected.object_contacts() != ()
+
+
+def test_user_time_decides_the_tick(handover: mujoco.MjModel) -> None:
+    user = mujoco.MjData(handover)
+    world = World(handover, (), (), user)
+    for _ in range(5):
+        mujoco.mj_step(handover, user)
+    world.after_user_step()
+    assert world.view().tick == 5
+    world.after_user_step()
+    assert world.view().tick == 5
+    mujoco.mj_resetData(handover, user)
+    assert world.after_user_step() is True
+    assert world.view().tick == 0
+    user.qpos[0] = np.inf
+    with pytest.raises(SimulationDivergedError, match="not finite"):
+        world.after_user_step()
+
+
+def test_loops_are_not_mixed(handover: mujoco.MjModel) -> None:
+    user = World(handover, (), (), mujoco.MjData(handover))
+    for call in (user.tick, user.reset, user.refresh, lambda: user.restore(b""), lambda: user.set_state_bytes(b"")):
+        with pytest.raises(NotOwnerError, match="user's loop"):
+            call()
+    with pytest.raises(NotOwnerError, match="call tick"):
+        World(handover, (), ()).after_user_step()
+
+
+def test_a_shown_state_is_a_function_of_its_bytes(handover: mujoco.MjModel) -> None:
+    """What an open session shows does not depend on what was shown before, and keeps the bytes it was given."""
+    robots, objects = find_robots(handover), find_objects(handover)
+    source = World(handover, robots, objects)
+    states = []
+    for k in range(40):
+        source.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.1 * k)
+        source.tick()
+        states.append(source.state_bytes())
+    forwards, single = World(handover, robots, objects), World(handover, robots, objects)
+    for state in states:
+        forwards.set_state_bytes(state)
+        assert forwards.state_bytes() == state
+    single.set_state_bytes(states[-1])
+    assert single.snapshot() == forwards.snapshot()
+    assert single.view().tick == 40
+    assert single.view().object_contacts() == source.view().object_contacts()
+    single.tick()
+    source.tick()
+    assert single.state_bytes() == source.state_bytes()
