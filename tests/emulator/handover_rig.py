@@ -154,6 +154,7 @@ class Rig:
         self._engagements = dict.fromkeys(self.behaviours, 0)
         self._next_sample_s = {robot: self.rng.uniform(0, SAMPLE_S) for robot in self.behaviours}
         self._next_state_s = 0.0
+        self._must_open: set[str] = set()
         self._seq = 0
 
     @property
@@ -177,6 +178,11 @@ class Rig:
             self.controller.tick(self.world.data)
             self.world.tick()
             self.referee.tick(self.world)
+
+    def end_engagement(self, robot: str) -> None:
+        """What the session does after a gap in the samples: the robot holds until the clutch was opened once."""
+        self._commands[robot] = Command(robot, CommandKind.HOLD, HoldReason.STALE)
+        self._must_open.add(robot)
 
     def _publish(self) -> None:
         if self.now_s < self._next_state_s:
@@ -216,7 +222,10 @@ class Rig:
             hand = self._on_the_way.popleft()[1]
             engaged = self._commands[hand.robot].kind == CommandKind.POSE
             if not hand.clutch:
+                self._must_open.discard(hand.robot)
                 self._commands[hand.robot] = Command(hand.robot, CommandKind.HOLD, HoldReason.CLUTCH_OPEN)
+                continue
+            if hand.robot in self._must_open:
                 continue
             self._engagements[hand.robot] += not engaged
             self._seq += 1

@@ -11,16 +11,25 @@ from iris_session.protocol.names import Device
 
 #: The other must be seen to hold the thing for so long [s] before the giver opens.
 SURE_S = 0.35
-#: How long a thing is offered before the giver gives up [s].
-PATIENCE_S = 60.0
 
 
 class Giver(Operator):
-    """Grasps `object` near its heavy end with `robot` and hands it to the operator of `partner`."""
+    """Grasps `object` near its heavy end with `robot` and hands it to the operator of `partner`.
 
-    def __init__(self, robot: str, object: str, partner: str, device: str = Device.CONTROLLER_RIGHT) -> None:
+    `patience_s`: how long the thing is offered before the giver gives up.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        object: str,
+        partner: str,
+        device: str = Device.CONTROLLER_RIGHT,
+        patience_s: float = 60.0,
+    ) -> None:
         super().__init__(robot, object, partner, device)
         self._after_close = "lift"
+        self._patience_s = patience_s
         self._taken_since_s = math.inf
         self._steps |= {
             "look": self._look,
@@ -73,20 +82,15 @@ class Giver(Operator):
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
         elif not self.eyes.holds(self.partner, self.object, self.thing.half_width):
             self._taken_since_s = math.inf
-            if self._waited(PATIENCE_S):
-                self._give_up(f"nobody took the {self.object} within {PATIENCE_S:.0f} s")
+            if self._waited(self._patience_s):
+                self._give_up(f"nobody took the {self.object} within {self._patience_s:.0f} s")
         else:
             self._taken_since_s = min(self._taken_since_s, self.hand.now_s)
             if self.hand.now_s - self._taken_since_s >= SURE_S:
                 self._enter("release")
 
     def _release(self) -> None:
-        self.hand.hold_still()
-        self.hand.trigger_goal = 0.0
-        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.015:
-            self._enter("retreat")
-        elif self._waited(4.0):
-            self._give_up(f"the gripper of {self.robot} does not open")
+        self._open_gripper("retreat")
 
     def _retreat(self) -> None:
         if self._entering_now:

@@ -34,6 +34,9 @@ CORRECTION_MOST = 0.05  # m, and rad times ten
 LOST_M = 0.08
 LOST_RAD = 0.4
 LOST_S = 0.7
+#: After the movement the tip is still this far away, for so long: the same.
+STUCK_M = 0.012
+STUCK_S = 1.5
 #: The clutch stays open so long before it is closed again [s].
 REARM_S = 0.25
 #: Pulling or releasing the trigger takes so long [s].
@@ -65,13 +68,15 @@ class ClutchedHand:
         self._correcting = True
         self._missing_m, self._missing_rad = math.inf, math.inf
         self._close_since_s = math.inf
-        self._lost_since_s = math.inf
+        self._trouble_since_s = [math.inf, math.inf]  # since when lost, since when stuck
+        self._still = False
 
     def update(self, view: OperatorView, tip: PoseTuple | None) -> bool:
         """Advances the hand to the present. `tip`: where the tip is seen. Returns whether the operator can act."""
         step_s = self._clock(view.session_time_ns)
         if tip is None or view.estop or view.lease_version(self.robot) is None:
-            self._open(view)
+            self._open()
+            self._hand = view.device_pose(self.device)
             return False
         self.now_s += step_s
         rate = step_s / TRIGGER_S
@@ -81,19 +86,20 @@ class ClutchedHand:
                 self._engage(tip)
         else:
             self._trigger += min(max(self.trigger_goal - self._trigger, -rate), rate)
-            self._follow(tip, step_s, view)
+            self._follow(tip, step_s)
         return True
 
     def move_to(self, goal: PoseTuple, speed: float = SPEED, turn: float = TURN, correct: bool = True) -> None:
         """Starts a movement of the tip to `goal`. `correct`: add what is missing at the end, until told otherwise."""
         self._goal, self._speed, self._turn, self._correcting = goal, speed, turn, correct
+        self._still = False
         self._close_since_s = math.inf
         if self._engaged:
             self._reach = Reach.plan(self._reference(), goal, self.now_s, speed, turn)
 
     def hold_still(self) -> None:
         """Keeps the hand where it is: no corrections while two robots hold the same thing."""
-        self._correcting = False
+        self._correcting, self._still = False, True
 
     def arrived(self, within_m: float = 0.003, within_rad: float = 0.02, for_s: float = 0.12) -> bool:
         """Whether the movement is over and the tip was seen at the goal for `for_s` seconds."""
@@ -112,14 +118,20 @@ class ClutchedHand:
     def trigger_done(self) -> bool:
         return self._engaged and self._trigger == self.trigger_goal
 
-    def let_go(self, view: OperatorView, for_s: float) -> None:
+    def let_go(self, for_s: float) -> None:
         """Opens the clutch for `for_s` seconds; the last goal stays."""
-        self._open(view)
+        self._open()
         self._rearm_s = self.now_s + for_s
+
+    def take_anew(self) -> None:
+        """Opens the clutch and closes it again: the robot does not follow the hand."""
+        self.reclutches += 1
+        self._open()
 
     def rest(self, view: OperatorView) -> HandInput:
         """Opens the clutch for good; the robot holds."""
-        self._open(view)
+        self._open()
+        self._hand = view.device_pose(self.device)
         self._goal = self._reach = None
         return self.input()
 
@@ -131,23 +143,22 @@ class ClutchedHand:
         self._last_ns = now_ns
         return min(max(step_s, 0.0), LONGEST_STEP_S)
 
-    def _open(self, view: OperatorView) -> None:
+    def _open(self) -> None:
         self._engaged = False
         self._rearm_s = self.now_s + REARM_S
-        self._hand = view.device_pose(self.device)
 
     def _engage(self, tip: PoseTuple) -> None:
         self._engaged = True
         self._hand_at_engage, self._tip_at_engage = self._hand, tip
         self._correction_p = self._correction_r = (0.0, 0.0, 0.0)
-        self._lost_since_s = math.inf
+        self._trouble_since_s = [math.inf, math.inf]
         self._reach = None if self._goal is None else Reach.plan(tip, self._goal, self.now_s, self._speed, self._turn)
 
     def _reference(self) -> PoseTuple:
         """Where the tip should be now, before corrections."""
         return self._tip_at_engage if self._reach is None else self._reach.pose(self.now_s)
 
-    def _follow(self, tip: PoseTuple, step_s: float, view: OperatorView) -> None:
+    def _follow(self, tip: PoseTuple, step_s: float) -> None:
         reference = self._reference()
         miss_p = (reference[0][0] - tip[0][0], reference[0][1] - tip[0][1], reference[0][2] - tip[0][2])
         miss_r = quat_to_rotvec(quat_mul(reference[1], quat_conj(tip[1])))
@@ -155,15 +166,17 @@ class ClutchedHand:
         if self._correcting and self.moved():
             self._correction_p = _toward(self._correction_p, miss_p, step_s, CORRECTION_SPEED, CORRECTION_MOST)
             self._correction_r = _toward(self._correction_r, miss_r, step_s, CORRECTION_TURN, 10.0 * CORRECTION_MOST)
-        if self._missing_m < LOST_M and self._missing_rad < LOST_RAD:
-            self._lost_since_s = math.inf
-        else:
-            self._lost_since_s = min(self._lost_since_s, self.now_s)
-        if self.now_s - self._lost_since_s > LOST_S:
-            self.reclutches += 1
-            self._open(view)
+        self._since(0, self._missing_m > LOST_M or self._missing_rad > LOST_RAD)
+        self._since(1, self.moved() and not self._still and self._missing_m > STUCK_M)
+        if self.now_s - self._trouble_since_s[0] > LOST_S or self.now_s - self._trouble_since_s[1] > STUCK_S:
+            self.take_anew()
             return
         self._hand = self._hand_for(reference)
+
+    def _since(self, trouble: int, present: bool) -> None:
+        """Notes since when a trouble has lasted."""
+        since = self._trouble_since_s
+        since[trouble] = min(since[trouble], self.now_s) if present else math.inf
 
     def _hand_for(self, reference: PoseTuple) -> PoseTuple:
         """The hand pose that brings the tip to `reference` plus corrections, by the motion since the engagement."""

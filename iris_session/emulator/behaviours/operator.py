@@ -47,6 +47,7 @@ class Operator:
             "rise": self._rise,
             "return": self._return,
         }
+        self._clutched_again = 0
         self._take_x = 0.0  # where along the thing it is taken [m]
         self._after_close = ""
 
@@ -114,6 +115,20 @@ class Operator:
             self.hand.move_to(self._home)
         if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
             self._finish()
+
+    def _open_gripper(self, then: str) -> None:
+        """Opens, goes on with `then`. A gripper that does not follow: the engagement was lost, clutch again."""
+        if self._entering_now:
+            self._clutched_again = 0
+        self.hand.hold_still()
+        self.hand.trigger_goal = 0.0
+        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.015:
+            self._enter(then)
+        elif self._waited(8.0):
+            self._give_up(f"the gripper of {self.robot} does not open")
+        elif self._waited(1.5 * (self._clutched_again + 1)):
+            self._clutched_again += 1
+            self.hand.take_anew()
 
     # --- transitions --------------------------------------------------------------------------------------------------
 

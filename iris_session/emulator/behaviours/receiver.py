@@ -11,8 +11,6 @@ from iris_session.protocol.names import Device
 
 #: A thing nearer to the place of exchange than this is offered [m].
 OFFERED_M = 0.10
-#: How long the receiver waits for an offer [s].
-PATIENCE_S = 120.0
 #: A giver whose tip is farther than this from where it held the thing has left [m].
 LEFT_M = 0.08
 
@@ -20,7 +18,8 @@ LEFT_M = 0.08
 class Receiver(Operator):
     """Takes `object` with `robot` from the operator of `partner` and lays it on the table.
 
-    `place`: where (x, y [m] in the world); default: in front of the robot, on its freer side.
+    `place`: where (x, y [m] in the world); default: in front of the robot, on its freer side. `patience_s`: how long it
+    waits for an offer before it gives up.
     """
 
     def __init__(
@@ -30,10 +29,12 @@ class Receiver(Operator):
         partner: str,
         device: str = Device.CONTROLLER_RIGHT,
         place: tuple[float, float] | None = None,
+        patience_s: float = 120.0,
     ) -> None:
         super().__init__(robot, object, partner, device)
         self._after_close = "secure"
         self._place = place
+        self._patience_s = patience_s
         self._laid: PoseTuple | None = None
         self._steps |= {
             "watch": self._watch,
@@ -60,8 +61,8 @@ class Receiver(Operator):
         if offered:
             self._take_x = self._free_end()
             self._enter("approach")
-        elif self._waited(PATIENCE_S):
-            self._give_up(f"nobody offered the {self.object} within {PATIENCE_S:.0f} s")
+        elif self._waited(self._patience_s):
+            self._give_up(f"nobody offered the {self.object} within {self._patience_s:.0f} s")
 
     def _free_end(self) -> float:
         """Where to take the thing [m along its x]: for a symmetric thing the end away from the giver's fingers."""
@@ -116,12 +117,7 @@ class Receiver(Operator):
             self._enter("open")
 
     def _open(self) -> None:
-        self.hand.hold_still()
-        self.hand.trigger_goal = 0.0
-        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.015:
-            self._enter("leave")
-        elif self._waited(4.0):
-            self._give_up(f"the gripper of {self.robot} does not open")
+        self._open_gripper("leave")
 
     def _leave(self) -> None:
         if self._entering_now:

@@ -40,15 +40,15 @@ class Wander:
         if self.hand.update(view, None if self._tip is None else self._tip.pose) and self._tip is not None:
             self._home = self._home or self._tip.pose
             if self.hand.now_s >= self._next_s:
-                self._begin_next(view, self._home)
+                self._begin_next(self._home)
         return (self.hand.input(),)
 
-    def _begin_next(self, view: OperatorView, home: PoseTuple) -> None:
+    def _begin_next(self, home: PoseTuple) -> None:
         rng = self._random
         if self._goals_left == 0:
             self.phase = "clutch"
             pause_s = rng.uniform(0.4, 0.9)
-            self.hand.let_go(view, pause_s)
+            self.hand.let_go(pause_s)
             self._next_s, self._goals_left = self.hand.now_s + pause_s, rng.randint(2, 5)
             return
         self.phase = "move"

@@ -1,0 +1,175 @@
+"""Whole handovers on the real physics and control, and what operators do when something goes wrong."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from anchors.pose import distance
+from iris_session.emulator.behaviours import Giver, Idle, Receiver, Wander, make_behaviour
+from tests.emulator.handover_rig import DEVICE, Rig, handover, verdict
+
+
+def _until(robot: str, phase: str):  # type: ignore[no-untyped-def]
+    return lambda rig: rig.behaviours[robot].phase == phase
+
+
+@pytest.mark.parametrize(
+    ("seed", "thing", "giver", "receiver"),
+    [(1, "hammer", "left", "right"), (2, "hammer", "left", "right"), (3, "board", "right", "left")],
+)
+def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -> None:
+    """Friction alone holds the thing; between the two grips it touches nothing else; it ends on the table."""
+    rig = handover(seed, thing, giver, receiver)
+    rig.run(25.0)
+    assert verdict(rig, giver, receiver) == ""
+    assert rig.now_s < 25.0
+    assert rig.fastest_hand < 0.5
+    side = 1.0 if receiver == "right" else -1.0
+    assert side * rig.world.view().object_pose(thing).p[0] > 0.1  # on the receiver's side of the table
+
+
+def test_nothing_moves_by_itself() -> None:
+    """The referee can fail: two people who hold their hands still hand nothing over."""
+    rig = Rig({"left": Idle("left"), "right": Idle("right")}, seed=1)
+    before = rig.world.view().object_pose("hammer").p
+    rig.run(1.0)
+    assert not rig.referee.handed_over("left", "right")
+    assert distance(before, rig.world.view().object_pose("hammer").p) < 1e-3
+
+
+def test_emergency_stop_in_the_middle() -> None:
+    """While stopped the clutch is open; after it the operators take hold again and finish."""
+    rig = handover(4)
+    rig.run(30.0, until=_until("left", "present"))
+    rig.run(0.4, until=lambda r: False)
+    for view in rig.views.values():
+        view.estop = True
+    rig.run(0.3, until=lambda r: False)
+    tip = rig.world.view().tip_pose("left").p
+    rig.run(1.0, until=lambda r: False)
+    assert distance(tip, rig.world.view().tip_pose("left").p) < 2e-3
+    for view in rig.views.values():
+        view.estop = False
+    rig.run(30.0)
+    assert verdict(rig, "left", "right") == ""
+
+
+def test_without_a_lease_the_operator_waits() -> None:
+    rig = handover(5)
+    rig.views["left"].lease = None
+    rig.run(2.0, until=lambda r: False)
+    assert rig.behaviours["left"].phase == "wait"
+    rig.views["left"].lease = 2
+    rig.run(30.0)
+    assert verdict(rig, "left", "right") == ""
+
+
+@pytest.mark.parametrize("phase", ["approach", "lift", "offer", "release"])
+def test_lost_engagement_of_the_giver_is_noticed(phase: str) -> None:
+    """The session ended the engagement (a gap in the samples): the giver sees it and clutches again."""
+    rig = handover(6)
+    rig.run(30.0, until=_until("left", phase))
+    rig.run(0.1, until=lambda r: False)
+    rig.end_engagement("left")
+    rig.run(40.0)
+    assert verdict(rig, "left", "right") == ""
+    assert rig.behaviours["left"].hand.reclutches >= 1  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("phase", ["descend", "carry", "put"])
+def test_lost_engagement_of_the_receiver_is_noticed(phase: str) -> None:
+    rig = handover(7)
+    rig.run(30.0, until=_until("right", phase))
+    rig.run(0.1, until=lambda r: False)
+    rig.end_engagement("right")
+    rig.run(40.0)
+    assert verdict(rig, "left", "right") == ""
+
+
+def test_thing_moved_away_before_the_grasp() -> None:
+    """The gripper closes on nothing; the giver sees it, opens and tries again."""
+    rig = handover(8)
+    rig.run(30.0, until=_until("left", "close"))
+    at = rig.world.model.joint("hammer").qposadr[0]
+    rig.world.data.qpos[at : at + 2] += (0.02, 0.09)
+    rig.world.refresh()
+    rig.run(50.0)
+    assert verdict(rig, "left", "right") == ""
+    assert rig.behaviours["left"].attempts == 2  # type: ignore[attr-defined]
+
+
+def test_thing_dropped_on_the_way_is_picked_up_again() -> None:
+    """The thing is torn out of the gripper in the air: the giver takes it from the table again."""
+    rig = handover(9)
+    rig.run(30.0, until=_until("left", "present"))
+    body = rig.world.model.body("hammer").id
+    rig.world.data.xfrc_applied[body, 2] = -300.0
+    rig.run(5.0, until=lambda r: r.world.view().object_pose("hammer").p[2] < 0.06)
+    rig.world.data.xfrc_applied[body] = 0.0
+    rig.run(60.0)
+    assert verdict(rig, "left", "right") == ""
+    assert rig.behaviours["left"].attempts >= 2  # type: ignore[attr-defined]
+
+
+def test_giver_gives_up_when_nobody_comes() -> None:
+    rig = Rig({"left": Giver("left", "hammer", "right", patience_s=2.0), "right": Idle("right")}, seed=10)
+    rig.run(30.0, until=lambda r: r.behaviours["left"].done)
+    giver = rig.behaviours["left"]
+    assert giver.phase == "failed"
+    assert giver.failed == "nobody took the hammer within 2 s"
+    assert rig.world.view().object_contacts()[0].grippers == ("left",)  # it does not drop it
+
+
+def test_receiver_gives_up_when_nothing_is_offered() -> None:
+    rig = Rig({"left": Idle("left"), "right": Receiver("right", "hammer", "left", patience_s=1.0)}, seed=11)
+    rig.run(5.0, until=lambda r: r.behaviours["right"].done)
+    assert rig.behaviours["right"].failed == "nobody offered the hammer within 1 s"
+
+
+def test_wander_stays_near_and_cycles_the_clutch() -> None:
+    rig = Rig({"left": Wander("left", seed=3), "right": Wander("right", seed=4)}, seed=12)
+    home = rig.world.view().tip_pose("left").p
+    clutches, farthest = set(), 0.0
+
+    def look(r: Rig) -> bool:
+        nonlocal farthest
+        farthest = max(farthest, distance(home, r.world.view().tip_pose("left").p))
+        clutches.add(r.behaviours["left"].phase)
+        return False
+
+    rig.run(12.0, until=look)
+    assert clutches == {"wait", "move", "clutch"}
+    assert 0.05 < farthest < 0.2
+    assert rig.fastest_hand < 0.5
+
+
+def test_same_seed_same_handover() -> None:
+    """Operators use no clock and no hidden randomness."""
+    first, second = handover(13), handover(13)
+    first.run(3.0, until=lambda r: False)
+    second.run(3.0, until=lambda r: False)
+    assert first.world.state_bytes() == second.world.state_bytes()
+
+
+def test_make_behaviour() -> None:
+    assert isinstance(make_behaviour("giver", "left"), Giver)
+    assert make_behaviour("receiver", "right", "board").partner == "left"  # type: ignore[attr-defined]
+    assert isinstance(make_behaviour("wander", "arm3", seed=5), Wander)
+    assert isinstance(make_behaviour("idle", "arm3", device=DEVICE), Idle)
+    with pytest.raises(ValueError, match="needs a partner"):
+        make_behaviour("giver", "arm1")
+    with pytest.raises(ValueError, match="Available behaviours: giver, receiver, wander, idle"):
+        make_behaviour("juggler", "left")
+    with pytest.raises(ValueError, match="Known things: hammer, board"):
+        make_behaviour("giver", "left", "teapot")
+
+
+def test_hand_turns_with_the_tip() -> None:
+    """Rotation is relative too: the hand turns about the world's axes by what the tip shall turn."""
+    rig = handover(14, shift=False)
+    rig.run(30.0, until=_until("left", "descend"))
+    tip, hand = rig.world.view().tip_pose("left"), rig.views["left"].hand
+    assert math.isclose(sum(c * c for c in hand[1]), 1.0, abs_tol=1e-9)
+    assert tip.q != hand[1]
