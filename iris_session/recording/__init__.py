@@ -1,1 +1,51 @@
-"""recording"""
+"""Recording room: journal, the feed to the recorder process, reading back, verification. See docs/architecture.md.
+
+Rerun is imported only where files are written or read, so that the authority stays light.
+"""
+
+from iris_session.recording.errors import NotARecordingError, RecorderError, RecordingError
+from iris_session.recording.feed import FeedStats, RecorderFeed
+from iris_session.recording.journal import (
+    CLOSED,
+    OPEN,
+    JournalRow,
+    Keyframe,
+    SessionHeader,
+    check_row,
+    header_root,
+    make_row,
+    pack_model,
+    unpack_model,
+)
+from iris_session.recording.reader import RawSample, Recording, State
+from iris_session.recording.supervise import RecorderProcess
+from iris_session.recording.verify import Core, Problem, VerifyReport, verify
+
+__all__ = [
+    # making one
+    "SessionHeader",
+    "JournalRow",
+    "Keyframe",
+    "CLOSED",
+    "OPEN",
+    "make_row",
+    "check_row",
+    "header_root",
+    "pack_model",
+    "unpack_model",
+    "RecorderProcess",
+    "RecorderFeed",
+    "FeedStats",
+    # reading one
+    "Recording",
+    "State",
+    "RawSample",
+    "verify",
+    "VerifyReport",
+    "Problem",
+    "Core",
+    # errors
+    "RecordingError",
+    "RecorderError",
+    "NotARecordingError",
+]

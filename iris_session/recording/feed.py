@@ -1,0 +1,230 @@
+"""The authority's side of the recorder: hands over journal rows, states and events without ever blocking a step.
+
+Batches of about 20 ms are numbered and kept until the recorder says that they are in the file: first in a window in
+memory, beyond it in a spill file. A recorder that was killed and started anew gets everything that was not yet in the
+file. Only when memory and spill are both full are rows dropped: counted, and told by `take_gap`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, TypeVar
+
+import msgspec
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import PresenceItem, Reply
+from iris_session.protocol.steps import Decision
+from iris_session.recording import messages
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal
+from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, RecorderStatus, StateFrame
+from iris_session.recording.spill import SpillFile
+
+_T = TypeVar("_T")
+
+BATCH_ROWS: Final = 10
+BATCH_NS: Final = 20_000_000
+#: Memory for batches that are not in the file yet. 2 operators, 50 bodies: about 0.5 MB/s, so 30 s.
+WINDOW_BYTES: Final = 16 << 20
+SPILL_BYTES: Final = 2 << 30
+#: Records taken from the spill file per flush: 20 ms of backlog 4 times over, so that a flush stays short.
+UNSPILL_BATCHES: Final = 4
+#: Bound on each list of one batch. A flush comes long before; it holds when a caller never takes a step.
+BATCH_ITEMS: Final = 4096
+
+
+class FeedStats(msgspec.Struct):
+    """Counters of one feed. `dropped_rows`: rows that are lost for the recording; `recorder`: its last status."""
+
+    rows: int = 0
+    batches: int = 0
+    bytes: int = 0
+    window_bytes: int = 0
+    spilled_batches: int = 0
+    waiting_in_spill: int = 0
+    dropped_rows: int = 0
+    dropped_items: int = 0
+    recorders: int = 0
+    spill_fault: str = ""
+    recorder: RecorderStatus | None = None
+
+
+class RecorderFeed:
+    """One feed per session, used from the thread that takes the steps. No clock, no threads.
+
+    Call `row` once per step (it flushes by itself), `keyframe` every few seconds and whenever `wants_keyframe`.
+    `endpoint`: where the recorder process listens, see `RecorderProcess.feed_endpoint`.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        spill_dir: str | Path,
+        window_bytes: int = WINDOW_BYTES,
+        spill_bytes: int = SPILL_BYTES,
+    ) -> None:
+        self.stats = FeedStats()
+        self.wants_keyframe = False
+        self._window_limit = window_bytes
+        self._spill = SpillFile(Path(spill_dir) / f"feed-{os.getpid()}.spill", spill_bytes)
+        self._context = zmq.Context(io_threads=1)
+        self._socket = self._context.socket(zmq.DEALER)
+        # Unlimited marks: the window is the bound, and a refused send would be a second one to account for.
+        self._socket.setsockopt(zmq.SNDHWM, 0)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.connect(endpoint)
+        self._header = b""
+        self._next = 0
+        self._window: deque[tuple[int, bytes]] = deque()
+        self._instance = 0
+        self._header_sent_to = 0
+        self._gap_rows = 0
+        self._batch = Batch()
+        self._batch_since = 0
+        self._now = (0, 0)  # step and session time of the newest row
+        self._presence: tuple[PresenceItem, ...] = ()
+
+    def header(self, header: SessionHeader) -> None:
+        """Names the session: once, before the first row."""
+        self._header = messages.encode_header(header)
+        self._exchange()
+
+    def row(self, row: JournalRow) -> None:
+        """One step. Flushes after 10 rows or 20 ms of session time."""
+        batch = self._batch
+        if not batch.rows:
+            self._batch_since = row.now_ns
+        batch.rows.append(row)
+        self._now = (row.step, row.now_ns)
+        self.stats.rows += 1
+        if len(batch.rows) >= BATCH_ROWS or row.now_ns - self._batch_since >= BATCH_NS:
+            self.flush()
+
+    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        """Snapshots after the step of the newest row, whose `chain` is given (`header_root` before the first row)."""
+        self.wants_keyframe = False
+        self._batch.keyframes.append(seal(keyframe, chain))
+        self.flush()
+
+    def state(
+        self,
+        step: int,
+        tick: int,
+        sim_time: float,
+        session_time: int,
+        poses: NDArray[np.float64],
+        applied: Sequence[Applied] = (),
+    ) -> None:
+        """World poses (n_bodies, 7) `x y z qw qx qy qz` of the header's bodies, at the state rate; presence with it."""
+        frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), self._presence, tuple(applied))
+        self._add(self._batch.states, frame)
+
+    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+        """Events and denials of one step; its presence goes with the next state."""
+        if decision.presence:
+            self._presence = decision.presence
+        for event in decision.events:
+            self._add(self._batch.events, event)
+        for outgoing in decision.outgoing:
+            message = outgoing.message
+            if type(message) is Reply and message.denial is not None:
+                record = DenialRecord(step, session_time, outgoing.connection, message.denial)
+                self._add(self._batch.denials, record)
+
+    def metric(self, name: str, value: float) -> None:
+        """A scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
+        self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
+
+    def take_gap(self) -> int:
+        """Rows lost since the last call: journal them as `Entry(RecordingGap(rows))` and take a keyframe."""
+        rows, self._gap_rows = self._gap_rows, 0
+        return rows
+
+    def flush(self) -> None:
+        """Numbers the pending batch and hands over what the window allows. Never blocks."""
+        batch = self._batch
+        if batch.rows or batch.states or batch.events or batch.denials or batch.metrics or batch.keyframes:
+            self._batch = Batch(dropped_rows=self.stats.dropped_rows)
+            self._enqueue(messages.encode_batch(batch), len(batch.rows))
+        self._exchange()
+
+    def close(self, timeout_s: float = 5.0) -> bool:
+        """Hands over everything and waits until it is in the file. False: not all of it is, after `timeout_s`.
+
+        Without a header nothing was recorded, and there is nothing to wait for. A second call does nothing.
+        """
+        if self._socket.closed:
+            return not self._window
+        self.flush()
+        waits = max(1, round(timeout_s / 0.02))
+        while waits and self._header and (self._window or self._spill) and not self._fault():
+            self._socket.poll(20)
+            self._exchange()
+            waits -= 1
+        complete = not self._window and not self._spill
+        self._spill.close()
+        self._socket.close(0)
+        self._context.term()
+        return complete
+
+    def _add(self, items: list[_T], item: _T) -> None:
+        if len(items) < BATCH_ITEMS:
+            items.append(item)
+        else:
+            self.stats.dropped_items += 1
+
+    def _enqueue(self, body: bytes, rows: int) -> None:
+        if not self._spill and self.stats.window_bytes + len(body) <= self._window_limit:
+            self._send_batch(body)
+        elif self._spill.push(body, rows):
+            self.stats.spilled_batches += 1
+        else:
+            self.stats.dropped_rows += rows
+            self.stats.spill_fault = self._spill.fault
+            self._gap_rows += rows
+            self.wants_keyframe = True
+            self._batch.dropped_rows = self.stats.dropped_rows
+
+    def _send_batch(self, body: bytes) -> None:
+        number, self._next = self._next, self._next + 1
+        self._window.append((number, body))
+        self.stats.batches += 1
+        self.stats.bytes += len(body)
+        self.stats.window_bytes += len(body)
+        if self._instance and self._header_sent_to == self._instance:
+            self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+
+    def _exchange(self) -> None:
+        while int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
+            self._take(messages.decode_status(self._socket.recv(zmq.NOBLOCK)))
+        for _ in range(UNSPILL_BATCHES):
+            if not self._spill or self.stats.window_bytes >= self._window_limit:
+                break
+            record = self._spill.pop()
+            if record is not None:
+                self._send_batch(record[0])
+        self.stats.waiting_in_spill = len(self._spill)
+
+    def _take(self, status: RecorderStatus) -> None:
+        self.stats.recorder = status
+        if status.instance != self._instance:
+            self._instance = status.instance
+            self.stats.recorders += 1
+        while self._window and self._window[0][0] <= status.written:
+            self.stats.window_bytes -= len(self._window.popleft()[1])
+        if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
+            self._header_sent_to = self._instance
+            first = self._window[0][0] if self._window else self._next
+            self._socket.send_multipart((messages.FRAME.pack(messages.HEADER, first), self._header), zmq.NOBLOCK)
+            for number, body in self._window:
+                self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
+
+    def _fault(self) -> str:
+        return self.stats.recorder.fault if self.stats.recorder else ""

@@ -1,0 +1,277 @@
+"""The journal of a session: header, one row per step, keyframes, and the checks that name what was changed. Pure.
+
+A step is `(now_ns, entries, n_ticks)`; its row also holds the digest of what came out and a hash chained over all
+rows. Every field has its own CRC-32, every entry too, so that damage is attributed to a field, or to an entry, even
+when the bytes no longer decode. CRCs find accidents; the chain finds rows that were left out, moved or rewritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Count, Name, Nanoseconds
+from iris_session.protocol.entries import Entry, encode_entry
+from iris_session.protocol.server_messages import BodyInfo
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+
+FORMAT: Final = 1
+CLOSED: Final = "closed"  # all code ours: re-simulated bit for bit
+OPEN: Final = "open"  # a user's loop or a real robot: the plant's state comes from the rows
+HASH_BYTES: Final = 16
+
+#: Fields of a row with a CRC of their own, in the order of `JournalRow.field_crcs`. `entry_index` is the array header
+#: of `entries` with `entry_lengths` and `entry_crcs`.
+FIELDS: Final = ("step", "now_ns", "n_ticks", "digest", "plant", "entry_index")
+
+_I64 = struct.Struct("<q")
+_STEP = struct.Struct("<qqq")
+_encoder = msgspec.msgpack.Encoder()
+
+
+class SessionHeader(msgspec.Struct, frozen=True):
+    """What a recording needs to be understood and re-simulated. Holds no key, secret or token.
+
+    `recording_class`: `closed` or `open`. `config`: the session's configuration as its composer encodes it. `model`:
+    `pack_model` of the MuJoCo model's binary form (mjb). `bodies`: the streamed bodies in the order of state poses.
+    `versions`: of Python, the libraries and the platform, see `versions.py`.
+    """
+
+    session_id: Name
+    session_name: Name
+    recording_class: Name
+    tick_period_ns: Nanoseconds
+    config: bytes = b""
+    model: bytes = b""
+    scene_hash: Name = ""
+    robots: tuple[RobotSpec, ...] = ()
+    objects: tuple[ObjectSpec, ...] = ()
+    bodies: tuple[BodyInfo, ...] = ()
+    versions: dict[str, str] = {}
+    created_utc: str = ""
+    format: int = FORMAT
+
+
+class JournalRow(msgspec.Struct, frozen=True, array_like=True):
+    """One step. Make it with `make_row`.
+
+    `entries`: MessagePack array of `iris_session.protocol.entries.Entry`; `entry_lengths` and `entry_crcs`: bytes and
+    CRC-32 of each. `plant`: in class `open`, the plant's `mjSTATE_INTEGRATION` at the start of this step. `digest`:
+    16 bytes over everything the step gave. `chain`: 16 bytes over the previous row's chain and this whole row.
+    """
+
+    step: Count
+    now_ns: Nanoseconds
+    n_ticks: Count
+    entries: bytes
+    entry_lengths: tuple[int, ...]
+    entry_crcs: tuple[int, ...]
+    digest: bytes
+    chain: bytes
+    field_crcs: tuple[int, ...]
+    plant: bytes = b""
+
+
+class Keyframe(msgspec.Struct, frozen=True, array_like=True):
+    """Snapshots after step `step`: what `restore` needs.
+
+    `step` -1: the initial state. `status`: the control report that the next step's authority sees, as its composer
+    encodes it. `chain` (of row `step`) and `crcs` (see `SNAPSHOTS`) are filled in by `seal`.
+    """
+
+    step: int
+    plant: bytes
+    authority: bytes
+    controller: bytes
+    status: bytes = b""
+    chain: bytes = b""
+    crcs: tuple[int, ...] = ()
+
+
+#: The snapshots of a keyframe, in the order of `Keyframe.crcs`; a last CRC is that of `step` and `chain`.
+SNAPSHOTS: Final = ("plant", "authority", "controller", "status")
+
+
+class RowProblem(msgspec.Struct, frozen=True):
+    """What is wrong with a row. `entry`: index of the changed entry, -1 when it is not an entry."""
+
+    step: int
+    field: str
+    text: str
+    entry: int = -1
+
+
+def header_root(header: SessionHeader) -> bytes:
+    """The chain value before the first row: 16 bytes that bind the rows to this header."""
+    return hashlib.blake2b(_encoder.encode(header), digest_size=HASH_BYTES).digest()
+
+
+def pack_model(mjb: bytes) -> bytes:
+    """Compresses a binary MuJoCo model for `SessionHeader.model`."""
+    return zlib.compress(mjb, 6)
+
+
+def unpack_model(packed: bytes) -> bytes:
+    """Inverse of `pack_model`. Raises `zlib.error` for damaged bytes."""
+    return zlib.decompress(packed)
+
+
+def array_header(n: int) -> bytes:
+    """The MessagePack header of an array of `n` items."""
+    if n < 16:
+        return bytes((0x90 | n,))
+    return struct.pack(">BH", 0xDC, n) if n < 65536 else struct.pack(">BI", 0xDD, n)
+
+
+def make_row(
+    prev_chain: bytes,
+    step: int,
+    now_ns: int,
+    n_ticks: int,
+    entries: Sequence[Entry],
+    digest: bytes,
+    plant: bytes = b"",
+) -> JournalRow:
+    """The row of one step. `prev_chain`: `chain` of the previous row, `header_root(header)` for the first."""
+    if entries:
+        encoded = [encode_entry(entry) for entry in entries]
+        head = array_header(len(encoded))
+        blob = head + b"".join(encoded)
+        lengths, crcs = tuple(map(len, encoded)), tuple(map(zlib.crc32, encoded))
+    else:
+        head = blob = b"\x90"
+        lengths = crcs = ()
+    field_crcs = _field_crcs(step, now_ns, n_ticks, digest, plant, head, lengths, crcs)
+    chain = _chain(prev_chain, step, now_ns, n_ticks, blob, digest, plant, (*lengths, *crcs, *field_crcs))
+    return JournalRow(step, now_ns, n_ticks, blob, lengths, crcs, digest, chain, field_crcs, plant)
+
+
+def check_row(prev_chain: bytes, row: JournalRow) -> RowProblem | None:
+    """None when `row` is what was written after the row with `prev_chain`; else the changed field or entry."""
+    if _rechain(prev_chain, row) == row.chain:
+        return None
+    problem = _field_problem(prev_chain, row) or _entry_problem(row)
+    if problem is not None:
+        return problem
+    text = "the chain does not continue: its own value was changed, or rows before it were left out, moved or rewritten"
+    return RowProblem(row.step, "chain", text)
+
+
+def chain_of(prev_chain: bytes, row: JournalRow) -> bytes:
+    """The chain value that `row` ought to have; to go on checking after a row whose `chain` was changed."""
+    return _rechain(prev_chain, row)
+
+
+def check_fields(row: JournalRow) -> RowProblem | None:
+    """`check_row` without the chain, for a row whose predecessor is lost."""
+    return _field_problem(None, row) or _entry_problem(row)
+
+
+def seal(keyframe: Keyframe, chain: bytes) -> Keyframe:
+    """`keyframe` with the chain value of its row and its CRCs."""
+    return msgspec.structs.replace(keyframe, chain=chain, crcs=_keyframe_crcs(keyframe, chain))
+
+
+def check_keyframe(keyframe: Keyframe) -> str:
+    """The name of the first field that differs from its CRC, empty when all are as written."""
+    now = _keyframe_crcs(keyframe, keyframe.chain)
+    if len(keyframe.crcs) != len(now):
+        return "crcs"
+    changed = [name for name, a, b in zip((*SNAPSHOTS, "step"), now, keyframe.crcs, strict=True) if a != b]
+    return changed[0] if changed else ""
+
+
+def _keyframe_crcs(keyframe: Keyframe, chain: bytes) -> tuple[int, ...]:
+    snapshots = (zlib.crc32(getattr(keyframe, name)) for name in SNAPSHOTS)
+    return (*snapshots, zlib.crc32(chain, zlib.crc32(_I64.pack(keyframe.step))))
+
+
+def _rechain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | None = None) -> bytes:
+    numbers = (*row.entry_lengths, *row.entry_crcs, *(row.field_crcs if field_crcs is None else field_crcs))
+    return _chain(prev_chain, row.step, row.now_ns, row.n_ticks, row.entries, row.digest, row.plant, numbers)
+
+
+def _chain(
+    prev_chain: bytes,
+    step: int,
+    now_ns: int,
+    n_ticks: int,
+    blob: bytes,
+    digest: bytes,
+    plant: bytes,
+    numbers: tuple[int, ...],
+) -> bytes:
+    h = hashlib.blake2b(prev_chain, digest_size=HASH_BYTES)
+    h.update(_STEP.pack(step, now_ns, n_ticks))
+    h.update(digest)
+    h.update(struct.pack(f"<{len(numbers)}q", *numbers))
+    h.update(blob)
+    h.update(plant)
+    return h.digest()
+
+
+def _field_crcs(
+    step: int,
+    now_ns: int,
+    n_ticks: int,
+    digest: bytes,
+    plant: bytes,
+    head: bytes,
+    lengths: tuple[int, ...],
+    crcs: tuple[int, ...],
+) -> tuple[int, ...]:
+    crc = zlib.crc32
+    index = head if not lengths else head + struct.pack(f"<{2 * len(lengths)}q", *lengths, *crcs)
+    return (
+        crc(_I64.pack(step)),
+        crc(_I64.pack(now_ns)),
+        crc(_I64.pack(n_ticks)),
+        crc(digest),
+        crc(plant),
+        crc(index),
+    )
+
+
+def _field_problem(prev_chain: bytes | None, row: JournalRow) -> RowProblem | None:
+    head_bytes = max(0, len(row.entries) - sum(row.entry_lengths))
+    head = row.entries[:head_bytes]
+    now = _field_crcs(row.step, row.now_ns, row.n_ticks, row.digest, row.plant, head, row.entry_lengths, row.entry_crcs)
+    if now == row.field_crcs:
+        return None
+    if prev_chain is not None and _rechain(prev_chain, row, now) == row.chain:
+        return RowProblem(row.step, "field_crcs", "the checksums of the fields were changed, the fields are intact")
+    if len(row.field_crcs) != len(FIELDS):
+        return RowProblem(row.step, "field_crcs", f"{len(row.field_crcs)} field checksums, expected {len(FIELDS)}")
+    changed = [name for name, a, b in zip(FIELDS, now, row.field_crcs, strict=True) if a != b]
+    if changed == ["entry_index"]:
+        return _index_problem(row, head)
+    return RowProblem(row.step, changed[0], f"field {', '.join(changed)} was changed")
+
+
+def _index_problem(row: JournalRow, head: bytes) -> RowProblem:
+    if len(row.entry_crcs) == len(row.entry_lengths) and head == array_header(len(row.entry_lengths)):
+        for i, data in enumerate(_slices(row)):
+            if zlib.crc32(data) != row.entry_crcs[i]:
+                return RowProblem(row.step, "entry_crcs", f"the checksum or length of entry {i} was changed", i)
+    return RowProblem(row.step, "entries", "the index of the entries (count, lengths, checksums) was changed")
+
+
+def _entry_problem(row: JournalRow) -> RowProblem | None:
+    for i, (data, crc) in enumerate(zip(_slices(row), row.entry_crcs, strict=False)):
+        if zlib.crc32(data) != crc:
+            return RowProblem(row.step, "entries", f"entry {i} was changed", i)
+    return None
+
+
+def _slices(row: JournalRow) -> list[bytes]:
+    at = len(row.entries) - sum(row.entry_lengths)
+    out = []
+    for length in row.entry_lengths:
+        out.append(row.entries[at : at + length])
+        at += length
+    return out

@@ -1,0 +1,104 @@
+"""What travels between the authority's feed and the recorder process. Pure.
+
+Authority -> recorder, two frames each: `HEADER` with the number of the batch that follows it, or `BATCH` with its own
+number, then the body. Recorder -> authority: `RecorderStatus`. The feed keeps every batch until a status says that it
+is in the file; a new recorder process asks for the header (`expecting` -1) and gets everything since.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
+from iris_session.protocol.server_messages import Event, PresenceItem
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
+
+
+class RecorderConfig(msgspec.Struct, frozen=True):
+    """Configuration of the recorder process. `path`: the file of this part, must not exist. Endpoints: `ipc://` sockets
+    that it binds. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: process id that it outlives only to
+    finish the file."""
+
+    path: str
+    recording_id: str
+    feed_endpoint: str
+    samples_endpoint: str
+    origin_ns: int
+    parent: int
+
+
+HEADER: Final = b"H"
+BATCH: Final = b"B"
+FRAME: Final = struct.Struct("<cQ")  # kind, batch number
+
+
+class StateFrame(msgspec.Struct, frozen=True, array_like=True):
+    """Rigid state at one moment. `poses`: float64 (n_bodies, 7) C-contiguous, `x y z qw qx qy qz`, world frame."""
+
+    step: Count
+    tick: Count
+    sim_time: float
+    session_time: Nanoseconds
+    poses: bytes
+    presence: tuple[PresenceItem, ...] = ()
+    applied: tuple[Applied, ...] = ()
+
+
+class DenialRecord(msgspec.Struct, frozen=True, array_like=True):
+    """A typed no that a participant got."""
+
+    step: Count
+    session_time: Nanoseconds
+    connection: Count
+    denial: Denial
+
+
+class MetricRecord(msgspec.Struct, frozen=True, array_like=True):
+    """One scalar for the plots: lateness, latency."""
+
+    step: Count
+    session_time: Nanoseconds
+    name: Name
+    value: float
+
+
+class Batch(msgspec.Struct, array_like=True):
+    """Everything of about 20 ms. `dropped_rows`: rows lost before this batch since the feed began."""
+
+    rows: list[JournalRow] = []
+    states: list[StateFrame] = []
+    events: list[Event] = []
+    denials: list[DenialRecord] = []
+    metrics: list[MetricRecord] = []
+    keyframes: list[Keyframe] = []
+    dropped_rows: Count = 0
+
+
+class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
+    """Sent after every write, and at least every half second. `written`: newest batch that is in the file, -1 for none.
+
+    `expecting`: number of the next batch, -1 until a header came. `cpu_ns`: processor time of the recorder so far.
+    `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none.
+    `fault`: one line when the file can no longer be written; the process then ends.
+    """
+
+    instance: int
+    expecting: int
+    written: int
+    bytes: int = 0
+    cpu_ns: int = 0
+    lag_ns: int = 0
+    samples: int = 0
+    samples_refused: int = 0
+    fault: str = ""
+
+
+encode_batch = msgspec.msgpack.Encoder().encode
+decode_batch = msgspec.msgpack.Decoder(Batch).decode
+encode_header = msgspec.msgpack.Encoder().encode
+decode_header = msgspec.msgpack.Decoder(SessionHeader).decode
+encode_status = msgspec.msgpack.Encoder().encode
+decode_status = msgspec.msgpack.Decoder(RecorderStatus).decode

@@ -1,0 +1,249 @@
+"""The recorder process: `python -m iris_session.recording.process`, configuration as MessagePack on standard input.
+
+Takes batches from the authority and raw samples from the front, and writes them into one Rerun file about seven times
+a second, so that a killed process of any kind costs at most 0.25 s. Says `ready` or `failed: <one line>` on standard
+output. Ends by SIGTERM, or when its parent is gone, after writing everything that was received; SIGINT is the parent's.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import zmq
+
+from iris_session.recording.errors import RecorderError
+from iris_session.recording.messages import (
+    BATCH,
+    FRAME,
+    HEADER,
+    RecorderConfig,
+    RecorderStatus,
+    decode_batch,
+    decode_header,
+    encode_status,
+)
+from iris_session.recording.writer import RrdWriter, WriteError
+
+#: Sockets are drained at this period instead of at every message: one wake-up for some twenty messages.
+DRAIN_S: Final = 0.03
+FLUSH_S: Final = 0.14
+SYNC_S: Final = 1.0
+STATUS_S: Final = 0.5
+#: Messages taken per drain, so that a flood cannot keep the file from being written.
+DRAIN_MESSAGES: Final = 4096
+#: After SIGTERM or the parent's end: quiet for this long means that everything was received.
+QUIET_S: Final = 0.1
+FINISH_S: Final = 10.0
+MIN_FREE_BYTES: Final = 16 << 20
+
+_decode_sample = msgspec.msgpack.Decoder(tuple[int, int, bytes]).decode
+
+
+class Recorder:
+    """The loop of the process. `stop` may be called from a signal handler."""
+
+    def __init__(self, config: RecorderConfig) -> None:
+        self._config = config
+        self._context = zmq.Context(io_threads=1)
+        self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
+        self._front = self._bind(zmq.PULL, config.samples_endpoint)
+        claim(Path(config.path))
+        self._writer = RrdWriter(config.path, config.recording_id)
+        self._writer.flush()
+        self._syncer = _Syncer(config.path)
+        self._instance = time.time_ns()
+        self._expecting = -1
+        self._received = -1
+        self._newest_ns = 0  # session time of the newest row received
+        self._lag_ns = 0
+        self._samples = 0
+        self._refused = 0
+        self._fault = ""
+        self._stopping = False
+
+    def run(self) -> int:
+        """Records until told to stop. Returns the exit status of the process."""
+        try:
+            self._say(-1)
+            self._loop()
+            self._drain_all()
+            self._writer.close()
+            self._say(self._received)
+        except WriteError as error:
+            self._fault = str(error)
+            self._say(-1)
+            sys.stderr.write(self._fault + "\n")
+            return 3
+        finally:
+            self._syncer.stop()
+            self._context.destroy(linger=500)
+        return 0
+
+    def stop(self) -> None:
+        """Asks the loop to finish the file."""
+        self._stopping = True
+
+    def _bind(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.RCVHWM, 20_000)
+        socket.setsockopt(zmq.SNDHWM, 100)
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            raise RecorderError(f"the recorder cannot listen on {endpoint}: {error}") from error
+        return socket
+
+    def _loop(self) -> None:
+        flush_at = status_at = 0.0
+        while not self._stopping and os.getppid() == self._config.parent:
+            time.sleep(DRAIN_S)
+            n = self._drain()
+            now = time.monotonic()
+            if now >= flush_at:
+                flush_at = now + FLUSH_S
+                self._writer.flush()
+                self._syncer.check()
+                self._lag_ns = time.monotonic_ns() - self._config.origin_ns - self._newest_ns
+                if n or now >= status_at:
+                    status_at = now + STATUS_S
+                    self._say(self._received)
+
+    def _drain_all(self) -> None:
+        until = time.monotonic() + FINISH_S
+        quiet_at = time.monotonic() + QUIET_S
+        while time.monotonic() < min(until, quiet_at):
+            if self._drain():
+                quiet_at = time.monotonic() + QUIET_S
+                self._writer.flush()
+                self._say(self._received)
+            time.sleep(DRAIN_S)
+
+    def _drain(self) -> int:
+        n = 0
+        while n < DRAIN_MESSAGES and int(self._feed.get(zmq.EVENTS)) & zmq.POLLIN:
+            self._take(self._feed.recv_multipart(zmq.NOBLOCK))
+            n += 1
+        m = 0
+        while m < DRAIN_MESSAGES:
+            try:
+                data = self._front.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            m += 1
+            self._take_sample(data)
+        return n + m
+
+    def _take(self, frames: list[bytes]) -> None:
+        """Batches are taken in order only: what a new process gets before its header comes again after it."""
+        if len(frames) != 2 or len(frames[0]) != FRAME.size:
+            return
+        kind, number = FRAME.unpack(frames[0])
+        if kind == HEADER and self._expecting < 0:
+            self._writer.header(decode_header(frames[1]))
+            self._expecting = number
+            self._received = number - 1
+        elif kind == BATCH and number == self._expecting:
+            batch = decode_batch(frames[1])
+            if batch.rows:
+                self._newest_ns = batch.rows[-1].now_ns
+            self._writer.add(batch)
+            self._received = number
+            self._expecting = number + 1
+
+    def _take_sample(self, data: bytes) -> None:
+        try:
+            connection, receive_ns, sample = _decode_sample(data)
+        except msgspec.DecodeError:
+            self._refused += 1
+            return
+        self._samples += 1
+        self._writer.add_sample(connection, receive_ns, sample)
+
+    def _say(self, written: int) -> None:
+        size = os.stat(self._config.path).st_size
+        status = RecorderStatus(
+            self._instance,
+            self._expecting,
+            written,
+            size,
+            time.process_time_ns(),
+            self._lag_ns,
+            self._samples,
+            self._refused,
+            self._fault,
+        )
+        with suppress(zmq.Again):
+            self._feed.send(encode_status(status), zmq.NOBLOCK)
+
+
+class _Syncer:
+    """Makes the file durable once a second from its own thread: a slow disk delays no write. Rerun never syncs."""
+
+    def __init__(self, path: str) -> None:
+        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._ended = threading.Event()
+        self._fault = ""
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raises `WriteError` when the disk reported an error."""
+        if self._fault:
+            raise WriteError(self._fault)
+
+    def stop(self) -> None:
+        self._ended.set()
+        self._thread.join(timeout=5.0)
+        with suppress(OSError):
+            os.fsync(self._fd)
+        os.close(self._fd)
+
+    def _run(self) -> None:
+        while not self._ended.wait(SYNC_S):
+            try:
+                os.fsync(self._fd)
+            except OSError as error:
+                self._fault = f"the recording cannot be made durable: {error.strerror}"
+                return
+
+
+def claim(path: Path) -> None:
+    """Creates the folder and the empty file. Raises `RecorderError`: no right, no space, or a file that exists."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
+        free = os.statvfs(path.parent)
+    except FileExistsError:
+        raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file") from None
+    except OSError as error:
+        raise RecorderError(f"cannot record to {path}: {error.strerror or error}") from error
+    if free.f_bavail * free.f_frsize < MIN_FREE_BYTES:
+        path.unlink(missing_ok=True)
+        raise RecorderError(f"cannot record to {path}: less than {MIN_FREE_BYTES >> 20} MiB of the disk are free")
+
+
+def main() -> int:
+    """Entry of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    config = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=RecorderConfig)
+    try:
+        recorder = Recorder(config)
+    except (RecorderError, WriteError) as error:
+        print(f"failed: {error}", flush=True)
+        sys.stderr.write(f"{error}\n")
+        return 1
+    signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
+    print("ready", flush=True)
+    return recorder.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,283 @@
+"""Reads a recording back exactly: header, journal, keyframes, states, events, raw samples; damaged files too.
+
+A recording is `session.rrd` and, when its recorder was started anew, `session.part2.rrd` and so on. `Recording.open`
+takes all of them; steps that two parts hold count once.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zlib
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple, Self, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import Event, PresenceItem
+from iris_session.recording import paths, rrd_file
+from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
+from iris_session.recording.messages import DenialRecord, decode_header
+
+_decode_event = msgspec.msgpack.Decoder(Event).decode
+_decode_denial = msgspec.msgpack.Decoder(DenialRecord).decode
+_decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
+_decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
+
+
+_T = TypeVar("_T")
+#: A new part repeats at most what the feed's window held: minutes of rows.
+REPEATED_ITEMS: Final = 200_000
+
+
+class RawSample(NamedTuple):
+    """A message of a client as it came. `receive_ns`: session time."""
+
+    connection: int
+    receive_ns: int
+    data: bytes
+
+
+class State(NamedTuple):
+    """`poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, world frame, exactly as the session had them."""
+
+    step: int
+    tick: int
+    sim_time: float
+    session_time: int
+    poses: NDArray[np.float64]
+    presence: tuple[PresenceItem, ...]
+    applied: tuple[Applied, ...]
+
+
+class Recording:
+    """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
+
+    `damage`: one line per thing that could not be read; it grows while reading. `finished`: every part was closed
+    in order, not killed.
+    """
+
+    def __init__(self, files: list[str]) -> None:
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.files: list[str] = []
+        self._readable: list[str] = []
+        self.damage: list[str] = []
+        self.finished = True
+        for path in files:
+            self._add_part(path)
+        self.header = self._header(files[0])
+
+    @classmethod
+    def open(cls, path: str | Path) -> Recording:
+        """Opens the recording whose first file (or only surviving part) is `path`.
+
+        Raises `NotARecordingError` with one line: no such file, no Rerun file, no session in it.
+        """
+        first = str(path)
+        if not os.path.isfile(first):
+            raise NotARecordingError(f"there is no recording {first}")
+        files = [first]
+        while os.path.isfile(following := paths.part_path(first, len(files) + 1)):
+            files.append(following)
+        return cls(files)
+
+    def rows(self) -> Iterator[JournalRow]:
+        """The journal in order. Where rows are missing, `step` jumps."""
+        return self._unique(paths.ROWS, _rows, lambda row: row.chain)
+
+    def count_rows(self) -> int:
+        """Number of rows in the files, for showing progress."""
+        return sum(batch.num_rows for _, batch in self._batches(paths.ROWS))
+
+    def keyframes(self) -> Iterator[Keyframe]:
+        """The keyframes in order."""
+        return self._unique(paths.KEYFRAMES, _keyframes, lambda keyframe: keyframe.step)
+
+    def states(self) -> Iterator[State]:
+        """Poses of all bodies at the state rate, with presence and the applied samples."""
+        n = len(self.header.bodies)
+        return self._unique(paths.STATE, lambda batch: _states(batch, n), lambda state: state.session_time)
+
+    def events(self) -> Iterator[Event]:
+        """The shared history in order of `event_seq`."""
+        return self._unique(
+            paths.EVENTS, lambda batch: map(_decode_event, _values(batch, "event")), lambda event: event.event_seq
+        )
+
+    def denials(self) -> Iterator[DenialRecord]:
+        """Every typed no, in order."""
+        return self._unique(
+            paths.DENIALS, lambda batch: map(_decode_denial, _values(batch, "denial")), lambda record: record
+        )
+
+    def samples(self) -> Iterator[RawSample]:
+        """Raw messages of clients, in the order of receipt."""
+        for _, batch in self._batches(paths.SAMPLES):
+            times = _index(batch, paths.SESSION_TIME)
+            for row in zip(_values(batch, "connection"), times, _values(batch, "data"), strict=True):
+                yield RawSample(*row)
+
+    def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Per name: session times [ns] and values."""
+        found: dict[str, tuple[list[int], list[float]]] = {}
+        for _, batch in self._batches(f"{paths.METRICS}/**"):
+            times, values = found.setdefault(_entity(batch).removeprefix(paths.METRICS + "/"), ([], []))
+            times += _index(batch, paths.SESSION_TIME)
+            values += _values(batch, "Scalars:scalars")
+        return {name: (np.array(t, np.int64), np.array(v, np.float64)) for name, (t, v) in found.items()}
+
+    def close(self) -> None:
+        """Removes temporary copies."""
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _unique(
+        self, entity: str, decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
+    ) -> Iterator[_T]:
+        """Items of all parts; what a part repeats from the end of the one before counts once."""
+        before: frozenset[Hashable] = frozenset()
+        tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
+        part = 0
+        for i, batch in self._batches(entity):
+            if i != part:
+                part, before = i, frozenset(tail)
+            for item in decode(batch):
+                name = key(item)
+                if name not in before:
+                    tail.append(name)
+                    yield item
+
+    def _batches(self, entity: str) -> Iterator[tuple[int, Any]]:
+        """Part number (from 0) and record batch of an entity, over all parts in order.
+
+        A damaged part is read on from a copy without the damage, at the same place.
+        """
+        for i in range(len(self.files)):
+            done = 0
+            while True:
+                try:
+                    for k, chunk in enumerate(rrd_file.chunks(self._readable[i], entity)):
+                        if k < done:
+                            continue
+                        done = k + 1
+                        yield i, chunk.to_record_batch()
+                except RuntimeError:
+                    if self._readable[i] != self.files[i]:
+                        raise
+                    self._salvage(i)
+                    continue
+                break
+
+    def _add_part(self, path: str) -> None:
+        """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
+        try:
+            found = rrd_file.scan(path)
+            self.files.append(path)
+            self._readable.append(path)
+            self.finished &= found.complete
+            if found.good_bytes < found.size:
+                self._salvage(len(self.files) - 1)
+        except NotARecordingError as error:
+            self.damage.append(str(error))
+            self.finished = False
+            if self.files and self.files[-1] == path:
+                self.files.pop()
+                self._readable.pop()
+
+    def _salvage(self, i: int) -> None:
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
+        copy = os.path.join(self._folder.name, f"part{i + 1}.rrd")
+        name = os.path.basename(self.files[i])
+        self.damage += [f"{name}: {line}" for line in rrd_file.salvage(self.files[i], copy)]
+        self._readable[i] = copy
+
+    def _header(self, path: str) -> SessionHeader:
+        for _, batch in self._batches(paths.HEADER):
+            blob = _values(batch, "blob")[0]
+            try:
+                header = decode_header(blob)
+            except msgspec.DecodeError as error:
+                raise NotARecordingError(f"the header of {path} is damaged: {error}") from error
+            if zlib.crc32(blob) != _values(batch, "crc")[0]:
+                self.damage.append("header: its bytes were changed (checksum)")
+            return header
+        why = f" ({self.damage[0]})" if self.damage else ": nothing was recorded, or it is not ours"
+        raise NotARecordingError(f"{path} holds no session header{why}")
+
+
+def _rows(batch: Any) -> Iterator[JournalRow]:
+    n = batch.num_rows
+    plant = _values(batch, "plant") if "plant" in batch.schema.names else [b""] * n
+    columns = zip(
+        _index(batch, paths.STEP),
+        _index(batch, paths.SESSION_TIME),
+        _values(batch, "n_ticks"),
+        _values(batch, "entries"),
+        map(tuple, batch.column("entry_lengths").to_pylist()),
+        map(tuple, batch.column("entry_crcs").to_pylist()),
+        _values(batch, "digest"),
+        _values(batch, "chain"),
+        map(tuple, batch.column("field_crcs").to_pylist()),
+        plant,
+        strict=True,
+    )
+    return (JournalRow(*values) for values in columns)
+
+
+def _keyframes(batch: Any) -> Iterator[Keyframe]:
+    columns = zip(
+        _index(batch, paths.STEP),
+        *(_values(batch, name) for name in ("plant", "authority", "controller", "status", "chain")),
+        map(tuple, batch.column("crcs").to_pylist()),
+        strict=True,
+    )
+    return (Keyframe(*values) for values in columns)
+
+
+def _states(batch: Any, n_bodies: int) -> Iterator[State]:
+    decoders: tuple[tuple[str, Callable[[bytes], Any]], ...] = (
+        ("presence", _decode_presence),
+        ("applied", _decode_applied),
+    )
+    poses = np.asarray(batch.column("poses").flatten(), np.float64).reshape(batch.num_rows, n_bodies, 7)
+    columns = zip(
+        _index(batch, paths.STEP),
+        _index(batch, paths.TICK),
+        _values(batch, "sim_time_s"),
+        _index(batch, paths.SESSION_TIME),
+        poses,
+        *(map(decode, _values(batch, name)) for name, decode in decoders),
+        strict=True,
+    )
+    return (State(*values) for values in columns)
+
+
+def _values(batch: Any, column: str) -> list[Any]:
+    """One value per row of a component column."""
+    return list(batch.column(column).flatten().to_pylist())
+
+
+def _index(batch: Any, timeline: str) -> list[int]:
+    """Integer values of a timeline (durations in nanoseconds)."""
+    return [int(v) for v in np.asarray(batch.column(timeline).cast("int64"))]
+
+
+def _entity(batch: Any) -> str:
+    return str(batch.schema.metadata[b"rerun:entity_path"].decode())

@@ -1,0 +1,70 @@
+"""A bounded first-in first-out queue in a file: where the feed's batches wait when the recorder cannot take them."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import Final
+
+_HEAD: Final = struct.Struct("<II")  # bytes of the record, rows in it
+
+
+class SpillFile:
+    """Records of bytes in the order of `push`, at most `limit_bytes` on disk. The file exists only while it holds any.
+
+    `push` returns False when the disk or the limit refuses the record, which is then not in the queue.
+    """
+
+    def __init__(self, path: Path, limit_bytes: int) -> None:
+        self._path = path
+        self._limit = limit_bytes
+        self._fd = -1
+        self._read_at = 0
+        self._write_at = 0
+        self.records = 0
+        self.fault = ""
+
+    def __len__(self) -> int:
+        return self.records
+
+    def push(self, data: bytes, rows: int) -> bool:
+        """Appends one record that holds `rows` journal rows."""
+        record = _HEAD.pack(len(data), rows) + data
+        if self._write_at + len(record) > self._limit:
+            self.fault = f"the spill file {self._path} holds its limit of {self._limit >> 20} MiB"
+            return False
+        try:
+            if self._fd < 0:
+                flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+                self._fd = os.open(self._path, flags, 0o600)
+            written = os.pwrite(self._fd, record, self._write_at)
+        except OSError as error:
+            self.fault = f"the spill file {self._path} cannot be written: {error.strerror}"
+            return False
+        if written != len(record):  # the disk is full: the next push writes over the partial record
+            self.fault = f"the spill file {self._path} cannot be written: no space left"
+            return False
+        self._write_at += len(record)
+        self.records += 1
+        return True
+
+    def pop(self) -> tuple[bytes, int] | None:
+        """The oldest record as `(data, rows)`, None when empty. Raises `OSError` when the file cannot be read."""
+        if not self.records:
+            return None
+        length, rows = _HEAD.unpack(os.pread(self._fd, _HEAD.size, self._read_at))
+        data = os.pread(self._fd, length, self._read_at + _HEAD.size)
+        self._read_at += _HEAD.size + length
+        self.records -= 1
+        if not self.records:
+            self.close()
+        return data, rows
+
+    def close(self) -> None:
+        """Removes the file and what is in it."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+            self._path.unlink(missing_ok=True)
+        self._read_at = self._write_at = self.records = 0

@@ -1,0 +1,146 @@
+"""The parent's side of the recorder process: start, watch, start anew on the next part of the file, end."""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from iris_session.recording.errors import RecorderError
+from iris_session.recording.messages import RecorderConfig
+from iris_session.recording.paths import part_path
+
+START_S: Final = 20.0
+
+
+class RecorderProcess:
+    """A recorder of the file `path`, started by exec, listening on sockets in a private temporary folder.
+
+    It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. When it has ended, `restart`
+    begins the next part (`session.part2.rrd`); the feed hands it everything that was not written.
+    """
+
+    def __init__(self, path: str | Path, origin_ns: int) -> None:
+        self.path = str(path)
+        self.part = 0
+        self._origin_ns = origin_ns
+        self._folder = tempfile.mkdtemp(prefix="iris-rec-")
+        self.feed_endpoint = f"ipc://{self._folder}/feed"
+        self.samples_endpoint = f"ipc://{self._folder}/samples"
+        self._log = Path(self._folder) / "recorder.log"
+        self._recording_id = uuid.uuid4().hex
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def part_path(self) -> str:
+        """The file that is being written."""
+        return part_path(self.path, max(1, self.part))
+
+    @property
+    def pid(self) -> int:
+        """Process id of the recorder, 0 when none was started."""
+        return 0 if self._process is None else self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """False before the start and once the process has ended."""
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def failure(self) -> str:
+        """One line about how the process ended, empty while it runs and after a clean end."""
+        if self._process is None or not (code := self._process.poll()):
+            return ""
+        how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
+        return f"the recorder ended ({how}): {_last_line(self._log) or 'no message'}"
+
+    def start(self) -> None:
+        """Begins the recording and waits until it writes. Raises `RecorderError`: no right, no space, file exists."""
+        self.part = 1
+        self._spawn()
+        answer = self._answer()
+        if answer != "ready":
+            self.close(0.0)
+            raise RecorderError(answer.removeprefix("failed: "))
+
+    def restart(self) -> None:
+        """Begins the next part without waiting for it: look at `alive` and `failure` later, as after a crash."""
+        self._end(0.0)
+        while os.path.exists(self.part_path):
+            self.part += 1
+        self._spawn()
+
+    def close(self, timeout_s: float = 10.0) -> bool:
+        """Finishes the file. True: it ended by itself and well. Close the feed and the front before."""
+        clean = self._end(timeout_s)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return clean
+
+    def _spawn(self) -> None:
+        config = RecorderConfig(
+            self.part_path, self._recording_id, self.feed_endpoint, self.samples_endpoint, self._origin_ns, os.getpid()
+        )
+        # RERUN=off in a user's shell would silence the stream.
+        environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error"}
+        with open(self._log, "ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "iris_session.recording.process"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=environment,
+                start_new_session=True,
+            )
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # it ended before reading; its answer says why
+            self._process.stdin.write(msgspec.msgpack.encode(config))
+            self._process.stdin.close()
+
+    def _answer(self) -> str:
+        """The first line on standard output: `ready`, or the reason why not."""
+        process = self._process
+        assert process is not None
+        assert process.stdout is not None
+        text = b""
+        until = time.monotonic() + START_S
+        while b"\n" not in text and (left := until - time.monotonic()) > 0:
+            if select.select([process.stdout], [], [], left)[0]:
+                chunk = os.read(process.stdout.fileno(), 4096)
+                if not chunk:
+                    break
+                text += chunk
+        line = text.decode(errors="replace").strip()
+        return line or f"the recorder did not start within {START_S:g} s: {_last_line(self._log) or 'no message'}"
+
+    def _end(self, timeout_s: float) -> bool:
+        process, self._process = self._process, None
+        if process is None:
+            return True
+        process.terminate()
+        try:
+            clean = process.wait(timeout_s) == 0
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            clean = False
+        if process.stdout is not None:
+            process.stdout.close()
+        return clean
+
+
+def _last_line(log: Path) -> str:
+    try:
+        lines = log.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return lines[-1][:300] if lines else ""

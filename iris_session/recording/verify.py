@@ -1,0 +1,253 @@
+"""Proves or refutes a recording: checks every row's bytes and chain, and simulates the session again from its journal.
+
+The first problem is named by step and field or entry. Begins at the initial state; after missing rows or a divergence
+it goes on from the next keyframe. What is simulated is composed elsewhere and handed in as `make_core`: this module
+knows no room but its own.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from iris_session.protocol.entries import Entry, decode_entries
+from iris_session.recording import versions
+from iris_session.recording.journal import (
+    SNAPSHOTS,
+    JournalRow,
+    Keyframe,
+    RowProblem,
+    SessionHeader,
+    chain_of,
+    check_fields,
+    check_keyframe,
+    check_row,
+    header_root,
+)
+from iris_session.recording.reader import Recording
+
+#: Problems kept in a report; more are counted.
+MAX_PROBLEMS: Final = 20
+PROGRESS_ROWS: Final = 500
+
+
+class Core(Protocol):
+    """The session as a function, made by `make_core(header)` in its initial state."""
+
+    def step(self, now_ns: int, entries: list[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
+        """Takes one step and returns its digest. `plant`: of the row, in class `open`."""
+        ...
+
+    def restore(self, keyframe: Keyframe) -> None:
+        """Takes the state of `keyframe`."""
+        ...
+
+    def keyframe(self, step: int) -> Keyframe:
+        """The present state, after `step`."""
+        ...
+
+
+class Problem(msgspec.Struct, frozen=True):
+    """`kind`: `changed` (bytes differ from what was written), `missing` (rows), `divergence` (the simulation gives
+    something else), `unreadable`. `field`: of the row or keyframe; `entry`: index, -1 when it is not an entry."""
+
+    step: int
+    kind: str
+    field: str
+    text: str
+    entry: int = -1
+
+
+class VerifyReport(msgspec.Struct):
+    """`ok`: every step was checked and simulated again with the same result.
+
+    `gaps`: `(first, last)` missing steps. `unverified_steps`: rows between a gap or divergence and the next keyframe.
+    `keyframes`: how many were met and equal. `seconds`: session time simulated. `problems`: the first ones, in order.
+    """
+
+    path: str
+    ok: bool = False
+    recording_class: str = ""
+    finished: bool = True
+    parts: int = 1
+    steps: int = 0
+    unverified_steps: int = 0
+    keyframes: int = 0
+    seconds: float = 0.0
+    wall_s: float = 0.0
+    problems: list[Problem] = []
+    more_problems: int = 0
+    gaps: list[tuple[int, int]] = []
+    damage: list[str] = []
+    version_differences: list[str] = []
+
+    def line(self) -> str:
+        """The result on one line."""
+        speed = self.seconds / self.wall_s if self.wall_s > 0 else 0.0
+        parts = [f"{self.steps} steps, {self.seconds:.1f} s of session in {self.wall_s:.1f} s ({speed:.1f}x)"]
+        parts.append(f"{self.keyframes} keyframes equal, class {self.recording_class}")
+        if self.unverified_steps:
+            parts.append(f"{self.unverified_steps} steps could not be verified")
+        if not self.finished:
+            parts.append("the file was not finished (the recorder was killed)")
+        if self.ok:
+            return "ok: " + "; ".join(parts)
+        if self.version_differences:
+            parts.append(f"versions differ: {', '.join(self.version_differences)}")
+        if not self.problems:
+            return "FAILED: no step could be verified; " + "; ".join(parts)
+        first = self.problems[0]
+        entry = f", entry {first.entry}" if first.entry >= 0 else ""
+        n = len(self.problems) + self.more_problems - 1
+        more = f" (and {n} more)" if n else ""
+        return f"FAILED at step {first.step}{entry}, {first.field}: {first.text}{more}; " + "; ".join(parts)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything as plain values, `line` included."""
+        fields: dict[str, Any] = msgspec.to_builtins(self)
+        return {**fields, "line": self.line()}
+
+    def json(self) -> str:
+        """`as_dict` as one JSON object."""
+        return json.dumps(self.as_dict())
+
+
+def verify(
+    path: str | Path,
+    make_core: Callable[[SessionHeader], Core] | None,
+    progress: Callable[[int, int], None] | None = None,
+) -> VerifyReport:
+    """Verifies the recording `path`; `progress(done, total)` is called with row counts, about every 500 rows.
+
+    `make_core` None checks bytes, chain and completeness without simulating. Raises `NotARecordingError`; every other
+    finding is in the report.
+    """
+    began = time.perf_counter()
+    with Recording.open(path) as recording:
+        header = recording.header
+        report = VerifyReport(str(path), recording_class=header.recording_class, parts=len(recording.files))
+        report.version_differences = versions.differences(header.versions)
+        total = recording.count_rows() if progress else 0
+        run = _Run(recording, make_core(header) if make_core else None, report)
+        for done, row in enumerate(recording.rows()):
+            run.take(row)
+            if progress is not None and done % PROGRESS_ROWS == 0:
+                progress(done, total)
+        if progress is not None:
+            progress(total, total)
+        report.damage = list(recording.damage)
+        report.finished = recording.finished
+        report.problems += [Problem(run.last_step, "unreadable", "file", line) for line in recording.damage]
+    report.wall_s = round(time.perf_counter() - began, 3)
+    report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
+    return report
+
+
+class _Run:
+    """State of one pass over the rows. `simulating` is false between a gap or divergence and the next keyframe."""
+
+    def __init__(self, recording: Recording, core: Core | None, report: VerifyReport) -> None:
+        self.report = report
+        self.last_step = -1
+        self.simulating = True
+        self._core = core
+        self._chain: bytes | None = header_root(recording.header)
+        self._now_ns: int | None = None
+        self._keyframes = recording.keyframes()
+        self._next_keyframe = next(self._keyframes, None)
+        self._meet_keyframe(-1)
+
+    def take(self, row: JournalRow) -> None:
+        """Checks one row, simulates it, and meets the keyframe taken after it."""
+        problem = check_fields(row) if self._chain is None else check_row(self._chain, row)
+        expected = self.last_step + 1
+        if row.step != expected and not (problem and problem.field == "step"):
+            self._gap(expected, row.step - 1)
+            problem = check_fields(row)
+        elif problem is None and self._now_ns is not None and row.now_ns < self._now_ns:
+            problem = RowProblem(row.step, "now_ns", "session time goes back")
+        if problem is not None:
+            self._problem(Problem(expected, "changed", problem.field, problem.text, problem.entry))
+        # A changed chain value is known from the one before it; after any other change the stored one is right.
+        is_chain = problem is not None and problem.field == "chain" and self._chain is not None
+        self._chain = chain_of(self._chain, row) if is_chain and self._chain is not None else row.chain
+        self.last_step = row.step if problem is None or problem.field != "step" else expected
+        self._simulate(row)
+        self._meet_keyframe(self.last_step)
+
+    def _gap(self, first: int, last: int) -> None:
+        if last < first:  # the same or an earlier step again: not a gap, but never what was written
+            self._problem(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
+        else:
+            self.report.gaps.append((first, last))
+            text = f"{last - first + 1} rows are missing, steps {first} to {last}"
+            self._problem(Problem(first, "missing", "step", text))
+        self.simulating = False
+        self._chain = None
+        self._meet_keyframe(last)
+
+    def _simulate(self, row: JournalRow) -> None:
+        elapsed = 0 if self._now_ns is None else max(0, row.now_ns - self._now_ns)
+        self._now_ns = row.now_ns
+        if not self.simulating:
+            self.report.unverified_steps += 1
+            return
+        self.report.steps += 1
+        self.report.seconds += elapsed / 1e9
+        if self._core is None:
+            return
+        try:
+            digest = self._core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
+        except Exception as error:  # changed bytes may mean anything to the core; what came of it is the finding
+            why = f"the step cannot be taken again: {type(error).__name__}: {' '.join(str(error).split())}"
+            self._diverged("entries", why)
+            return
+        if digest != row.digest:
+            self._diverged("digest", "the simulation gives another result than the recording")
+
+    def _diverged(self, field: str, text: str) -> None:
+        self._problem(Problem(self.last_step, "divergence", field, text))
+        self.simulating = False
+
+    def _meet_keyframe(self, step: int) -> None:
+        """Compares the keyframe after `step`, or goes on from it when the simulation had stopped."""
+        while (keyframe := self._next_keyframe) is not None:
+            changed = check_keyframe(keyframe)
+            if not changed and keyframe.step > step:
+                return
+            self._next_keyframe = next(self._keyframes, None)
+            if changed:
+                text = f"keyframe: {changed} was changed"
+                self._problem(Problem(step, "changed", changed, text))
+            elif keyframe.step == step:
+                self._use_keyframe(keyframe)
+
+    def _use_keyframe(self, keyframe: Keyframe) -> None:
+        if self._chain is not None and keyframe.chain != self._chain:
+            self._problem(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
+            return
+        self._chain = keyframe.chain
+        if self._core is None:
+            self.simulating = True
+        elif not self.simulating:
+            self._core.restore(keyframe)
+            self.simulating = True
+        else:
+            mine = self._core.keyframe(keyframe.step)
+            other = [name for name in SNAPSHOTS if getattr(mine, name) != getattr(keyframe, name)]
+            if other:
+                text = f"keyframe: {', '.join(other)} is not what the simulation gives"
+                self._problem(Problem(keyframe.step, "divergence", other[0], text))
+                return
+        self.report.keyframes += 1
+
+    def _problem(self, problem: Problem) -> None:
+        if len(self.report.problems) < MAX_PROBLEMS:
+            self.report.problems.append(problem)
+        else:
+            self.report.more_problems += 1

@@ -1,0 +1,318 @@
+"""Writes one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
+
+Moving bodies and people are rows of `/tf` (one transform per body and change, named frames as in ROS); geometry is
+static in those frames. Exact float64 poses, raw samples and the journal lie beside it as plain columns.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from iris_session.protocol.names import Device
+from iris_session.protocol.server_messages import BodyInfo, Event
+from iris_session.recording import paths, scene
+from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
+from iris_session.recording.journal import SessionHeader, unpack_model
+from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame, encode_header
+from iris_session.recording.text import describe_denial, describe_event, describe_session
+
+#: Colours of participants in the order of their appearance.
+PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+_encode = msgspec.msgpack.Encoder().encode
+#: The stream's own batcher never acts: this writer sends whole columns and flushes them.
+_BATCHER = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
+
+
+class WriteError(Exception):
+    """The file can no longer be written. The text is one line."""
+
+
+class RrdWriter:
+    """One file. `add` and `add_sample` only collect; `flush` writes and returns when the bytes are with the system."""
+
+    def __init__(self, path: str | Path, recording_id: str) -> None:
+        self.path = str(path)
+        self._rec = rr.RecordingStream(paths.APPLICATION, recording_id=recording_id, batcher_config=_BATCHER)
+        self._rec.set_sinks(rr.FileSink(self.path))
+        self._rec.send_blueprint(_blueprint())
+        self._pending = Batch()
+        self._samples: list[tuple[int, int, bytes]] = []
+        self._bodies: tuple[BodyInfo, ...] = ()
+        self._moving: NDArray[np.intp] = np.empty(0, np.intp)
+        self._frames: list[str] = []
+        self._last_poses: NDArray[np.float64] | None = None
+        self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
+        self._people: dict[str, tuple[int, int, int]] = {}
+        self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
+
+    def header(self, header: SessionHeader) -> None:
+        """Writes the header and the scene. Must come before the first flush with data."""
+        blob = encode_header(header)
+        self._rec.send_recording_name(header.session_name)
+        self._static(paths.HEADER, rr.AnyValues(blob=pa.array([blob], pa.binary()), crc=pa.array([zlib.crc32(blob)])))
+        self._static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
+        self._bodies = header.bodies
+        self._moving = np.array([i for i, body in enumerate(header.bodies) if body.moving], np.intp)
+        self._frames = [header.bodies[i].name for i in self._moving]
+        root = rr.Transform3D(parent_frame="tf#/", child_frame=scene.WORLD)  # tf#/: frame of the root entity
+        self._static(paths.TRANSFORMS + "_static", root)
+        self._static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if header.model:
+            self._scene(header)
+
+    def _scene(self, header: SessionHeader) -> None:
+        try:
+            model = scene.load_model(unpack_model(header.model))
+        except (ValueError, zlib.error) as error:
+            # The journal is worth more than its picture: go on, and say it where the viewer shows it.
+            text = f"the scene is not drawn, MuJoCo does not take the model: {error}"
+            self._static(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"))
+            return
+        for shape in scene.shapes(model, header.bodies):
+            self._static(f"{paths.SCENE}/{_part(shape.body)}/{_part(shape.name)}", *_drawing(shape))
+
+    def add(self, batch: Batch) -> None:
+        """Collects one batch of the authority."""
+        pending = self._pending
+        for name in ("rows", "states", "events", "denials", "metrics", "keyframes"):
+            getattr(pending, name).extend(getattr(batch, name))
+
+    def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
+        """Collects one raw message of a client, as it came."""
+        self._samples.append((connection, receive_ns, data))
+
+    def flush(self, timeout_s: float = 10.0) -> None:
+        """Writes what was collected. Raises `WriteError`; the file is then good up to an earlier flush."""
+        batch, self._pending = self._pending, Batch()
+        samples, self._samples = self._samples, []
+        try:
+            self._rows(batch)
+            self._keyframes(batch)
+            self._states(batch.states)
+            self._events(batch.events)
+            self._denials(batch.denials)
+            self._metrics(batch.metrics)
+            self._raw_samples(samples)
+            self._rec.flush(timeout_sec=timeout_s)
+        except (RuntimeError, ValueError, OSError) as error:
+            raise WriteError(f"{self.path} cannot be written: {' '.join(str(error).split())}") from error
+
+    def close(self) -> None:
+        """Writes the rest and finishes the file."""
+        self.flush()
+        self._rec.disconnect()
+
+    def _static(self, entity: str, *values: Any) -> None:
+        self._rec.log(entity, *values, static=True, strict=True)
+
+    def _send(self, entity: str, times: Sequence[Any], columns: Sequence[Any]) -> None:
+        rr.send_columns(entity, times, columns, recording=self._rec, strict=True)
+
+    def _rows(self, batch: Batch) -> None:
+        rows = batch.rows
+        if not rows:
+            return
+        columns = [
+            each("n_ticks", [row.n_ticks for row in rows], pa.int64()),
+            blobs("entries", [row.entries for row in rows]),
+            lists("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
+            lists("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
+            blobs("digest", [row.digest for row in rows]),
+            blobs("chain", [row.chain for row in rows]),
+            lists("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
+        ]
+        if any(row.plant for row in rows):
+            columns.append(blobs("plant", [row.plant for row in rows]))
+        times = [
+            sequence(paths.STEP, [row.step for row in rows]),
+            nanoseconds(paths.SESSION_TIME, [row.now_ns for row in rows]),
+        ]
+        self._send(paths.ROWS, times, columns)
+
+    def _keyframes(self, batch: Batch) -> None:
+        frames = batch.keyframes
+        if not frames:
+            return
+        columns = [blobs(name, [getattr(k, name) for k in frames]) for name in _KEYFRAME_BLOBS]
+        columns.append(lists("crcs", [k.crcs for k in frames], pa.uint32()))
+        self._send(paths.KEYFRAMES, [sequence(paths.STEP, [k.step for k in frames])], columns)
+
+    def _states(self, states: list[StateFrame]) -> None:
+        if not states:
+            return
+        n = len(self._bodies)
+        poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(n, 7) for s in states])
+        moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
+        times = np.array(moments, np.int64).T
+        columns = [
+            matrix("poses", poses.reshape(len(states), -1)),
+            each("sim_time_s", [s.sim_time for s in states], pa.float64()),
+            blobs("presence", [_encode(s.presence) for s in states]),
+            blobs("applied", [_encode(s.applied) for s in states]),
+        ]
+        self._send(paths.STATE, _times(times), columns)
+        self._transforms(states, poses, times)
+        self._clock = moments[-1][1:3]
+
+    def _transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
+        """One row per body that changed in a frame, and per device of a person that has a new pose."""
+        moving = poses[:, self._moving]
+        before = np.empty_like(moving)
+        before[1:] = moving[:-1]
+        before[0] = np.nan if self._last_poses is None else self._last_poses
+        self._last_poses = moving[-1].copy()
+        frame, body = np.nonzero((moving != before).any(axis=2))
+        values = moving[frame, body]
+        names = [self._frames[i] for i in body]
+        people = self._people_rows(states)
+        if people:
+            frame = np.concatenate([frame, np.array([row[0] for row in people], np.intp)])
+            values = np.concatenate([values, np.array([row[2] for row in people], np.float64)])
+            names += [row[1] for row in people]
+        if not names:
+            return
+        columns = rr.Transform3D.columns(
+            translation=values[:, :3],
+            quaternion=values[:, [4, 5, 6, 3]],
+            child_frame=names,
+            parent_frame=[scene.WORLD] * len(names),
+        )
+        self._send(paths.TRANSFORMS, _times(times[:, frame]), [*columns])
+
+    def _people_rows(self, states: list[StateFrame]) -> list[tuple[int, str, tuple[float, ...]]]:
+        rows: list[tuple[int, str, tuple[float, ...]]] = []
+        for i, state in enumerate(states):
+            for item in state.presence:
+                key = (item.participant, item.device)
+                if key not in self._devices:
+                    self._introduce(*key)
+                elif item.capture_ns and item.capture_ns == self._devices[key]:
+                    continue
+                self._devices[key] = item.capture_ns
+                rows.append((i, _presence_frame(*key), (*item.pose.p, *item.pose.q)))
+        return rows
+
+    def _introduce(self, participant: str, device: str) -> None:
+        """Static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
+        color = self._people.setdefault(participant, PALETTE[len(self._people) % len(PALETTE)])
+        frame = rr.CoordinateFrame(_presence_frame(participant, device))
+        entity = f"{paths.PRESENCE}/{_part(participant)}/{_part(device)}"
+        solid = rr.components.FillMode.Solid
+        if device == Device.HEAD:
+            shape = rr.Boxes3D(half_sizes=[(0.06, 0.09, 0.05)], colors=[color], labels=[participant], fill_mode=solid)
+        else:
+            shape = rr.Ellipsoids3D(half_sizes=[(0.05, 0.03, 0.03)], colors=[color], fill_mode=solid)
+        self._static(entity, frame, shape)
+
+    def _events(self, events: list[Event]) -> None:
+        if not events:
+            return
+        lines = [describe_event(event) for event in events]
+        text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
+        columns = [*text, blobs("event", [_encode(event) for event in events])]
+        times = self._moments([e.step for e in events], [e.session_time for e in events])
+        self._send(paths.EVENTS, times, columns)
+
+    def _denials(self, denials: list[DenialRecord]) -> None:
+        if not denials:
+            return
+        lines = [describe_denial(record) for record in denials]
+        text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
+        columns = [*text, blobs("denial", [_encode(record) for record in denials])]
+        times = self._moments([d.step for d in denials], [d.session_time for d in denials])
+        self._send(paths.DENIALS, times, columns)
+
+    def _metrics(self, metrics: list[MetricRecord]) -> None:
+        by_name: dict[str, list[MetricRecord]] = {}
+        for record in metrics:
+            by_name.setdefault(record.name, []).append(record)
+        for name, records in by_name.items():
+            times = self._moments([r.step for r in records], [r.session_time for r in records])
+            values = rr.Scalars.columns(scalars=[r.value for r in records])
+            self._send(f"{paths.METRICS}/{name}", times, [*values])
+
+    def _raw_samples(self, samples: list[tuple[int, int, bytes]]) -> None:
+        if not samples:
+            return
+        columns = [
+            each("connection", [s[0] for s in samples], pa.int64()),
+            blobs("data", [s[2] for s in samples]),
+        ]
+        self._send(paths.SAMPLES, [nanoseconds(paths.SESSION_TIME, [s[1] for s in samples])], columns)
+
+    def _moments(self, steps: list[int], session_times: list[int]) -> list[Any]:
+        moments = [(step, *self._clock, now_ns) for step, now_ns in zip(steps, session_times, strict=True)]
+        return _times(np.array(moments, np.int64).T)
+
+
+_KEYFRAME_BLOBS = ("plant", "authority", "controller", "status", "chain")
+
+
+def _times(times: NDArray[np.int64]) -> list[Any]:
+    """`times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
+    step, tick, sim_ns, session_ns = times
+    return [
+        sequence(paths.STEP, step),
+        sequence(paths.TICK, tick),
+        nanoseconds(paths.SIM_TIME, sim_ns),
+        nanoseconds(paths.SESSION_TIME, session_ns),
+    ]
+
+
+def _drawing(shape: scene.Shape) -> list[Any]:
+    """Rerun components of one geom: its frame, its pose in that frame, and its form."""
+    frame = rr.CoordinateFrame(shape.frame)
+    w, x, y, z = shape.q
+    p = shape.p
+    color = shape.rgba
+    solid = rr.components.FillMode.Solid
+    drawn: Any
+    if shape.kind == scene.BOX:
+        drawn = rr.Boxes3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
+    elif shape.kind == scene.ELLIPSOID:
+        drawn = rr.Ellipsoids3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
+    elif shape.kind == scene.CYLINDER:
+        radius, half = shape.size
+        drawn = rr.Cylinders3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
+    elif shape.kind == scene.CAPSULE:
+        radius, half = shape.size
+        drawn = rr.Capsules3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
+        # Rerun's capsule begins at the origin and MuJoCo's is centred there: back by half a length along its axis.
+        axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+        p = (p[0] - half * axis[0], p[1] - half * axis[1], p[2] - half * axis[2])
+    else:
+        drawn = rr.Mesh3D(
+            vertex_positions=shape.vertices,
+            vertex_normals=shape.normals,
+            triangle_indices=shape.faces,
+            albedo_factor=color,
+        )
+    return [frame, rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])]), drawn]
+
+
+def _part(name: str) -> str:
+    """`name` as one part of an entity path (names may hold slashes and spaces)."""
+    return str(rr.escape_entity_path_part(name))
+
+
+def _presence_frame(participant: str, device: str) -> str:
+    return f"presence/{participant}/{device}"
+
+
+def _blueprint() -> Any:
+    view = rrb.Spatial3DView(origin="/", name="scene", contents=["+ /**", "- /journal/**", "- /samples"])
+    log = rrb.TextLogView(origin="/", name="events", contents=[f"+ {paths.EVENTS}", f"+ {paths.DENIALS}"])
+    plots = rrb.TimeSeriesView(origin=paths.METRICS, name="metrics")
+    about = rrb.TextDocumentView(origin=paths.INFO, name="session")
+    side = rrb.Vertical(log, plots, about)
+    return rrb.Blueprint(rrb.Horizontal(view, side, column_shares=[2, 1]), collapse_panels=True)

@@ -1,0 +1,180 @@
+"""Support for the tests: a small deterministic session, a real recorder process, and files to damage."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from iris_session.protocol.client_messages import Marker, Sample
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import Entry, encode_entry
+from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded
+from iris_session.protocol.steps import Decision, PresenceItem
+from iris_session.recording import (
+    CLOSED,
+    Keyframe,
+    RecorderFeed,
+    RecorderProcess,
+    SessionHeader,
+    header_root,
+    make_row,
+    pack_model,
+)
+
+TICK_NS = 2_000_000
+XML = """<mujoco><option timestep="0.002"/><worldbody><light pos="0 0 3"/>
+<geom name="floor" type="plane" size="0 0 .1" rgba=".8 .8 .8 1"/>
+<body name="ball" pos="0 0 1"><freejoint/><geom name="g/ball" type="sphere" size=".1" mass="1"/></body>
+<body name="arm/link 1" pos="0 1 1"><joint axis="0 1 0"/>
+ <geom type="capsule" fromto="0 0 0 .4 0 0" size=".04"/><geom type="cylinder" size=".05 .1" pos=".4 0 0"/>
+ <body name="tip" pos=".4 0 0"><geom type="box" size=".02 .03 .04"/><geom type="ellipsoid" size=".02 .03 .04"/></body>
+</body><body name="post" pos="1 1 0"><geom type="box" size=".1 .1 .5" group="3"/></body>
+</worldbody></mujoco>"""
+
+
+class SmallCore:
+    """A session in a few lines: real physics, and a hash that every entry enters. Bit-exact, with snapshots."""
+
+    def __init__(self, header: SessionHeader | None = None) -> None:
+        self.model = mujoco.MjModel.from_xml_string(XML)
+        self.data = mujoco.MjData(self.model)
+        self.memory = b"\0" * 16
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
+        h = hashlib.blake2b(self.memory + struct.pack("<q", now_ns), digest_size=16)
+        for entry in entries:
+            h.update(encode_entry(entry))
+        self.memory = h.digest()
+        if plant:
+            self._set(plant)
+        self.data.xfrc_applied[1, 0] = self.memory[0] / 64.0
+        for _ in range(n_ticks):
+            mujoco.mj_step(self.model, self.data)
+        return hashlib.blake2b(self.memory + self.state(), digest_size=16).digest()
+
+    def state(self) -> bytes:
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        out = np.empty(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, self.data, out, spec)
+        return out.tobytes()
+
+    def _set(self, state: bytes) -> None:
+        mujoco.mj_setState(self.model, self.data, np.frombuffer(state), mujoco.mjtState.mjSTATE_INTEGRATION)
+
+    def keyframe(self, step: int) -> Keyframe:
+        return Keyframe(step, self.state(), self.memory, b"controller", b"status")
+
+    def restore(self, keyframe: Keyframe) -> None:
+        self._set(keyframe.plant)
+        self.memory = keyframe.authority
+
+
+def make_header(recording_class: str = CLOSED, versions: dict[str, str] | None = None) -> SessionHeader:
+    """Header of the small session, with its real model."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    names = [mujoco.mj_id2name(model, 1, i) for i in range(1, model.nbody)]
+    return SessionHeader(
+        session_id="s1",
+        session_name="small",
+        recording_class=recording_class,
+        tick_period_ns=TICK_NS,
+        config=b"config",
+        model=pack_model(buffer.tobytes()),
+        bodies=tuple(BodyInfo(i + 1, name, name != "post") for i, name in enumerate(names)),
+        versions=versions or {},
+    )
+
+
+def make_entries(step: int) -> list[Entry]:
+    """None to three entries, different in every step."""
+    sample = Sample(
+        "controller/left", "pose", step, step * TICK_NS, 1, 1, 1, pose=Pose((step / 3, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+    )
+    return [Entry(7, 7, step * TICK_NS, sample), Entry(8, 8, step * TICK_NS, Marker(step, f"m{step}"))][: step % 3]
+
+
+class SmallSession:
+    """Takes steps of a `SmallCore` and feeds them to a recorder as a session does."""
+
+    def __init__(self, feed: RecorderFeed, keyframe_steps: int = 100, **header: object) -> None:
+        self.feed = feed
+        self.core = SmallCore()
+        self.header = make_header(**header)  # type: ignore[arg-type]
+        self.chain = header_root(self.header)
+        self.step_count = 0
+        self.poses: list[np.ndarray] = []
+        self._keyframe_steps = keyframe_steps
+        feed.header(self.header)
+        feed.keyframe(self.core.keyframe(-1), self.chain)
+
+    def take(self, steps: int, pause_s: float = 0.0) -> None:
+        for _ in range(steps):
+            self._one()
+            if pause_s:
+                time.sleep(pause_s)
+
+    def _one(self) -> None:
+        step, feed, core = self.step_count, self.feed, self.core
+        now_ns = (step + 1) * TICK_NS
+        entries = make_entries(step)
+        plant = core.state() if self.header.recording_class == "open" else b""
+        digest = core.step(now_ns, entries, 1, plant)
+        row = make_row(self.chain, step, now_ns, 1, entries, digest, plant)
+        self.chain = row.chain
+        feed.row(row)
+        head = PresenceItem("p1", "head", Pose((0.0, 0.0, 1.0 + step / 1000), (1.0, 0.0, 0.0, 0.0)), now_ns)
+        events = ()
+        if step % 50 == 0:
+            events = (Event(step // 50 + 1, step, now_ns, MarkerAdded("p1", f"event {step}")),)
+        feed.decision(step, now_ns, Decision(commands=(), events=events, presence=(head,)))
+        feed.metric("late_ms", step / 10)
+        if step % 8 == 0:
+            poses = np.concatenate([core.data.xpos[1:], core.data.xquat[1:]], axis=1)
+            self.poses.append(poses.copy())
+            feed.state(step, step + 1, core.data.time, now_ns, poses)
+        if step % self._keyframe_steps == self._keyframe_steps - 1 or feed.wants_keyframe:
+            feed.keyframe(core.keyframe(step), self.chain)
+        self.step_count += 1
+
+
+@contextmanager
+def recorder(path: Path, **feed_options: int) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
+    """A started recorder process with a feed; ended in any case."""
+    process = RecorderProcess(path, time.monotonic_ns())
+    feed: RecorderFeed | None = None
+    try:
+        process.start()
+        feed = RecorderFeed(process.feed_endpoint, path.parent, **feed_options)
+        yield process, feed
+    finally:
+        if feed is not None:
+            feed.close(0.0)
+        process.close()
+
+
+def record(path: Path, steps: int, **header: object) -> SmallSession:
+    """A finished recording of `steps` steps."""
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed, **header)
+        session.take(steps)
+        assert feed.close(20.0)
+        assert process.close()
+    return session
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    """Polls `condition`; fails after `timeout_s`."""
+    until = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < until, "the condition did not come true"
+        time.sleep(0.01)
