@@ -68,10 +68,10 @@ class SceneView:
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         """`T_world_site` of a robot's end effector in the newest scene."""
-        state, info = self._state, self.connection.mirror.robots.get(robot)
-        if state is None or info is None or info.site_body >= len(state.poses):
+        state, tip = self._state, self.connection.mirror.tip(robot)
+        if state is None or tip is None or tip[0] >= len(state.poses):
             return None
-        return compose(pose_at(state.poses, info.site_body), (info.T_body_site.p, info.T_body_site.q))
+        return compose(pose_at(state.poses, tip[0]), tip[1])
 
     def lease_version(self, target: str) -> int | None:
         """Our fencing token for a robot or object, `None` when it is not ours."""

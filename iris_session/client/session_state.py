@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from anchors.pose import PoseTuple
 from iris_session.protocol.common import Alignment, Lease
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
@@ -39,6 +40,7 @@ _encoder = msgspec.msgpack.Encoder(order="deterministic")
 class SessionMirror:
     """Roster, leases, alignments, robots and bodies as the session says they are.
 
+    `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`.
     `synced` is false before the first snapshot and after a gap; the other attributes then show the last known state.
     Counters: `gaps`, `discarded` (events older than the snapshot or repeated), `held_overflow`.
     """
@@ -64,6 +66,7 @@ class SessionMirror:
         self.robots: dict[str, RobotInfo] = {}
         self.bodies: tuple[BodyInfo, ...] = ()
         self.body_index: dict[str, int] = {}
+        self.index_of_id: dict[int, int] = {}
         self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
 
     def apply_snapshot(self, snapshot: Snapshot) -> list[Event]:
@@ -86,6 +89,7 @@ class SessionMirror:
         self.robots = {robot.name: robot for robot in snapshot.robots}
         self.bodies = snapshot.bodies
         self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
+        self.index_of_id = {body.id: i for i, body in enumerate(snapshot.bodies)}
         self.synced = True
         held, self._held = self._held, deque(maxlen=MAX_HELD_EVENTS)
         return [event for event in held if self.apply_event(event)]
@@ -111,6 +115,12 @@ class SessionMirror:
         """The alignment of one participant, `None` while it has none."""
         info = self.participants.get(participant)
         return None if info is None else info.alignment
+
+    def tip(self, robot: str) -> tuple[int, PoseTuple] | None:
+        """Row of the body that carries the robot's end-effector site, and `T_body_site`; `None`: no such robot."""
+        info = self.robots.get(robot)
+        index = None if info is None else self.index_of_id.get(info.site_body)
+        return None if info is None or index is None else (index, (info.T_body_site.p, info.T_body_site.q))
 
     def lease_version(self, target: str, participant: str) -> int | None:
         """The fencing token of `target` when `participant` holds it (alone or with others), else `None`."""

@@ -14,13 +14,23 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any, Final
 
-from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_yaw
-from iris_session.client import Client, NotConnectedError, PoseBuffer, SceneState, Shown
-from iris_session.client.scene_view import pose_at
+from anchors.pose import (
+    PoseTuple,
+    Vec3,
+    apply,
+    compose,
+    distance,
+    inverse,
+    quat_angle,
+    quat_from_yaw,
+)
+from iris_session.client import Client, NotConnectedError, SceneState
 from iris_session.emulator.behaviours import Behaviour, HandInput, make_behaviour
+from iris_session.emulator.display import Display
 from iris_session.emulator.headset import Headset, look_at
 from iris_session.emulator.link import DelayLine
 from iris_session.emulator.specs import OBSERVER, HeadsetReport, HeadsetSpec
+from iris_session.emulator.viewpoints import between, viewpoint_pose
 from iris_session.protocol.client_messages import Acquire, ClientMessage
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, CommandKind, Device, HoldReason, Role
@@ -28,7 +38,7 @@ from iris_session.protocol.server_messages import Event, Handover, Notice
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
-MOVE_S: Final = 0.4  # from one viewpoint to the next
+MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
 RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...
 RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
@@ -41,61 +51,6 @@ CLUTCH_AGAIN: Final = frozenset(
      HoldReason.NO_SAMPLE, HoldReason.DISCONNECTED, HoldReason.ESTOP, HoldReason.UNTRACKED, HoldReason.NOT_WORN,
      HoldReason.UNALIGNED}
 )  # fmt: skip
-
-
-class Display:
-    """What the person sees, world frame: `OperatorView` of the behaviours. The picture is late on purpose."""
-
-    def __init__(self, client: Client, delay_s: float) -> None:
-        self._client = client
-        self.buffer = PoseBuffer(int(delay_s * 1e9))
-        self.hands: dict[str, PoseTuple] = {}
-        self._epoch = 0
-        self._shown: Shown | None = None
-        self._now_ns = 0
-
-    def take(self, state: SceneState) -> None:
-        """A new state came."""
-        if state.header.scene_epoch != self._epoch:
-            self._epoch = state.header.scene_epoch
-            self.buffer.clear()
-        self.buffer.add(state.header.session_time, state.poses)
-
-    def refresh(self, session_ns: int) -> None:
-        """The next picture."""
-        self._now_ns = max(self._now_ns, session_ns)
-        self._shown = self.buffer.show(self._now_ns)
-
-    @property
-    def ready(self) -> bool:
-        return self._shown is not None
-
-    @property
-    def session_time_ns(self) -> int:
-        return self._now_ns
-
-    @property
-    def estop(self) -> bool:
-        return self._client.mirror.estop
-
-    def body_pose(self, name: str) -> PoseTuple | None:
-        index = self._client.mirror.body_index.get(name)
-        return None if index is None else self._pose(index)
-
-    def tip_pose(self, robot: str) -> PoseTuple | None:
-        info = self._client.mirror.robots.get(robot)
-        body = None if info is None else self._pose(info.site_body)
-        return None if info is None or body is None else compose(body, (info.T_body_site.p, info.T_body_site.q))
-
-    def lease_version(self, robot: str) -> int | None:
-        return self._client.lease_version(robot)
-
-    def device_pose(self, device: str) -> PoseTuple:
-        return self.hands[device]
-
-    def _pose(self, index: int) -> PoseTuple | None:
-        shown = self._shown
-        return None if shown is None or index >= len(shown.poses) else pose_at(shown.poses, index)
 
 
 class Person:
@@ -137,8 +92,9 @@ class Person:
         self._refused_because = ""
         self._holding_since = 0
         self._open_clutch = RECLUTCH_SAMPLES
+        self._lease_version: int | None = None
         self._jumps = sorted(spec.recentre_at_s)
-        self.head = look_at(spec.eye, spec.T_world_anchor[0])
+        self.head = self._head_from = self._head_to = self._seat = look_at(spec.eye, spec.T_world_anchor[0])
         yaw = math.atan2(spec.T_world_anchor[0][1] - spec.eye[1], spec.T_world_anchor[0][0] - spec.eye[0])
         self.display.hands[spec.device] = compose((spec.eye, quat_from_yaw(yaw)), (HAND_AT_REST, (1.0, 0.0, 0.0, 0.0)))
         self.client.open()
@@ -201,6 +157,8 @@ class Person:
             self._look(now_ns)
         elif self.report.phase == "acquire":
             self._acquire(now_ns)
+        else:
+            self._move_head(self._seat, now_ns)
         self._send(Device.HEAD, self.headset.track(self.head, now_ns), now_ns)
         if not self.observer:
             self._hands(now_ns)
@@ -249,6 +207,10 @@ class Person:
 
     def _clutch(self, hand: HandInput, now_ns: int) -> bool:
         """The clutch as a person works it: when the robot holds although it is closed, open it and close it again."""
+        lease_version = self.client.lease_version(hand.robot)
+        if lease_version != self._lease_version:  # a new lease arms only after it has seen the clutch open
+            self._lease_version = lease_version
+            self._open_clutch = RECLUTCH_SAMPLES
         if self._open_clutch > 0:
             self._open_clutch -= 1
             return False
@@ -270,7 +232,7 @@ class Person:
         """Walks the head around the sheet; goes on when the session has accepted an alignment after the last look."""
         spec = self.spec
         if self._viewpoint < spec.viewpoints:
-            self.head = viewpoint_pose(spec, self._viewpoint)
+            self._move_head(viewpoint_pose(spec, self._viewpoint), now_ns)
             if now_ns - self._moved_ns < MOVE_S * 1e9 or not self.headset.detection_due(now_ns):
                 return
             seen = self.headset.observe(self.head, spec.T_world_anchor, now_ns, self._viewpoints_used)
@@ -282,15 +244,22 @@ class Person:
                 self._seen_here = 0
                 self._viewpoint += 1
                 self._viewpoints_used += 1
-                self._moved_ns = self._looked_ns = now_ns
+                self._looked_ns = now_ns
         elif now_ns - self._looked_ns > SETTLE_S * 1e9:
             if self._alignment() is None:
                 self._viewpoint = 0  # look again
                 return
-            self.head = look_at(spec.eye, spec.T_world_anchor[0])
             self.report.aligned_s = (now_ns - self.started_ns) / 1e9
             self._judge(now_ns)
             self._enter("watch" if self.observer else "acquire", now_ns)
+
+    def _move_head(self, T_world_head: PoseTuple, now_ns: int) -> None:
+        """Moves the head towards a pose, within `MOVE_S` of first being asked to."""
+        if T_world_head != self._head_to:
+            self._head_from, self._head_to, self._moved_ns = self.head, T_world_head, now_ns
+        s = min(1.0, (now_ns - self._moved_ns) / (MOVE_S * 1e9))
+        fraction = s * s * (3.0 - 2.0 * s)
+        self.head = between(self._head_from, self._head_to, fraction)
 
     def _acquire(self, now_ns: int) -> None:
         if self.client.lease_version(self.spec.robot) is not None:
@@ -374,16 +343,3 @@ class Person:
             self.report.handovers += 1
         elif isinstance(event.body, Notice):
             self._refused_because = event.body.text
-
-
-def viewpoint_pose(spec: HeadsetSpec, index: int) -> PoseTuple:
-    """Where the head goes for the `index`-th look: 0.4 to 0.6 m from the sheet, spread +-50 deg about the seat."""
-    x, y, z = spec.T_world_anchor[0]
-    seat = math.atan2(spec.eye[1] - y, spec.eye[0] - x)
-    share = 0.5 if spec.viewpoints == 1 else index / (spec.viewpoints - 1)
-    azimuth = seat + math.radians(100.0) * (share - 0.5)
-    elevation = math.radians(40.0 if index % 2 else 60.0)
-    reach = 0.4 + 0.1 * (index % 3)
-    flat = reach * math.cos(elevation)
-    eye = (x + flat * math.cos(azimuth), y + flat * math.sin(azimuth), z + reach * math.sin(elevation))
-    return look_at(eye, (x, y, z))
