@@ -11,7 +11,7 @@ date, because after `mj_step` the user's own derived quantities are those of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import msgspec
 import mujoco
@@ -125,10 +125,8 @@ class World:
             mujoco.mj_resetDataKeyframe(self.model, self._shown, self._keyframe)
         else:
             mujoco.mj_resetData(self.model, self._shown)
-        mujoco.mj_step1(self.model, self._shown)
         self._forces = (0.0,) * len(self._forces)
-        self.diverged = ""
-        self._set_tick(0)
+        self._derive(0)
 
     def tick(self) -> None:
         """One timestep with the present `ctrl` and applied forces.
@@ -148,15 +146,14 @@ class World:
             self._forces = self._tables.gripper_forces(model, data)
             mujoco.mj_step1(model, data)
         except mujoco.FatalError as error:  # out of memory in the middle of a step
-            self.diverged = one_line(error)
+            self._give_up(error)
         self._set_tick(self._tick + 1)
         self._check(data)
 
     def refresh(self) -> None:
         """Recomputes what follows from the state, after mocap poses, `eq_active` or `qpos` were written."""
         self._require_owner(user=False)
-        mujoco.mj_step1(self.model, self._shown)
-        self._set_tick(self._tick)
+        self._derive(self._tick)
 
     # --- a user's loop ------------------------------------------------------------------------------------------------
 
@@ -248,10 +245,8 @@ class World:
         self._load_state(saved.state)
         mujoco.mj_resetData(self.model, self._shown)  # clears warnings and whatever is outside the state
         mujoco.mj_setState(self.model, self._shown, self._state, STATE)
-        mujoco.mj_step1(self.model, self._shown)
         self._forces = saved.forces
-        self.diverged = ""
-        self._set_tick(saved.tick)
+        self._derive(saved.tick)
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -260,17 +255,30 @@ class World:
             raise SnapshotError(f"state of {len(state)} bytes, but this model's has {self._state.nbytes}")
         self._state[:] = np.frombuffer(state, np.float64)
 
+    def _derive(self, tick: int) -> None:
+        """Positions, contacts and velocities of the state that was just put into the shown data."""
+        try:
+            mujoco.mj_step1(self.model, self._shown)
+        except mujoco.FatalError as error:
+            self._give_up(error)
+        self.diverged = ""
+        self._set_tick(tick)
+
     def _set_tick(self, tick: int) -> None:
         self._tick = tick
         self._view.advance(tick, self._forces)
 
     def _check(self, data: Any) -> None:
-        """Raises when MuJoCo gave up or met bad numbers in this tick. For those it has reset `data` itself."""
+        """Raises when MuJoCo met bad numbers in this tick. For those it has reset `data` itself."""
         counts = data.warning.number.tolist()
         found = [text for index, text in _BAD if counts[index]]
-        if found or self.diverged:
-            self.diverged = self.diverged or "; ".join(found)
+        if found:
+            self.diverged = "; ".join(found)
             raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
+
+    def _give_up(self, error: mujoco.FatalError) -> NoReturn:
+        self.diverged = one_line(error)
+        raise SimulationDivergedError(self._tick, float(self._shown.time), self.diverged) from error
 
     def _require_owner(self, *, user: bool) -> None:
         if user and not self.user_owned:
@@ -301,8 +309,9 @@ def _body_infos(model: mujoco.MjModel, tree: Tree, objects: Sequence[ObjectSpec]
     """All bodies but the world and the vertices of flexes, by id."""
     vertices = tree.flex_vertex_bodies()
     taken = {spec.body for spec in objects}
+    mocap = set(np.flatnonzero(model.body_mocapid >= 0).tolist())  # before MuJoCo 3.4 these are welded to the world
     return tuple(
-        BodyInfo(id=index, name=name, moving=tree.weld[index] != 0, object=name in taken)
+        BodyInfo(index, name, moving=tree.weld[index] != 0 or index in mocap, object=name in taken)
         for index, name in enumerate(body_names(model))
         if index and index not in vertices
     )

@@ -124,7 +124,7 @@ def test_objects_touch_each_other_the_world_and_cloth() -> None:
     m = model("""<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 1"/>
       <body name="low" pos="0 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
       <body name="high" pos="0 0 .2997"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
-      <body name="wide" pos="1 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1" gap=".05"/></body>
+      <body name="wide" pos="1 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
       <body name="near" pos="1 0 .33"><freejoint/><geom type="box" size=".1 .1 .1" gap=".05"/></body>
       <flexcomp name="cloth" type="grid" count="6 6 1" spacing=".08 .08 .08" pos="0 0 .408" dim="2" mass=".3"
         radius=".01"><edge equality="true"/></flexcomp></worldbody></mujoco>""")

@@ -180,7 +180,7 @@ def test_derived_quantities_belong_to_the_new_state() -> None:
     for _ in range(150):
         world.tick()
     fresh = mujoco.MjData(m)
-    mujoco.mj_setState(m, fresh, np.frombuffer(world.state_bytes()), STATE)
+    mujoco.mj_setState(m, fresh, np.frombuffer(world.state_bytes()).copy(), STATE)
     mujoco.mj_forward(m, fresh)
     assert world.data.xpos.tobytes() == fresh.xpos.tobytes()
     assert int(world.data.ncon) == int(fresh.ncon) > 0
@@ -295,12 +295,14 @@ def test_full_memory_is_counted() -> None:
 
 
 def test_memory_that_is_too_small_for_a_tick_is_a_typed_error() -> None:
-    world = World(pile("130K"), (), ())
-    with pytest.raises(SimulationDivergedError, match="out of memory"):
-        world.tick()
-    assert "out of memory" in world.diverged
-    world.reset()
-    assert world.diverged == ""
+    errors: list[str] = []
+    for kilobytes in range(20, 170, 10):
+        try:
+            World(pile(f"{kilobytes}K"), (), ()).tick()
+        except SimulationDivergedError as error:
+            errors.append(str(error))
+    assert errors
+    assert all("out of memory" in text and "\n" not in text for text in errors)
 
 
 def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
@@ -332,7 +334,8 @@ def test_sleeping_islands_are_refused_in_our_loop_only() -> None:
 def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path, iiwa: mujoco.MjModel) -> None:
     first = World(iiwa, (), ())
     data = first.model_bytes()
-    assert str(data_dir).encode() in bytes(iiwa.paths)
+    assert bytes(iiwa.paths).strip(b"\0")
+    assert bytes(iiwa.paths) not in data
     assert str(data_dir).encode() not in data
     again = World(model_from_bytes(data), (), ())
     assert again.scene_hash == first.scene_hash
