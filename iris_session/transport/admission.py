@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.names import RefusalCode, Role
@@ -27,7 +25,7 @@ class _RefusedError(Exception):
 
 
 class Admission:
-    """Accepts or refuses `hello`. `hand_back` is called with the table of tokens before an entry depends on it."""
+    """Accepts or refuses `hello`."""
 
     def __init__(
         self,
@@ -37,7 +35,6 @@ class Admission:
         outbox: Outbox,
         drops: Drops,
         tokens: ResumeTokens,
-        hand_back: Callable[[bytes], None],
     ) -> None:
         self._config = config
         self._ports = ports
@@ -45,7 +42,6 @@ class Admission:
         self._outbox = outbox
         self._drops = drops
         self._tokens = tokens
-        self._hand_back = hand_back
         self._hellos = TokenBucket(config.limits.hellos_per_second, config.limits.hello_burst)
 
     def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
@@ -58,7 +54,6 @@ class Admission:
             return None
         connection.last_heard_ns = now_ns
         self._clients.add(connection)
-        self._hand_back(self._tokens.blob())
         return Entry(connection.number, connection.number, now_ns, join)
 
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
@@ -129,7 +124,6 @@ class Admission:
             return
         config = self._config
         token = self._tokens.issue(connection.key_id, admitted.participant_id)
-        self._hand_back(self._tokens.blob())
         connection.admitted = True
         self._outbox.send(
             connection,
@@ -155,4 +149,3 @@ class Admission:
         """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
         if connection.hello.resume_token:
             self._tokens.retire(connection.hello.resume_token)
-            self._hand_back(self._tokens.blob())

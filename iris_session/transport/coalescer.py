@@ -8,7 +8,7 @@ authority sees every press. Urgent messages have a lane of their own that is emp
 from __future__ import annotations
 
 from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample
-from iris_session.protocol.entries import URGENT, Entry, Lost
+from iris_session.protocol.entries import URGENT, Entry, Join, Lost
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops
 
@@ -105,13 +105,16 @@ class Coalescer:
     def _offer_urgent(self, lane: _Lane, item: tuple[int, Entry]) -> bool:
         """An e-stop or loss is never dropped for want of room: a second one of the same connection says nothing new."""
         message = item[1].message
+        if isinstance(message, Lost) and any(isinstance(e.message, Join) for _, e in lane.messages):
+            self.forget(item[1].connection)  # the authority never heard of this connection
+            return True
         if isinstance(message, EStop | Lost) and any(type(e.message) is type(message) for _, e in lane.urgent):
             return True
         if len(lane.urgent) >= self._limits.pending_urgent and not isinstance(message, EStop | Lost):
             self._drops.count("urgent_pending", item[1].connection)
             return False
         if not isinstance(message, EStop):
-            # A release must not overtake the acquire before it, nor a loss the join.
+            # A release must not overtake the acquire before it.
             lane.urgent += lane.messages
             lane.messages = []
         if isinstance(message, Lost | Bye):

@@ -37,7 +37,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     unacknowledged: int = 8
     send_queue: int = 256
     slow_drops: int = 64
-    resume_tokens: int = 1024
+    resume_tokens: int = 256
 
 
 class SceneInfo(msgspec.Struct, frozen=True):
@@ -72,7 +72,6 @@ class FrontConfig(msgspec.Struct, frozen=True):
     heartbeat_ns: int = 500 * MILLISECOND
     silence_ns: int = 2 * SECOND
     stall_ns: int = 100 * MILLISECOND
-    parent_silence_ns: int = 2 * SECOND
     presence_period_ns: int = SECOND // 60
     proposal_period_ns: int = SECOND // 5
     tick_period_ns: int = 2 * MILLISECOND

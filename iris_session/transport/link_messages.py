@@ -47,7 +47,7 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrontStatus(msgspec.Struct, frozen=True):
-    """Counters of the front since its start, sent on change and at most twice a second.
+    """Counters of the front since its start, sent on change, at most twice a second.
 
     `drops`: by reason, over all connections. `dropped_by`: by connection number, those with drops only.
     """

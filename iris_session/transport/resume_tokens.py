@@ -32,18 +32,23 @@ def _digest(token: bytes) -> bytes:
 
 
 class ResumeTokens:
-    """Bounded table of tokens and the counter of connection numbers. `blob()` is handed to the next front."""
+    """Bounded table of tokens and the counter of connection numbers.
+
+    `blob()` is handed to the next front, whenever something has `changed` since the last one.
+    """
 
     def __init__(self, capacity: int, blob: bytes = b"") -> None:
         handback = _decoder.decode(blob) if blob else _Handback(1, [])
         self._capacity = capacity
         self._next_connection = handback.next_connection
         self._records = {record.digest: record for record in handback.records}
+        self.changed = False
 
     def new_connection(self) -> int:
         """A connection number that no front of this session has used, from 1."""
         number = self._next_connection
         self._next_connection += 1
+        self.changed = True
         return number
 
     def issue(self, key_id: str, participant_id: str) -> bytes:
@@ -52,6 +57,7 @@ class ResumeTokens:
         digest = _digest(token)
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
+        self.changed = True
         self._records[digest] = _Record(digest, key_id, participant_id)
         return token
 
@@ -62,7 +68,8 @@ class ResumeTokens:
 
     def retire(self, token: bytes) -> None:
         """Uses the token up."""
-        self._records.pop(_digest(token), None)
+        self.changed = self._records.pop(_digest(token), None) is not None or self.changed
 
     def blob(self) -> bytes:
+        self.changed = False
         return msgspec.msgpack.encode(_Handback(self._next_connection, list(self._records.values())))

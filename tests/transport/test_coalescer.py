@@ -119,13 +119,21 @@ def test_release_overtakes_no_acquire_of_its_own() -> None:
     assert [type(e.message) for e in waiting.take(urgent_only=True)] == [Acquire, Release]
 
 
-def test_loss_comes_after_the_join_and_drops_the_samples() -> None:
+def test_loss_comes_after_what_was_said_and_drops_the_samples() -> None:
     waiting, _ = coalescer()
-    waiting.offer(entry(Join("key", "operator", "Ann")))
+    waiting.offer(entry(Marker(1, "x")))
     waiting.offer(entry(sample(1)))
     waiting.offer(entry(Heartbeat()))
     waiting.offer(entry(Lost("closed")))
-    assert [type(e.message) for e in waiting.take()] == [Join, Lost]
+    assert [type(e.message) for e in waiting.take()] == [Marker, Lost]
+
+
+def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> None:
+    waiting, _ = coalescer()
+    waiting.offer(entry(Join("key", "operator", "Ann")))
+    waiting.offer(entry(Lost("closed")))
+    assert not waiting
+    assert waiting.take() == []
 
 
 def test_an_estop_always_has_room_and_is_said_once() -> None:

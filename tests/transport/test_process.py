@@ -12,10 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zmq
+import zmq.auth
 
-from iris_session.protocol.client_messages import Heartbeat, Hello, envelope
+from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
@@ -54,9 +56,36 @@ def test_open_networks_need_keys() -> None:
         FrontProcess(FrontConfig(host="0.0.0.0", control_port=0, state_port=0), scene()).start()
 
 
-def test_an_address_of_another_machine_is_named() -> None:
-    config = FrontConfig(host="127.0.0.1x", control_port=0, state_port=0, curve_secret_file="/nonexistent")
-    with pytest.raises(FrontError, match="folder with the public keys"):
+def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
+    _certificate(tmp_path, "server")
+    config = FrontConfig(
+        host="203.0.113.9",  # TEST-NET-3, nobody's
+        control_port=0,
+        state_port=0,
+        curve_secret_file=str(tmp_path / "server.key_secret"),
+        curve_clients_dir=str(tmp_path),
+    )
+    with pytest.raises(FrontError, match=r"cannot listen on 203\.0\.113\.9"):
+        FrontProcess(config, scene()).start()
+
+
+@pytest.mark.parametrize(
+    ("secret_file", "folder", "text"),
+    [
+        ("server.key_secret", "missing", "folder with the public keys"),
+        ("nothing", ".", "cannot be read"),
+        ("server.key", ".", "holds no secret key"),
+    ],
+)
+def test_keys_that_cannot_be_used_are_named(tmp_path: Path, secret_file: str, folder: str, text: str) -> None:
+    _certificate(tmp_path, "server")
+    config = FrontConfig(
+        control_port=0,
+        state_port=0,
+        curve_secret_file=str(tmp_path / secret_file),
+        curve_clients_dir=str(tmp_path / folder),
+    )
+    with pytest.raises(FrontError, match=text):
         FrontProcess(config, scene()).start()
 
 
@@ -113,31 +142,30 @@ def test_a_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(ses
 
 
 def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:
-    import numpy as np
-
     poses = np.zeros((3, 7))
     client = session.client()
     client.join()
-    for _ in range(50):
-        session.send_state(poses)
-        session.once()
-    client.send(_get_snapshot())
+    session.send_state(poses)
+    client.send(GetSnapshot(1))
     before = client.wait_for(Snapshot).state_seq
-    assert before == 50
+    assert before == 1
     os.kill(session.process.pid, signal.SIGKILL)
     wait(lambda: not session.process.alive, "crash")
     session.process.restart()
     session.pump(lambda: session.process.link.ports is not None, "new front")
     session.send_state(poses)
     client.join()
-    client.send(_get_snapshot())
+    client.send(GetSnapshot(2))
     assert client.wait_for(Snapshot, 2).state_seq > before
 
 
-def _get_snapshot() -> object:
-    from iris_session.protocol.client_messages import GetSnapshot
-
-    return GetSnapshot(1)
+def test_a_link_closed_without_a_word_ends_the_front(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    session.process.link.close()
+    wait(lambda: not session.process.alive, "end of the front")
+    client.receive()
+    assert client.got(ProtocolFault)[-1].code == "session_ended"
 
 
 def test_a_session_that_stands_still_is_reported_once_and_again_when_it_recovers(session: FrontSession) -> None:
@@ -222,10 +250,7 @@ def test_curve_lets_in_listed_keys_only_and_names_clients_by_key(open_session: O
 
 
 def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
-    import zmq.auth
-
     zmq.auth.create_certificates(folder, name)
     public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
     assert secret is not None
-    (folder / f"{name}.key").exists()
     return public, secret

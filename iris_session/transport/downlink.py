@@ -1,0 +1,127 @@
+"""What comes from the authority: state to the PUB socket first, then welcomes, answers and events to clients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import zmq
+
+from iris_session.protocol.server_messages import Event, ProtocolFault, Refused, ServerMessage, Snapshot
+from iris_session.protocol.steps import Outgoing
+from iris_session.transport import link_messages as link
+from iris_session.transport.admission import Admission
+from iris_session.transport.clients import ClientTable, Connection, Outbox, encode_message
+from iris_session.transport.limiter import Drops
+from iris_session.transport.sockets import readable
+from iris_session.transport.state_publisher import StatePublisher
+
+_BOUND = 64  # messages taken at once
+
+
+class Downlink:
+    """Drains the link. `forget` is called with connections that the authority is done with.
+
+    `heard_ns`: session time of the last word of the authority, 0 before its first. `acknowledged`: batches taken by
+    it since the start. `ended`: the session is over.
+    """
+
+    def __init__(
+        self,
+        socket: zmq.Socket[bytes],
+        clients: ClientTable,
+        outbox: Outbox,
+        admission: Admission,
+        publisher: StatePublisher,
+        drops: Drops,
+        session_ns: Callable[[], int],
+        forget: Callable[[Connection], None],
+    ) -> None:
+        self._socket = socket
+        self._clients = clients
+        self._outbox = outbox
+        self._admission = admission
+        self._publisher = publisher
+        self._drops = drops
+        self._session_ns = session_ns
+        self._forget = forget
+        self.heard_ns = 0
+        self.acknowledged = 0
+        self.ended = False
+
+    def drain(self) -> None:
+        """Takes what waits. Of several states only the newest is sent: they would fill the subscribers' queues."""
+        if not readable(self._socket):
+            return
+        waiting = [self._socket.recv_multipart()]
+        while len(waiting) < _BOUND and readable(self._socket):
+            waiting.append(self._socket.recv_multipart())
+        self.heard_ns = self._session_ns()
+        states = [i for i, frames in enumerate(waiting) if frames[0] == link.STATE]
+        if states:
+            # First of all, unless the scene changes before it.
+            newest = states[-1]
+            first = 0 if all(frames[0] != link.SCENE for frames in waiting[:newest]) else newest
+            state = waiting.pop(newest)
+            waiting.insert(first, state)
+            if len(states) > 1:
+                self._drops.count("state_superseded", n=len(states) - 1)
+                waiting = [frames for frames in waiting if frames[0] != link.STATE or frames is state]
+        for frames in waiting:
+            self._handle(frames)
+
+    def _handle(self, frames: list[bytes]) -> None:
+        kind = frames[0]
+        if kind == link.STATE:
+            if not self._publisher.publish(frames[1], frames[2]):
+                self._drops.count("state_of_other_scene")
+        elif kind == link.ACK:
+            self.acknowledged += frames[1][0]
+        elif kind == link.DECIDED:
+            self._decided(link.decode_decided(frames[1]))
+        elif kind == link.PRESENCE:
+            self._publisher.publish_presence(self.heard_ns, link.decode_presence(frames[1]))
+        elif kind == link.SCENE:
+            self._publisher.set_scene(link.decode_scene(frames[1]))
+        elif kind == link.END:
+            self.ended = True
+
+    def _decided(self, decided: link.Decided) -> None:
+        """Welcomes, then answers, then events: a snapshot may be older than the events of its step, never newer."""
+        for admitted in decided.admitted:
+            self._admission.welcome(admitted, self._session_ns())
+        for outgoing in decided.outgoing:
+            self._answer(outgoing)
+        for event in decided.events:
+            self.broadcast(event)
+        for dropped in decided.dropped:
+            connection = self._clients.by_number.get(dropped.connection)
+            if connection is not None:
+                text = f"the session let this connection go: {dropped.reason}"
+                self._outbox.send(connection, ProtocolFault("dropped", text))
+                self._forget(connection)
+
+    def _answer(self, outgoing: Outgoing) -> None:
+        message: ServerMessage = outgoing.message
+        connection = self._clients.by_number.get(outgoing.connection)
+        if connection is None:
+            return
+        if isinstance(message, Snapshot):
+            # What only the front knows: the scene, and the poses of the newest state frame.
+            state_seq, poses = self._publisher.keyframe()
+            scene = self._publisher.scene
+            filled = msgspec.structs.replace(
+                message, scene_hash=scene.scene_hash, robots=scene.robots, bodies=scene.bodies, state_seq=state_seq
+            )
+            self._outbox.send(connection, filled, poses)
+            return
+        self._outbox.send(connection, message)
+        if isinstance(message, Refused):
+            self._forget(connection)
+
+    def broadcast(self, message: Event | ProtocolFault) -> None:
+        """To every admitted connection; encoded once."""
+        encoded = encode_message(message)
+        for connection in self._clients.by_number.values():
+            if connection.admitted:
+                self._outbox.send_encoded(connection, encoded)
