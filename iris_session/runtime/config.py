@@ -26,7 +26,7 @@ class SessionConfig:
     `record`: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
     False records nothing. Port 0 takes any free one. `anchors`: `T_world_anchor` per anchor id. `curve_key`: file with
     the server's CURVE secret key, required for any `host` that is not loopback. `keyframe_s`: distance of the
-    recording's keyframes [s].
+    recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes on without when refused.
     """
 
     name: str = "session"
@@ -35,9 +35,10 @@ class SessionConfig:
     state_port: int = 7722
     state_hz: float = 60.0
     record: bool | str | Path = True
-    anchors: Mapping[str, PoseTuple] = DEFAULT_ANCHORS
+    anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     curve_key: str = ""
     keyframe_s: float = 5.0
+    realtime: bool = True
     authority: AuthorityConfig = field(default_factory=AuthorityConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
 

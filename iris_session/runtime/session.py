@@ -39,6 +39,7 @@ from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.core import CoreConfig, SessionCore, plant_state
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
+from iris_session.runtime.scheduling import tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import Stepper, session_clock
 from iris_session.runtime.user_loop import UserLoop
@@ -77,6 +78,7 @@ class Session:
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
+        self._scheduling = "normal"
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -117,7 +119,7 @@ class Session:
         stepper = self._make_stepper(user_owned=False)
         end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
         pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
-        with self._signals():
+        with self._signals(), tick_priority(self.config.realtime) as self._scheduling:
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
@@ -250,7 +252,7 @@ class Session:
 
     def status(self) -> SessionStatus:
         """Who is here, who holds what, how late ticks are, what was dropped."""
-        return make_status(self._stepper, self._pacer, self._processes)
+        return make_status(self._stepper, self._pacer, self._processes, self._scheduling)
 
     def recent_events(self) -> list[Event]:
         """The newest events, oldest first (at most 200; the recording has them all)."""

@@ -46,7 +46,7 @@ class HandoverStatus(msgspec.Struct, frozen=True):
 
 class SessionStatus(msgspec.Struct, frozen=True):
     """`lateness`: ticks, late, late_share, p50_ms, p99_ms. `input_to_ctrl_ms`: capture of the newest applied sample to
-    the step that used it, per robot. `drops`: by reason, of front and recorder."""
+    the step that used it, per robot. `drops`: by reason, of front and recorder. `scheduling`: `realtime` or `normal`."""
 
     session_time_s: float
     tick: int
@@ -59,6 +59,7 @@ class SessionStatus(msgspec.Struct, frozen=True):
     input_to_ctrl_ms: dict[str, float]
     drops: dict[str, int]
     restarts: dict[str, int]
+    scheduling: str = "normal"
 
     def as_dict(self) -> dict[str, Any]:
         return dict(msgspec.to_builtins(self))
@@ -118,12 +119,14 @@ class SessionLedger:
         return {name: (a.step_ns - a.capture_ns) * 1e-6 for name, a in self.applied.items()}
 
 
-def make_status(stepper: Stepper | None, pacer: Pacer | None, processes: SessionProcesses | None) -> SessionStatus:
+def make_status(
+    stepper: Stepper | None, pacer: Pacer | None, processes: SessionProcesses | None, scheduling: str
+) -> SessionStatus:
     """The status now; empty before the first step."""
     drops = {} if processes is None else processes.drops()
     restarts = {} if processes is None else processes.restarts()
     if stepper is None or stepper.last is None:
-        return SessionStatus(0.0, 0, 0.0, False, False, (), (), {}, {}, drops, restarts)
+        return SessionStatus(0.0, 0, 0.0, False, False, (), (), {}, {}, drops, restarts, scheduling)
     now_ns = stepper.clock()
     lateness = {}
     if pacer is not None:
@@ -149,4 +152,5 @@ def make_status(stepper: Stepper | None, pacer: Pacer | None, processes: Session
         ledger.input_to_ctrl_ms(),
         drops,
         restarts,
+        scheduling,
     )
