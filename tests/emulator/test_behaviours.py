@@ -7,8 +7,9 @@ import math
 import pytest
 
 from anchors.pose import distance
-from iris_session.emulator.behaviours import Giver, Idle, Receiver, Wander, make_behaviour
-from tests.emulator.handover_rig import DEVICE, Rig, handover, verdict
+from iris_session.emulator.behaviours import Behaviour, Giver, Idle, Receiver, Wander, make_behaviour
+from iris_session.physics.scenes import n_arms_scene
+from tests.emulator.handover_rig import DEVICE, Referee, Rig, handover, verdict
 
 
 def _until(robot: str, phase: str):  # type: ignore[no-untyped-def]
@@ -28,6 +29,25 @@ def test_handover_in_mid_air(seed: int, thing: str, giver: str, receiver: str) -
     assert rig.fastest_hand < 0.5
     side = 1.0 if receiver == "right" else -1.0
     assert side * rig.world.view().object_pose(thing).p[0] > 0.1  # on the receiver's side of the table
+
+
+def test_four_operators_two_handovers_at_once() -> None:
+    """Four arms around a table: neighbours hand over a hammer and a board at the same time."""
+    behaviours: dict[str, Behaviour] = {}
+    for giver, receiver, thing in (("arm1", "arm2", "object1"), ("arm3", "arm4", "object2")):
+        behaviours[giver] = Giver(giver, thing, receiver)
+        behaviours[receiver] = Receiver(receiver, thing, giver)
+    rig = Rig(behaviours, seed=15, object="object1", shift=False, model=n_arms_scene(4).compile())
+    other = Referee("object2")
+
+    def look(r: Rig) -> bool:
+        other.tick(r.world)
+        return all(b.done for b in r.behaviours.values())
+
+    rig.run(30.0, until=look)
+    assert verdict(rig, "arm1", "arm2") == ""
+    assert other.handed_over("arm3", "arm4")
+    assert other.resting
 
 
 def test_nothing_moves_by_itself() -> None:
@@ -101,16 +121,28 @@ def test_thing_moved_away_before_the_grasp() -> None:
 
 
 def test_thing_dropped_on_the_way_is_picked_up_again() -> None:
-    """The thing is torn out of the gripper in the air: the giver takes it from the table again."""
+    """The pads lose their grip for a moment in the air: the giver takes the thing from the table again."""
     rig = handover(9)
     rig.run(30.0, until=_until("left", "present"))
-    body = rig.world.model.body("hammer").id
-    rig.world.data.xfrc_applied[body, 2] = -300.0
+    model = rig.world.model
+    pads = [model.geom(f"left/pad_{side}").id for side in ("left", "right")]
+    rubber = model.geom_friction[pads].copy()
+    model.geom_friction[pads] = 0.001
     rig.run(5.0, until=lambda r: r.world.view().object_pose("hammer").p[2] < 0.06)
-    rig.world.data.xfrc_applied[body] = 0.0
+    model.geom_friction[pads] = rubber
     rig.run(60.0)
     assert verdict(rig, "left", "right") == ""
     assert rig.behaviours["left"].attempts >= 2  # type: ignore[attr-defined]
+
+
+def test_thing_that_leans_on_something_is_left_alone() -> None:
+    rig = handover(9, shift=False)
+    at = rig.world.model.joint("hammer").qposadr[0]
+    rig.world.data.qpos[at + 2] = 0.17
+    rig.world.data.qpos[at + 3 : at + 7] = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)  # on its head, handle upright
+    rig.world.refresh()
+    rig.run(10.0, until=lambda r: r.behaviours["left"].done)
+    assert rig.behaviours["left"].failed == "the hammer does not lie flat, it cannot be taken from above"
 
 
 def test_giver_gives_up_when_nobody_comes() -> None:

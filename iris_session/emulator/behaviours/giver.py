@@ -6,11 +6,13 @@ import math
 
 from anchors.pose import apply, distance
 from iris_session.emulator.behaviours.operator import CLEAR_ABOVE, Operator
-from iris_session.emulator.behaviours.things import above, face_up, level
+from iris_session.emulator.behaviours.things import above, face_up, level, tilt
 from iris_session.protocol.names import Device
 
 #: The other must be seen to hold the thing for so long [s] before the giver opens.
 SURE_S = 0.35
+#: A thing that lies more askew than this is left alone [rad].
+MOST_TILT = 0.3
 
 
 class Giver(Operator):
@@ -46,6 +48,10 @@ class Giver(Operator):
     def _look(self) -> None:
         """Waits until the thing lies still, and chooses the end to take: the free end must point at the partner."""
         if self.eyes.still_s(self.object) < 0.3:
+            return
+        if tilt(self.eyes.body(self.object)) > MOST_TILT:
+            if self._waited(3.0):
+                self._give_up(f"the {self.object} does not lie flat, it cannot be taken from above")
             return
         self._take_x = self.thing.giver_x
         if self.thing.symmetric:

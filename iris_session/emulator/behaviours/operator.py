@@ -45,6 +45,7 @@ class Operator:
             "close": self._close,
             "back_off": self._back_off,
             "rise": self._rise,
+            "step_back": self._step_back,
             "return": self._return,
         }
         self._clutched_again = 0
@@ -108,6 +109,13 @@ class Operator:
 
     def _rise(self) -> None:
         if self.hand.moved():
+            self._enter("step_back")
+
+    def _step_back(self) -> None:
+        """Back to where the hand began: nothing leans on the arm there, and both people can see the thing."""
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        if self.hand.arrived(0.02, 0.1) or self._waited(4.0):
             self._enter(self._first_phase())
 
     def _return(self) -> None:

@@ -6,6 +6,7 @@ a gripper), z up when it lies on the table, origin in the middle of the length.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, quat_angle, quat_from_yaw, quat_mul, quat_rotate
@@ -75,6 +76,11 @@ def thing_named(name: str) -> Thing:
 def face_up(T_world_thing: PoseTuple) -> float:
     """1 when the thing's z axis points up, -1 when it lies on its other face."""
     return 1.0 if quat_rotate(T_world_thing[1], (0.0, 0.0, 1.0))[2] >= 0.0 else -1.0
+
+
+def tilt(T_world_thing: PoseTuple) -> float:
+    """Angle [rad] between the thing's z axis and the vertical, 0 on either face."""
+    return math.acos(min(1.0, abs(quat_rotate(T_world_thing[1], (0.0, 0.0, 1.0))[2])))
 
 
 def level(p_world: Vec3, yaw: float, up: float) -> PoseTuple:
