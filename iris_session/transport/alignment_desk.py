@@ -21,7 +21,7 @@ class AlignmentDesk:
         self._next_ns = 0
         self._pending = False
         self._unknown: tuple[str, int] | None = None
-        self._last: AlignmentProposal | None = None
+        self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
 
     def observe(self, observation: Observation) -> bool:
         """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform)."""
@@ -48,7 +48,7 @@ class AlignmentDesk:
         return self._pending and now_ns >= self._next_ns
 
     def propose(self, now_ns: int) -> AlignmentProposal | None:
-        """Estimates from everything observed. `None`: the result is the same as the last one."""
+        """Estimates from everything observed. `None`: the same refusal as before, for the same reason."""
         self._pending = False
         self._next_ns = now_ns + self._period_ns
         if self._unknown is not None:
@@ -58,9 +58,10 @@ class AlignmentDesk:
                 proposal = _proposal(self._estimator.estimate())
             except (ArithmeticError, ValueError, np.linalg.LinAlgError):
                 proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
-        if proposal == self._last:
+        refused = (proposal.tracking_epoch, proposal.advice) if proposal.refused else None
+        if refused is not None and refused == self._refused:
             return None
-        self._last = proposal
+        self._refused = refused
         return proposal
 
     def _unknown_anchor(self, anchor_id: str, tracking_epoch: int) -> AlignmentProposal:

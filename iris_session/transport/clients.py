@@ -71,7 +71,7 @@ class Connection:
         self.confirmed = False  # a message with its connection epoch has come: it has its `Welcome`
         self.last_heard_ns = 0
         self.drops_in_a_row = 0
-        self.faults = TokenBucket(2.0, 5.0)
+        self.faults = TokenBucket(2.0, 5)
         self.rates = RateLimiter()
         self.prefix = server_prefix(number)
 

@@ -33,7 +33,7 @@ from iris_session.transport.limiter import Drops, TokenBucket
 #: Fault code: this connection has not said hello (or the front was restarted): say it again.
 HELLO_NEEDED: Final = "hello"
 #: Faults to strangers, per second: they have no connection to count on.
-_STRANGER_FAULTS: Final = 20.0
+_STRANGER_FAULTS: Final = 20
 _RECORDER_HWM: Final = 20_000
 _encode = msgspec.msgpack.Encoder().encode
 

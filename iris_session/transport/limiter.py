@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
+
+_TOKEN: Final = 1_000_000_000
 
 
 class TokenBucket:
-    """Allows `burst` at once and `rate` per second on average."""
+    """Allows `burst` at once and `rate` per second on average. Counts in nano-tokens, so it is exact."""
 
-    __slots__ = ("_burst", "_last_ns", "_rate", "_tokens")
+    __slots__ = ("_full", "_last_ns", "_rate", "_tokens")
 
-    def __init__(self, rate: float, burst: float) -> None:
+    def __init__(self, rate: float, burst: int) -> None:
         self._rate = rate
-        self._burst = burst
-        self._tokens = burst
+        self._full = burst * _TOKEN
+        self._tokens = self._full
         self._last_ns = 0
 
     def take(self, now_ns: int) -> bool:
         """Uses one token; false when there is none."""
-        tokens = min(self._burst, self._tokens + (now_ns - self._last_ns) * 1e-9 * self._rate)
+        self._tokens = min(self._full, self._tokens + int((now_ns - self._last_ns) * self._rate))
         self._last_ns = now_ns
-        if tokens < 1.0:
-            self._tokens = tokens
+        if self._tokens < _TOKEN:
             return False
-        self._tokens = tokens - 1.0
+        self._tokens -= _TOKEN
         return True
 
 

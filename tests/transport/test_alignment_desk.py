@@ -1,0 +1,64 @@
+"""Observations of one connection -> proposals at a bounded rate, on change only."""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import IDENTITY_POSE, PoseTuple
+from iris_session.protocol.client_messages import Observation
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.transport.alignment_desk import AlignmentDesk
+
+PERIOD = 200_000_000
+ANCHORS: dict[str, PoseTuple] = {"table": ((1.0, 2.0, 0.8), IDENTITY_POSE[1])}
+
+
+def seen(i: int = 0, anchor: str = "table", epoch: int = 1, pose: Pose = IDENTITY) -> Observation:
+    return Observation(anchor, "qr", pose, i, epoch, viewpoint_id=i)
+
+
+def test_too_few_observations_are_refused_with_advice_once() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    assert not desk.due(0)
+    assert desk.observe(seen())
+    assert desk.due(0)
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert proposal.refused
+    assert proposal.advice
+    desk.observe(seen(1))
+    assert not desk.due(PERIOD - 1)
+    assert desk.due(PERIOD)
+    assert desk.propose(PERIOD) is None, "the same refusal again"
+
+
+def test_enough_observations_align() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    for i in range(8):
+        desk.observe(seen(i, pose=Pose((0.0, 0.0, -0.2), IDENTITY.q)))
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert not proposal.refused
+    assert math.dist(proposal.T_world_tracking.p, (1.0, 2.0, 1.0)) < 1e-6
+    assert proposal.n_observations == 8
+    assert len(proposal.covariance) == 36
+
+
+def test_an_unknown_anchor_names_the_known_ones() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    assert not desk.observe(seen(anchor="door", epoch=3))
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert proposal.refused
+    assert proposal.tracking_epoch == 3
+    assert "door" in proposal.advice
+    assert "table" in proposal.advice
+
+
+def test_hostile_numbers_are_of_no_use_and_harm_nothing() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    for value in (math.nan, math.inf, 1e308, -1e308):
+        for pose in (Pose((value, 0.0, 0.0), IDENTITY.q), Pose((0.0, 0.0, 0.0), (value, 0.0, 0.0, 0.0))):
+            assert not desk.observe(seen(pose=pose))
+    assert not desk.observe(seen(pose=Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))))
+    assert not desk.due(0)
