@@ -90,7 +90,7 @@ def _nan_for_null(line: bytes) -> bytes:
 
 
 class DemoResult(msgspec.Struct, frozen=True):
-    """What `iris-session demo NAME --json` prints. `alignment_mm`: stated p95 and true error at the sheet, by person."""
+    """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet."""
 
     ok: bool
     demo: str

@@ -46,7 +46,7 @@ class HandoverStatus(msgspec.Struct, frozen=True):
 
 class SessionStatus(msgspec.Struct, frozen=True):
     """`lateness`: ticks, late, late_share, p50_ms, p99_ms. `input_to_ctrl_ms`: capture of the newest applied sample to
-    the step that used it, per robot. `drops`: by reason, of front and recorder. `scheduling`: `realtime` or `normal`."""
+    the step that used it, per robot. `drops`: by reason. `scheduling`: `realtime` or `normal`."""
 
     session_time_s: float
     tick: int
