@@ -202,6 +202,20 @@ class RefusalCode:
     FULL: Final = "full"
 
 
+class FaultCode:
+    """Why a `ProtocolFault` was sent: a message that could not be taken, or what has become of the session."""
+
+    VERSION: Final = "version"
+    MALFORMED: Final = "malformed"
+    TOO_LARGE: Final = "too_large"
+    RATE: Final = "rate"
+    HELLO: Final = "hello"  # this connection has not said hello, or the front was restarted: say it again
+    DROPPED: Final = "dropped"  # the session let this connection go
+    STALLED: Final = "stalled"  # the session does not step: robots hold
+    RECOVERED: Final = "recovered"
+    SESSION_ENDED: Final = "session_ended"
+
+
 class EpisodeAction:
     START: Final = "start"
     SUCCESS: Final = "success"

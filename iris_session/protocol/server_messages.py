@@ -53,7 +53,7 @@ class Refused(Message, frozen=True, tag="refused"):
 
 
 class ProtocolFault(Message, frozen=True, tag="protocol_fault"):
-    """A message that could not be taken (malformed, too large, too fast). `code` as in `RefusalCode`."""
+    """A message that could not be taken, or what has become of the session. `code`: `FaultCode`."""
 
     code: Name
     message: Text

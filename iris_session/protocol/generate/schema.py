@@ -1,0 +1,219 @@
+"""The message definitions as plain data: what the generators of other languages and documents read.
+
+Structs are in the order of their definition, fields in the order of the wire. `array_like` structs are MessagePack
+arrays, all others maps with the field names as keys.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, get_args
+
+import msgspec
+
+from iris_session.protocol import client_messages, common, names, server_messages
+
+
+@dataclass(frozen=True)
+class Type:
+    """Type of a field. `base`: bool, int, float, str, bytes, array, map, struct, union.
+
+    `item`: of an array, or the value of a map. `length`: of an array of fixed length. `max_length`: 0 for no limit.
+    `name`: of a struct or union. `optional`: may be null. `minimum`: of an int.
+    """
+
+    base: str
+    item: Type | None = None
+    length: int = 0
+    max_length: int = 0
+    name: str = ""
+    optional: bool = False
+    minimum: int | None = None
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field. `enum`: name of the open enumeration that its values come from, or empty."""
+
+    name: str
+    type: Type
+    required: bool
+    default: Any
+    enum: str
+
+
+@dataclass(frozen=True)
+class Struct:
+    """One struct. `tag_field`, `tag`: empty for structs outside of a union."""
+
+    name: str
+    doc: str
+    array_like: bool
+    tag_field: str
+    tag: str
+    fields: tuple[Field, ...]
+    cls: type[msgspec.Struct]
+
+
+#: Closed unions of tagged structs, by the name used in generated code.
+UNIONS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
+    "ClientMessage": get_args(client_messages.ClientMessage),
+    "ServerMessage": get_args(server_messages.ServerMessage),
+    "EventKind": get_args(server_messages.EventKind),
+}
+
+#: Groups of structs in the order of the document.
+GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
+    "values": (
+        common.Pose,
+        common.Target,
+        common.Lease,
+        common.Denial,
+        common.Alignment,
+        common.Applied,
+        server_messages.Endpoints,
+        server_messages.ParticipantInfo,
+        server_messages.RobotInfo,
+        server_messages.BodyInfo,
+    ),
+    "client": UNIONS["ClientMessage"],
+    "server": UNIONS["ServerMessage"],
+    "events": UNIONS["EventKind"],
+    "frames": (
+        client_messages.ClientEnvelope,
+        server_messages.ServerEnvelope,
+        server_messages.StateHeader,
+        server_messages.PresenceItem,
+        server_messages.Presence,
+        server_messages.Beacon,
+    ),
+}
+
+#: Which open enumeration a field takes its values from.
+_ENUMS: Final[dict[str, str]] = {
+    "Hello.role": "Role",
+    "Hello.devices": "Device",
+    "Hello.alignment": "AlignmentKind",
+    "Sample.device": "Device",
+    "Sample.kind": "SampleKind",
+    "SetMode.mode": "LeaseMode",
+    "Grasp.device": "Device",
+    "Observation.kind": "AnchorKind",
+    "Observation.device": "Device",
+    "Episode.action": "EpisodeAction",
+    "Control.action": "ControlAction",
+    "Target.kind": "TargetKind",
+    "Lease.kind": "TargetKind",
+    "Lease.mode": "LeaseMode",
+    "Denial.reason": "DenialReason",
+    "Alignment.kind": "AlignmentKind",
+    "Applied.device": "Device",
+    "ParticipantInfo.role": "Role",
+    "ParticipantInfo.devices": "Device",
+    "Welcome.kind": "SessionKind",
+    "Welcome.role": "Role",
+    "Refused.code": "RefusalCode",
+    "ProtocolFault.code": "FaultCode",
+    "Feedback.state": "CommandKind",
+    "Feedback.hold_reason": "HoldReason",
+    "ObjectGrasped.device": "Device",
+    "SamplesRejected.device": "Device",
+    "SamplesRejected.reason": "RejectReason",
+    "PresenceItem.device": "Device",
+    "Beacon.kind": "SessionKind",
+}
+
+_SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {
+    msgspec.inspect.BoolType: "bool",
+    msgspec.inspect.FloatType: "float",
+}
+
+
+def structs(group: str) -> tuple[Struct, ...]:
+    """Structs of one of `GROUPS`."""
+    return tuple(_struct(cls) for cls in GROUPS[group])
+
+
+def all_structs() -> tuple[Struct, ...]:
+    """Every struct that travels, each once."""
+    return tuple(struct for group in GROUPS for struct in structs(group))
+
+
+def enums() -> dict[str, dict[str, str]]:
+    """Open enumerations: name -> constant -> value, in the order of their definition."""
+    found = {}
+    for name, value in vars(names).items():
+        if isinstance(value, type) and value.__module__ == names.__name__:
+            found[name] = {key: text for key, text in vars(value).items() if key.isupper() and isinstance(text, str)}
+    return found
+
+
+def enum_doc(name: str) -> str:
+    """First line of the docstring of an open enumeration, or empty."""
+    return (inspect.getdoc(getattr(names, name)) or "").split("\n")[0]
+
+
+def _struct(cls: type[msgspec.Struct]) -> Struct:
+    info = msgspec.inspect.type_info(cls)
+    assert isinstance(info, msgspec.inspect.StructType)
+    return Struct(
+        name=cls.__name__,
+        doc=_doc(cls),
+        array_like=info.array_like,
+        tag_field=info.tag_field or "",
+        tag=str(info.tag) if info.tag_field else "",
+        fields=tuple(_fields(cls, info)),
+        cls=cls,
+    )
+
+
+def _doc(cls: type[msgspec.Struct]) -> str:
+    """The docstring of `cls` itself (not of its base), unindented."""
+    return inspect.cleandoc(cls.__doc__) if cls.__doc__ else ""
+
+
+def _fields(cls: type[msgspec.Struct], info: msgspec.inspect.StructType) -> Iterator[Field]:
+    for field in info.fields:
+        default = field.default
+        if field.default_factory is not msgspec.NODEFAULT:
+            default = field.default_factory()
+        enum = _ENUMS.get(f"{cls.__name__}.{field.encode_name}", "")
+        yield Field(field.encode_name, _type(field.type), field.required, default, enum)
+
+
+def _type(node: msgspec.inspect.Type) -> Type:
+    scalar = _SCALARS.get(type(node))
+    if scalar:
+        return Type(scalar)
+    match node:
+        case msgspec.inspect.IntType():
+            return Type("int", minimum=node.ge)
+        case msgspec.inspect.StrType():
+            return Type("str", max_length=node.max_length or 0)
+        case msgspec.inspect.BytesType():
+            return Type("bytes", max_length=node.max_length or 0)
+        case msgspec.inspect.TupleType():
+            return Type("array", item=_type(node.item_types[0]), length=len(node.item_types))
+        case msgspec.inspect.VarTupleType():
+            return Type("array", item=_type(node.item_type), max_length=node.max_length or 0)
+        case msgspec.inspect.DictType():
+            return Type("map", item=_type(node.value_type))
+        case msgspec.inspect.StructType():
+            return Type("struct", name=node.cls.__name__)
+        case msgspec.inspect.UnionType():
+            return _union(node)
+    raise TypeError(f"{node} has no form in the schema: use bool, int, float, str, bytes, tuple, dict or a Struct")
+
+
+def _union(node: msgspec.inspect.UnionType) -> Type:
+    members = [member for member in node.types if not isinstance(member, msgspec.inspect.NoneType)]
+    if len(members) == 1:
+        inner = _type(members[0])
+        return Type(**{**vars(inner), "optional": True})
+    classes = {member.cls for member in members if isinstance(member, msgspec.inspect.StructType)}
+    for name, union in UNIONS.items():
+        if classes == set(union):
+            return Type("union", name=name)
+    raise TypeError(f"{node} is none of the unions {', '.join(UNIONS)}")

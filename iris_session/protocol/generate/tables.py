@@ -1,0 +1,102 @@
+"""Markdown tables of the protocol document, one text per section between its markers."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import msgspec
+
+from iris_session.protocol import limits
+from iris_session.protocol.generate.schema import Field, Struct, Type, enum_doc, enums, structs
+
+
+def sections() -> dict[str, str]:
+    """Section name -> markdown, for `<!-- generated:NAME -->` ... `<!-- end:NAME -->` in docs/protocol.md."""
+    groups = {group: _group(group) for group in ("values", "client", "server", "events", "frames")}
+    return {**groups, "names": _names(), "limits": _limits()}
+
+
+def _group(group: str) -> str:
+    return "\n\n".join(_struct(struct) for struct in structs(group))
+
+
+def _struct(struct: Struct) -> str:
+    form = "array" if struct.array_like else "map"
+    tag = f', `{struct.tag_field}` = `"{struct.tag}"`' if struct.tag else ""
+    lines = [f"#### {struct.name}", "", f"MessagePack {form}{tag}."]
+    if struct.doc:
+        lines[-1] += f" {struct.doc}"
+    if struct.fields:
+        first = "#" if struct.array_like else ""
+        lines += ["", f"| {first + ' | ' if first else ''}field | type | default |"]
+        lines.append("|" + "---|" * (4 if first else 3))
+        for k, field in enumerate(struct.fields):
+            index = f"{k} | " if first else ""
+            lines.append(f"| {index}`{field.name}` | {_type(field)} | {_default(field)} |")
+    return "\n".join(lines)
+
+
+def _type(field: Field) -> str:
+    text = _kind(field.type)
+    if field.enum:
+        text += f" of [{field.enum}](#{field.enum.lower()})"
+    return text + (" or null" if field.type.optional else "")
+
+
+def _kind(kind: Type) -> str:
+    match kind.base:
+        case "int":
+            return "uint63" if kind.minimum == 0 else "int64"
+        case "str" | "bytes":
+            unit = "bytes" if kind.base == "bytes" else "characters"
+            name = "bytes" if kind.base == "bytes" else "string"
+            return f"{name}, at most {kind.max_length} {unit}" if kind.max_length else name
+        case "array":
+            assert kind.item is not None
+            item = _kind(kind.item)
+            if kind.length:
+                return f"array of {kind.length} {item}"
+            limit = f", at most {kind.max_length}" if kind.max_length else ""
+            return f"array of ({item}){limit}"
+        case "map":
+            return "map of string to int"
+        case "struct":
+            return f"[{kind.name}](#{kind.name.lower()})"
+        case "union":
+            return f"one of {kind.name}"
+    return "float64" if kind.base == "float" else kind.base
+
+
+def _default(field: Field) -> str:
+    if field.required:
+        return "required"
+    return f"`{_json(field.default)}`"
+
+
+def _json(value: Any) -> str:
+    return json.dumps(msgspec.to_builtins(value))
+
+
+def _names() -> str:
+    blocks = []
+    for name, values in enums().items():
+        listed = ", ".join(f"`{value}`" for value in values.values())
+        doc = enum_doc(name)
+        blocks.append(f"#### {name}\n\n{doc + ' ' if doc else ''}{listed}")
+    return "\n\n".join(blocks)
+
+
+def _limits() -> str:
+    lines = ["| message | to | bytes | per second | burst |", "|---|---|---|---|---|"]
+    for table, to in ((limits.LIMITS, "session"), (limits.SERVER_LIMITS, "client")):
+        for kind, limit in table.items():
+            rate = f"{limit.per_second:g} | {limit.burst}" if limit.burst else "- | -"
+            lines.append(f"| `{kind.__struct_config__.tag}` | {to} | {limit.max_bytes:,} | {rate} |")
+    for name, size in (
+        ("state header", limits.MAX_STATE_HEADER_BYTES),
+        ("presence", limits.MAX_PRESENCE_BYTES),
+        ("beacon", limits.MAX_BEACON_BYTES),
+    ):
+        lines.append(f"| {name} | client | {size:,} | - | - |")
+    return "\n".join(lines)

@@ -1,0 +1,925 @@
+// Messages of the iris-session protocol. Written by `python -m iris_session.protocol.generate typescript`: do not edit.
+//
+// Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
+// enumerations may be others than those listed.
+
+export const PROTOCOL_VERSION = 1;
+export const TOPIC_RIGID = "rigid";
+export const TOPIC_PRESENCE = "presence";
+export const RIGID_FORMAT = 1;
+/** Edge of the position lattice [m]. */
+export const RIGID_LATTICE_M = 0.0001068115234375;
+export const RIGID_ROTATION_LEVELS = 6501;
+
+/** What a participant may do. Reserved for later message types: `camera`, `source`. */
+export const Role = {
+  OPERATOR: "operator",
+  OBSERVER: "observer",
+  DIRECTOR: "director",
+  AGENT: "agent",
+  LEADER: "leader",
+  GATEWAY: "gateway",
+  RECORDER: "recorder",
+  CAMERA: "camera",
+  SOURCE: "source",
+} as const;
+export type Role = (typeof Role)[keyof typeof Role] | (string & {});
+
+/** Tracked sources of input of one participant. */
+export const Device = {
+  HEAD: "head",
+  CONTROLLER_LEFT: "controller/left",
+  CONTROLLER_RIGHT: "controller/right",
+  HAND_LEFT: "hand/left",
+  HAND_RIGHT: "hand/right",
+  JOINTS: "joints",
+  GAZE: "gaze",
+  DESKTOP: "desktop",
+  TARGET: "target",
+} as const;
+export type Device = (typeof Device)[keyof typeof Device] | (string & {});
+
+/** Which payload of a `Sample` is meant. */
+export const SampleKind = {
+  POSE: "pose",
+  TWIST: "twist",
+  JOINTS: "joints",
+} as const;
+export type SampleKind = (typeof SampleKind)[keyof typeof SampleKind] | (string & {});
+
+export const TargetKind = {
+  ROBOT: "robot",
+  OBJECT: "object",
+} as const;
+export type TargetKind = (typeof TargetKind)[keyof typeof TargetKind] | (string & {});
+
+/** How a robot's lease passes between participants. */
+export const LeaseMode = {
+  EXCLUSIVE: "exclusive",
+  REQUEST: "request",
+  TAKEOVER: "takeover",
+  PRIORITY: "priority",
+  SHARED: "shared",
+} as const;
+export type LeaseMode = (typeof LeaseMode)[keyof typeof LeaseMode] | (string & {});
+
+export const AssignmentPolicy = {
+  CONFIG: "config",
+  JOIN_ORDER: "join-order",
+  NEAREST: "nearest",
+  DIRECTOR: "director",
+} as const;
+export type AssignmentPolicy = (typeof AssignmentPolicy)[keyof typeof AssignmentPolicy] | (string & {});
+
+/** How `T_world_tracking` of a participant came to be. */
+export const AlignmentKind = {
+  NONE: "none",
+  MEASURED: "measured",
+  PLACED: "placed",
+  NOT_NEEDED: "not_needed",
+} as const;
+export type AlignmentKind = (typeof AlignmentKind)[keyof typeof AlignmentKind] | (string & {});
+
+export const AnchorKind = {
+  QR: "qr",
+  BOARD: "board",
+  CONTROLLER: "controller",
+  TOUCH: "touch",
+} as const;
+export type AnchorKind = (typeof AnchorKind)[keyof typeof AnchorKind] | (string & {});
+
+export const SessionKind = {
+  LIVE: "live",
+  REPLAY: "replay",
+} as const;
+export type SessionKind = (typeof SessionKind)[keyof typeof SessionKind] | (string & {});
+
+export const CommandKind = {
+  HOLD: "hold",
+  POSE: "pose",
+  TWIST: "twist",
+  JOINTS: "joints",
+} as const;
+export type CommandKind = (typeof CommandKind)[keyof typeof CommandKind] | (string & {});
+
+/** Why a robot holds. Exactly one is given with every hold command. */
+export const HoldReason = {
+  NO_LEASE: "no_lease",
+  NO_SAMPLE: "no_sample",
+  CLUTCH_OPEN: "clutch_open",
+  STALE: "stale",
+  NOT_WORN: "not_worn",
+  UNTRACKED: "untracked",
+  UNALIGNED: "unaligned",
+  REJECTED: "rejected",
+  ESTOP: "estop",
+  DISCONNECTED: "disconnected",
+  GAP: "gap",
+  SCENE_CHANGED: "scene_changed",
+  REARM: "rearm",
+} as const;
+export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
+
+/** Why a sample was not counted. Counted per participant, device and reason. */
+export const RejectReason = {
+  CONNECTION_EPOCH: "connection_epoch",
+  SCENE_EPOCH: "scene_epoch",
+  TRACKING_EPOCH: "tracking_epoch",
+  LEASE_VERSION: "lease_version",
+  NOT_HOLDER: "not_holder",
+  ALIGNMENT_VERSION: "alignment_version",
+  SEQ: "seq",
+  STALE: "stale",
+  FUTURE: "future",
+  NOT_FINITE: "not_finite",
+  NOT_UNIT: "not_unit",
+  TOO_FAST: "too_fast",
+  SHAPE: "shape",
+  UNKNOWN_VALUE: "unknown_value",
+  UNKNOWN_TARGET: "unknown_target",
+  ROLE: "role",
+  UNALIGNED: "unaligned",
+  QUOTA: "quota",
+  DEVICE: "device",
+  LEADER_APART: "leader_apart",
+} as const;
+export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
+
+/** Why a request was denied. */
+export const DenialReason = {
+  HELD: "held",
+  CONSENT_PENDING: "consent_pending",
+  CONSENT_REFUSED: "consent_refused",
+  ROLE: "role",
+  UNKNOWN_TARGET: "unknown_target",
+  UNKNOWN_PARTICIPANT: "unknown_participant",
+  UNKNOWN_REQUEST: "unknown_request",
+  UNKNOWN_VALUE: "unknown_value",
+  LEASE_VERSION: "lease_version",
+  NOT_HOLDER: "not_holder",
+  NOT_JOINED: "not_joined",
+  ALREADY_JOINED: "already_joined",
+  ESTOP: "estop",
+  UNALIGNED: "unaligned",
+  ALIGNMENT_REFUSED: "alignment_refused",
+  EPISODE_STATE: "episode_state",
+  QUEUE_FULL: "queue_full",
+  QUOTA: "quota",
+  SESSION_FULL: "session_full",
+  USER_OWNED: "user_owned",
+  POLICY: "policy",
+  INVALID: "invalid",
+} as const;
+export type DenialReason = (typeof DenialReason)[keyof typeof DenialReason] | (string & {});
+
+/** Why a `hello` was refused by the front, before the authority saw it. */
+export const RefusalCode = {
+  VERSION: "version",
+  IDENTITY: "identity",
+  MALFORMED: "malformed",
+  TOO_LARGE: "too_large",
+  RATE: "rate",
+  GATEWAY_ONLY: "gateway_only",
+  RESUME_TOKEN: "resume_token",
+  FULL: "full",
+} as const;
+export type RefusalCode = (typeof RefusalCode)[keyof typeof RefusalCode] | (string & {});
+
+/** Why a `ProtocolFault` was sent: a message that could not be taken, or what has become of the session. */
+export const FaultCode = {
+  VERSION: "version",
+  MALFORMED: "malformed",
+  TOO_LARGE: "too_large",
+  RATE: "rate",
+  HELLO: "hello",
+  DROPPED: "dropped",
+  STALLED: "stalled",
+  RECOVERED: "recovered",
+  SESSION_ENDED: "session_ended",
+} as const;
+export type FaultCode = (typeof FaultCode)[keyof typeof FaultCode] | (string & {});
+
+export const EpisodeAction = {
+  START: "start",
+  SUCCESS: "success",
+  FAILURE: "failure",
+  DISCARD: "discard",
+  RERECORD: "rerecord",
+  RESET: "reset",
+} as const;
+export type EpisodeAction = (typeof EpisodeAction)[keyof typeof EpisodeAction] | (string & {});
+
+export const ControlAction = {
+  PAUSE: "pause",
+  RESUME: "resume",
+  STEP: "step",
+  RESET: "reset",
+} as const;
+export type ControlAction = (typeof ControlAction)[keyof typeof ControlAction] | (string & {});
+
+/** A rigid transform `T_a_b`: position `p` [m] of frame b in a, rotation `q` `[w, x, y, z]` from b to a. */
+export type Pose = [
+  p: [number, number, number],
+  q: [number, number, number, number],
+];
+
+/** What a sample drives, under which lease. `lease_version` is the fencing token. */
+export type Target = [
+  name: string,
+  lease_version: number,
+  kind?: TargetKind,
+];
+
+/**
+ * State of one lease as everyone sees it. `holder` is a participant id, empty when free.
+ *
+ * `expires_ns` is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
+ * `sub_holders` and `weights` are used in mode `shared` only and have the same length.
+ */
+export interface Lease {
+  target: string;
+  kind: TargetKind;
+  mode: LeaseMode;
+  holder: string;
+  lease_version: number;
+  expires_ns?: number;
+  queue?: string[];
+  sub_holders?: string[];
+  weights?: number[];
+}
+
+/** A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do. */
+export interface Denial {
+  reason: DenialReason;
+  message: string;
+  advice?: string;
+  target?: string;
+  holder?: string;
+  holder_name?: string;
+}
+
+/**
+ * `T_world_tracking` of one participant, as accepted by the authority.
+ *
+ * `covariance`: 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, empty when unknown.
+ * `error_at_anchor_m`, `error_at_robot_m`: stated p95 of the position error at the anchor and at the robot.
+ */
+export interface Alignment {
+  version: number;
+  kind: AlignmentKind;
+  T_world_tracking: Pose;
+  tracking_epoch?: number;
+  covariance?: number[];
+  error_at_anchor_m?: number;
+  error_at_robot_m?: number;
+  offset?: boolean;
+}
+
+/** The newest sample that entered the IK target behind the `ctrl` in use, for one robot. All times session time. */
+export type Applied = [
+  robot: string,
+  participant: string,
+  device: Device,
+  seq: number,
+  capture_ns: number,
+  receive_ns: number,
+  step_ns: number,
+];
+
+/** Ports of the other channels on the host that the client already talks to. */
+export interface Endpoints {
+  state?: number;
+  media?: number;
+  assets?: number;
+  web?: number;
+}
+
+/** One row of the roster. */
+export interface ParticipantInfo {
+  id: string;
+  name: string;
+  role: Role;
+  connected: boolean;
+  devices?: Device[];
+  worn?: boolean;
+  tracking_epoch?: number;
+  alignment?: Alignment | null;
+}
+
+/** A robot as clients need it. `site_body`: id of the body that carries the end-effector site; `T_body_site`. */
+export interface RobotInfo {
+  name: string;
+  joints: string[];
+  base_body: number;
+  site_body: number;
+  T_body_site: Pose;
+  gripper: boolean;
+}
+
+/** One streamed rigid body: its index in state frames is its position in `Snapshot.bodies`. */
+export type BodyInfo = [
+  id: number,
+  name: string,
+  moving: boolean,
+  object?: boolean,
+];
+
+/**
+ * First message of a connection.
+ *
+ * `secret`: client-made 128-bit secret that stands for the key on plain loopback. `resume_token`: from the last
+ * `Welcome`, single use. `alignment`: `measured`, or `not_needed` for policies, leaders, desktop and remote VR.
+ */
+export interface Hello {
+  type: "hello";
+  role: Role;
+  name: string;
+  software?: string;
+  devices?: Device[];
+  capabilities?: string[];
+  alignment?: AlignmentKind;
+  secret?: Uint8Array;
+  resume_token?: Uint8Array;
+  join_code?: string;
+}
+
+/** Leaves at once: leases are released without grace. */
+export interface Bye {
+  type: "bye";
+  reason?: string;
+}
+
+/** Sent at least every `Welcome.heartbeat_ns`. `worn` false: the headset lies on the table. */
+export interface Heartbeat {
+  type: "heartbeat";
+  worn?: boolean;
+}
+
+/** `t0_ns`: the client's own monotonic clock when it sent this. Answered by `ClockPong` from the front. */
+export interface ClockPing {
+  type: "clock_ping";
+  t0_ns: number;
+}
+
+export interface GetSnapshot {
+  type: "get_snapshot";
+  request_id?: number;
+}
+
+/**
+ * One input message of one device.
+ *
+ * `capture_ns`: when it was sampled (session time by the client's clock estimate), not when it will be displayed.
+ * `pose`: `T_tracking_device`. `twist`: (vx, vy, vz [m/s], wx, wy, wz [rad/s]) in the tracking frame.
+ * `clutch`: true while the person wants the target to follow. `gripper`: 0 open to 1 closed.
+ * `buttons`: bit mask. `hand_joints`: up to 26 poses flattened (x, y, z, qw, qx, qy, qz). `q`, `qd`: a leader's
+ * joint positions [rad or m] and velocities.
+ */
+export interface Sample {
+  type: "sample";
+  device: Device;
+  kind: SampleKind;
+  seq: number;
+  capture_ns: number;
+  scene_epoch: number;
+  tracking_epoch: number;
+  alignment_version: number;
+  targets?: Target[];
+  tracked?: boolean;
+  worn?: boolean;
+  clutch?: boolean;
+  gripper?: number | null;
+  buttons?: number;
+  pose?: Pose | null;
+  twist?: [number, number, number, number, number, number] | null;
+  hand_joints?: number[];
+  q?: number[];
+  qd?: number[];
+}
+
+/** Asks for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held. */
+export interface Acquire {
+  type: "acquire";
+  request_id: number;
+  robots?: string[];
+  objects?: string[];
+  wait?: boolean;
+  weight?: number;
+}
+
+/** Gives leases back. No targets: all of them, and leaves every queue. */
+export interface Release {
+  type: "release";
+  request_id?: number;
+  targets?: Target[];
+}
+
+/** Answer of a holder or director to a `ConsentRequested` event (mode `request`). */
+export interface Consent {
+  type: "consent";
+  request_id: number;
+  consent_id: number;
+  grant: boolean;
+}
+
+/** A director gives robots to a participant (empty: frees them), whoever holds them. */
+export interface Assign {
+  type: "assign";
+  request_id: number;
+  robots: string[];
+  participant?: string;
+}
+
+/** A director changes the lease mode of a robot, and the blending weights in mode `shared`. */
+export interface SetMode {
+  type: "set_mode";
+  request_id: number;
+  robot: string;
+  mode: LeaseMode;
+}
+
+/** A hand without a robot takes a free object. The lease on the object comes back in the `Reply`. */
+export interface Grasp {
+  type: "grasp";
+  request_id: number;
+  object: string;
+  device: Device;
+}
+
+/**
+ * A headset (or camera) saw an anchor: `T_tracking_anchor`.
+ *
+ * `kind`: `AnchorKind`. `size_m`: edge of the sheet as detected. `viewpoint_id`: observations with the same number
+ * share their systematic error. `covariance`: 6x6 row-major (position, rotation) or empty. `quality`: 0 to 1.
+ */
+export interface Observation {
+  type: "observation";
+  anchor_id: string;
+  kind: AnchorKind;
+  T_tracking_anchor: Pose;
+  capture_ns: number;
+  tracking_epoch: number;
+  viewpoint_id?: number;
+  size_m?: number;
+  quality?: number;
+  device?: Device;
+  covariance?: number[];
+}
+
+/** A director aligns a participant by hand, or adds an offset to a measured alignment (`offset` true). */
+export interface PlaceAlignment {
+  type: "place_alignment";
+  request_id: number;
+  participant: string;
+  T_world_tracking: Pose;
+  offset?: boolean;
+}
+
+/** The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void. */
+export interface TrackingEpoch {
+  type: "tracking_epoch";
+  tracking_epoch: number;
+}
+
+/** `EpisodeAction`: start, success, failure, discard, rerecord, reset. */
+export interface Episode {
+  type: "episode";
+  request_id: number;
+  action: EpisodeAction;
+  label?: string;
+}
+
+/** Anyone may stop everything. Latched. Not a safety-rated stop. */
+export interface EStop {
+  type: "estop";
+  reason?: string;
+}
+
+export interface ClearEStop {
+  type: "clear_estop";
+  request_id: number;
+}
+
+/** A director's `ControlAction`: pause, resume, step (`ticks` physics ticks while paused), reset. */
+export interface Control {
+  type: "control";
+  request_id: number;
+  action: ControlAction;
+  ticks?: number;
+}
+
+/** A note in the recording, at the session time of its receipt. */
+export interface Marker {
+  type: "marker";
+  request_id: number;
+  text: string;
+}
+
+/** Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once. */
+export interface Welcome {
+  type: "welcome";
+  session_id: string;
+  session_name: string;
+  kind: SessionKind;
+  participant_id: string;
+  connection_epoch: number;
+  role: Role;
+  resume_token: Uint8Array;
+  resumed: boolean;
+  session_time: number;
+  heartbeat_ns: number;
+  tick_period_ns: number;
+  state_period_ns: number;
+  endpoints: Endpoints;
+  key_fingerprint?: string;
+}
+
+/** A `hello` that the front did not let through (`RefusalCode`), or that the authority denied (`DenialReason`). */
+export interface Refused {
+  type: "refused";
+  code: RefusalCode;
+  message: string;
+  advice?: string;
+  supported_versions?: number[];
+}
+
+/** A message that could not be taken, or what has become of the session. `code`: `FaultCode`. */
+export interface ProtocolFault {
+  type: "protocol_fault";
+  code: FaultCode;
+  message: string;
+}
+
+/** `t0_ns` echoed; `t1_ns`, `t2_ns`: session time of receipt and of sending. */
+export interface ClockPong {
+  type: "clock_pong";
+  t0_ns: number;
+  t1_ns: number;
+  t2_ns: number;
+}
+
+/** Answer to a request: leases as they are now, or a denial (then nothing has changed). */
+export interface Reply {
+  type: "reply";
+  request_id: number;
+  ok: boolean;
+  denial?: Denial | null;
+  leases?: Lease[];
+}
+
+/**
+ * To the holder of a robot, for haptics and hints. Sent on change and at most at 20 Hz per robot.
+ *
+ * `state`: the command kind in force, `hold_reason` when it is `hold`. `limits`: joints or bounds that are active.
+ * `rejected`: counts by `RejectReason` for this participant since it joined. `contact_n`: force on the gripper [N].
+ */
+export interface Feedback {
+  type: "feedback";
+  robot: string;
+  state: CommandKind;
+  hold_reason?: HoldReason;
+  contact_n?: number;
+  limits?: string[];
+  rejected?: Record<string, number>;
+}
+
+/** One entry of the shared history. A gap in `event_seq` means: ask for a new snapshot. */
+export interface Event {
+  type: "event";
+  event_seq: number;
+  step: number;
+  session_time: number;
+  body: EventKind;
+}
+
+/**
+ * Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
+ *
+ * Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
+ * `state_seq`.
+ */
+export interface Snapshot {
+  type: "snapshot";
+  request_id: number;
+  event_seq: number;
+  scene_epoch: number;
+  scene_revision: number;
+  scene_hash: string;
+  tick: number;
+  sim_time: number;
+  session_time: number;
+  participants: ParticipantInfo[];
+  leases: Lease[];
+  robots?: RobotInfo[];
+  bodies?: BodyInfo[];
+  paused?: boolean;
+  estop?: boolean;
+  episode?: EpisodeChanged | null;
+  state_seq?: number;
+}
+
+export interface ParticipantJoined {
+  event: "participant_joined";
+  participant: ParticipantInfo;
+  resumed?: boolean;
+}
+
+export interface ParticipantChanged {
+  event: "participant_changed";
+  participant: ParticipantInfo;
+}
+
+/** `grace` true: the connection is lost, leases are kept until `Lease.expires_ns`. */
+export interface ParticipantLeft {
+  event: "participant_left";
+  participant: string;
+  reason: string;
+  grace?: boolean;
+}
+
+/** `cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode. */
+export interface LeaseChanged {
+  event: "lease_changed";
+  lease: Lease;
+  cause: string;
+  previous_holder?: string;
+}
+
+export interface ConsentRequested {
+  event: "consent_requested";
+  consent_id: number;
+  target: string;
+  requester: string;
+  holder: string;
+}
+
+/** Mode `priority`: a human took the robot from an agent (`active`), or gave it back. */
+export interface Intervention {
+  event: "intervention";
+  robot: string;
+  human: string;
+  agent: string;
+  active: boolean;
+}
+
+export interface EngagementChanged {
+  event: "engagement_changed";
+  robot: string;
+  participant: string;
+  engaged: boolean;
+  reason?: string;
+}
+
+export interface AlignmentChanged {
+  event: "alignment_changed";
+  participant: string;
+  alignment: Alignment;
+}
+
+/** `cause`: reset, new_scene, patch, external (the user's loop went back in time). */
+export interface SceneChanged {
+  event: "scene_changed";
+  scene_epoch: number;
+  scene_revision: number;
+  cause: string;
+}
+
+export interface EStopChanged {
+  event: "estop_changed";
+  active: boolean;
+  participant: string;
+  reason?: string;
+}
+
+export interface PauseChanged {
+  event: "pause_changed";
+  paused: boolean;
+  participant?: string;
+}
+
+/** `state`: running, success, failure, discarded. `number` counts episodes from 1. */
+export interface EpisodeChanged {
+  event: "episode_changed";
+  number: number;
+  state: string;
+  label?: string;
+  participant?: string;
+}
+
+export interface ObjectGrasped {
+  event: "object_grasped";
+  object: string;
+  participant: string;
+  device: Device;
+  grasped: boolean;
+}
+
+/** An object passed from one robot to another through contact alone. `duration_ns`: both grippers touched it. */
+export interface Handover {
+  event: "handover";
+  object: string;
+  giver: string;
+  receiver: string;
+  giver_participant: string;
+  receiver_participant: string;
+  duration_ns: number;
+}
+
+export interface MarkerAdded {
+  event: "marker_added";
+  participant: string;
+  text: string;
+}
+
+/** First rejection of a kind, then at most one per second and (participant, device, reason). */
+export interface SamplesRejected {
+  event: "samples_rejected";
+  participant: string;
+  device: Device;
+  reason: RejectReason;
+  count: number;
+}
+
+/** `kind`: `stalled` (no step for `duration_ns`) or `recording` (rows lost; verification restarts). */
+export interface Gap {
+  event: "gap";
+  kind: string;
+  duration_ns: number;
+}
+
+/** Something an operator should read. `level`: info, warning, error. */
+export interface Notice {
+  event: "notice";
+  level: string;
+  text: string;
+}
+
+/**
+ * One control-channel message from a client: `[version, connection_epoch, on_behalf_of, message]`.
+ *
+ * `connection_epoch`: from `Welcome`; 0 in `hello`. `on_behalf_of`: only role `gateway` may set it.
+ */
+export type ClientEnvelope = [
+  version: number,
+  connection_epoch: number,
+  on_behalf_of: string,
+  message: ClientMessage,
+];
+
+/** `[version, connection_epoch, message]`. `connection_epoch` is that of the connection it is meant for. */
+export type ServerEnvelope = [
+  version: number,
+  connection_epoch: number,
+  message: ServerMessage,
+];
+
+/**
+ * First payload frame of a rigid-state message; topic frame before it, encoded poses after it.
+ *
+ * `session_time`: end of the tick that this state belongs to. `published_ns`: session time when handed to the socket.
+ * `base_seq`: a client that holds any frame >= `base_seq` of this `scene_epoch` has every body within the bound after
+ * this one; an older client asks for a snapshot. `ticks` are counted within the epoch.
+ */
+export type StateHeader = [
+  scene_epoch: number,
+  scene_revision: number,
+  tick: number,
+  sim_time: number,
+  session_time: number,
+  published_ns: number,
+  state_seq: number,
+  base_seq: number,
+  applied?: Applied[],
+];
+
+/** A device of a participant in the world. Only of participants that are aligned. */
+export type PresenceItem = [
+  participant: string,
+  device: Device,
+  pose: Pose,
+  capture_ns?: number,
+];
+
+/** Message on topic `presence`: heads and hands of everyone, latest value. */
+export type Presence = [
+  session_time: number,
+  published_ns: number,
+  items: PresenceItem[],
+];
+
+/** UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned. */
+export interface Beacon {
+  protocol: number;
+  session_id: string;
+  session_name: string;
+  kind: SessionKind;
+  host: string;
+  control: number;
+  state: number;
+  media: number;
+  assets: number;
+  web: number;
+  key_fingerprint?: string;
+}
+
+export type ClientMessage =
+  | Hello
+  | Bye
+  | Heartbeat
+  | ClockPing
+  | GetSnapshot
+  | Sample
+  | Acquire
+  | Release
+  | Consent
+  | Assign
+  | SetMode
+  | Grasp
+  | Observation
+  | PlaceAlignment
+  | TrackingEpoch
+  | Episode
+  | EStop
+  | ClearEStop
+  | Control
+  | Marker;
+
+export type ServerMessage =
+  | Welcome
+  | Refused
+  | ProtocolFault
+  | ClockPong
+  | Reply
+  | Feedback
+  | Event
+  | Snapshot;
+
+export type EventKind =
+  | ParticipantJoined
+  | ParticipantChanged
+  | ParticipantLeft
+  | LeaseChanged
+  | ConsentRequested
+  | Intervention
+  | EngagementChanged
+  | AlignmentChanged
+  | SceneChanged
+  | EStopChanged
+  | PauseChanged
+  | EpisodeChanged
+  | ObjectGrasped
+  | Handover
+  | MarkerAdded
+  | SamplesRejected
+  | Gap
+  | Notice;
+
+/** Values of the fields that a message or event may leave out, by its tag. */
+export const DEFAULTS = {
+  hello: { software: "", devices: [], capabilities: [], alignment: "measured", secret: new Uint8Array(), resume_token: new Uint8Array(), join_code: "" },
+  bye: { reason: "" },
+  heartbeat: { worn: true },
+  clock_ping: {},
+  get_snapshot: { request_id: 0 },
+  sample: { targets: [], tracked: true, worn: true, clutch: false, gripper: null, buttons: 0, pose: null, twist: null, hand_joints: [], q: [], qd: [] },
+  acquire: { robots: [], objects: [], wait: false, weight: 1.0 },
+  release: { request_id: 0, targets: [] },
+  consent: {},
+  assign: { participant: "" },
+  set_mode: {},
+  grasp: {},
+  observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [] },
+  place_alignment: { offset: false },
+  tracking_epoch: {},
+  episode: { label: "" },
+  estop: { reason: "" },
+  clear_estop: {},
+  control: { ticks: 1 },
+  marker: {},
+  welcome: { key_fingerprint: "" },
+  refused: { advice: "", supported_versions: [1] },
+  protocol_fault: {},
+  clock_pong: {},
+  reply: { denial: null, leases: [] },
+  feedback: { hold_reason: "", contact_n: 0.0, limits: [], rejected: {} },
+  event: {},
+  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
+  participant_joined: { resumed: false },
+  participant_changed: {},
+  participant_left: { grace: false },
+  lease_changed: { previous_holder: "" },
+  consent_requested: {},
+  intervention: {},
+  engagement_changed: { reason: "" },
+  alignment_changed: {},
+  scene_changed: {},
+  estop_changed: { reason: "" },
+  pause_changed: { participant: "" },
+  episode_changed: { label: "", participant: "" },
+  object_grasped: {},
+  handover: {},
+  marker_added: {},
+  samples_rejected: {},
+  gap: {},
+  notice: {},
+} as const;
