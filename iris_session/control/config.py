@@ -88,7 +88,6 @@ class ControlConfig(msgspec.Struct, frozen=True):
     proximity_stop: float = 0.02  # [m]: at this distance it is zero
     proximity_gain: float = 4.0  # [1/s]: closing speed <= gain * (distance - stop)
     proximity_period_s: float = 0.01
-    proximity_exact_pairs: int = 6  # geom pairs measured exactly per robot pair; further ones by bounding spheres
     # --- objects held by hands without a robot
     grasp_frequency: float = 25.0  # [rad/s]
     grasp_max_force: float = 40.0  # [N], gravity compensation not counted

@@ -34,9 +34,7 @@ class JointInterpolator:
         self.acceleration = acceleration
         self.dt = dt
         self._dv = acceleration * dt
-        self._half_dv = 0.5 * self._dv
-        self._half_dv_squared = self._half_dv**2
-        self._double_acceleration = 2.0 * acceleration
+        self._unit = acceleration * dt * dt
         self.moving = False
 
     def place(self, q: Floats) -> None:
@@ -57,8 +55,10 @@ class JointInterpolator:
     def stop(self, joints: slice) -> None:
         """New goal: where these joints can stop, but not beyond the goal they already had."""
         q, v = self.q[joints], self.v[joints]
-        # Distance needed to stop: v^2 / 2a + |v| dt / 2 (discrete time).
-        reach = v * v / self._double_acceleration[joints] + 0.5 * np.abs(v) * self.dt
+        # Slowing down from the next tick on, by dv a tick: k dv, (k - 1) dv, ...
+        speed = np.maximum(np.abs(v) / self._dv[joints] - 1.0, 0.0)
+        ticks = np.floor(speed)
+        reach = (0.5 * ticks * (ticks + 1.0) + (speed - ticks) * (ticks + 1.0)) * self._unit[joints]
         distance = np.minimum(reach, np.abs(self.goal[joints] - q))
         ahead = np.sign(self.goal[joints] - q) == np.sign(v)
         # Standing joints finish the last step of their motion, if any is left, only when they already move.
@@ -71,8 +71,10 @@ class JointInterpolator:
         if not self.moving:
             return
         error = self.goal - self.q
-        # Fastest speed from which a joint can still stop at its goal, in discrete time.
-        brake = np.sqrt(self._half_dv_squared + self._double_acceleration * np.abs(error)) - self._half_dv
+        # Fastest speed from which a joint still stops at its goal: the inverse of the sum in `stop`, exact in ticks.
+        distance = np.abs(error) / self._unit
+        ticks = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * distance) - 1.0))
+        brake = (ticks + (distance - 0.5 * ticks * (ticks + 1.0)) / (ticks + 1.0)) * self._dv
         limit = np.minimum(brake, self.cap)
         wanted = np.minimum(np.maximum(error / self.remaining, -limit), limit)
         self.v += np.minimum(np.maximum(wanted - self.v, -self._dv), self._dv)

@@ -20,6 +20,11 @@ from iris_session.protocol.specs import RobotSpec
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 
+#: Of two robots, this many geom pairs, nearest by their bounding spheres, are measured; this many of the nearest bound
+#: the speed. Both bound the cost of a check.
+_MEASURED_PAIRS = 32
+_BOUNDED_PAIRS = 6
+
 
 class Proximity:
     """Speed factors per robot from their distances. Stateless: everything follows from the arguments."""
@@ -81,7 +86,7 @@ class Proximity:
         return [(present[r], present[c]) for r, c in zip(rows.tolist(), columns.tolist(), strict=True)]
 
     def _near_geoms(self, data: mujoco.MjData, a: int, b: int) -> list[tuple[float, int, int, Floats, Floats]]:
-        """Geom pairs of two robots within the margin: distance [m], geoms, nearest points in the world."""
+        """Nearest geom pairs of two robots within the margin: distance [m], geoms, nearest points in the world."""
         margin = self._config.proximity_margin
         geoms_a, geoms_b = self._geoms[a], self._geoms[b]
         centre_a, centre_b = data.geom_xpos[geoms_a], data.geom_xpos[geoms_b]
@@ -91,13 +96,14 @@ class Proximity:
         order = np.argsort(bound, axis=None, kind="stable")
         near = order[bound.ravel()[order] < margin]
         found = []
-        for flat in near[: self._config.proximity_exact_pairs].tolist():
+        for flat in near[:_MEASURED_PAIRS].tolist():
             i, j = divmod(flat, len(geoms_b))
             geom_a, geom_b = int(geoms_a[i]), int(geoms_b[j])
             distance = float(mujoco.mj_geomDistance(self._model, data, geom_a, geom_b, margin, self._segment))
             if distance < margin:
                 found.append((distance, geom_a, geom_b, self._segment[:3].copy(), self._segment[3:].copy()))
-        return found
+        found.sort(key=lambda pair: pair[:3])
+        return found[:_BOUNDED_PAIRS]
 
     def _point_velocity(self, data: mujoco.MjData, robot: int, geom: int, point: Floats, joints: Floats) -> Floats:
         body = int(self._model.geom_bodyid[geom])

@@ -6,6 +6,7 @@ import math
 import os
 from pathlib import Path
 
+import msgspec
 import mujoco
 import numpy as np
 
@@ -143,7 +144,7 @@ class Rig:
         for _ in range(steps):
             self.step(decision(hold_command(r.name) for r in self.robots))
 
-    def source(self, p: Vec3, q: Quat = IDENTITY, *, engagement: int = 1, **more: object) -> CommandSource:
+    def source(self, p: Vec3, rotation: Quat = IDENTITY, *, engagement: int = 1, **more: object) -> CommandSource:
         self.seq += 1
         fields: dict[str, object] = {
             "participant": "p1",
@@ -152,7 +153,7 @@ class Rig:
             "seq": self.seq,
             "capture_ns": self.steps * STEP_NS,
             "receive_ns": self.steps * STEP_NS + 1000,
-            "pose_world": Pose(p, q),
+            "pose_world": Pose(p, rotation),
         }
         return CommandSource(**{**fields, **more})  # type: ignore[arg-type]
 
@@ -179,8 +180,6 @@ def pose_command(robot: str, *sources: CommandSource, **more: object) -> Command
 
 def old(source: CommandSource) -> CommandSource:
     """The same sample in a later step, when it is no longer new."""
-    import msgspec
-
     return msgspec.structs.replace(source, new=False)
 
 

@@ -13,7 +13,8 @@ from iris_session.protocol.specs import RobotSpec
 MODEL = """<mujoco><compiler angle="radian"/><option integrator="implicitfast"/>
 <worldbody><body name="base"><body name="link"><joint name="j" axis="0 1 0" {joint}/>
 <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/><site name="tip" pos=".3 0 0"/></body></body>
-</worldbody><tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon><actuator>{actuator}</actuator></mujoco>"""
+</worldbody><tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+<actuator>{actuator}</actuator></mujoco>"""
 
 
 def laws(

@@ -1,0 +1,131 @@
+"""Two robots do not run into each other; they separate freely; grippers may meet."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.control import ControlConfig
+from iris_session.control.proximity import Proximity
+from iris_session.protocol.specs import RobotSpec
+from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
+
+FACING = ([(0.0, 0.0, 0.0), (1.3, 0.0, 0.0)], [0.0, math.pi])
+
+
+def gap(rig: Rig, proximity: Proximity) -> float:
+    a, b = proximity._geoms
+    distance = mujoco.mj_geomDistance
+    return min(distance(rig.model, rig.data, int(i), int(j), 1.0, None) for i in a for j in b)
+
+
+def push(rig: Rig, towards: float, steps: int) -> list[tuple[tuple[str, ...], ...]]:
+    """Both hands move `towards` each other at 0.4 m/s (negative: apart)."""
+    seen = []
+    for k in range(steps):
+        x = math.copysign(min(0.4 * k * 0.002, abs(towards)), towards)
+        a = rig.source((x, 0.0, 0.0), new=k % 7 == 0)
+        b = rig.source((-x, 0.0, 0.0), new=k % 7 == 0)
+        rig.step(decision([pose_command("r0", a), pose_command("r1", b)]))
+        seen.append(tuple(s.limits for s in rig.controller.status()))
+    return seen
+
+
+def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
+    model, robots = iiwa_arms(*FACING)
+    config = ControlConfig()
+    proximity = Proximity(model, robots, config)
+    rig = Rig(model, robots, config, home=IIWA_HOME)
+    rig.hold(200)
+    smallest = 1.0
+    for _ in range(8):
+        seen = push(rig, 0.2, 100)
+        smallest = min(smallest, gap(rig, proximity))
+        rig.hold(1)
+    assert all("proximity" in limits for limits in seen[-1])
+    assert 0.005 < smallest < 0.04
+    rig.hold(200)
+    # Hold lifts the report and stays apart.
+    assert gap(rig, proximity) > 0.005
+    assert rig.controller.status()[0].limits == ()
+    away = push(rig, -0.15, 400)
+    assert gap(rig, proximity) > 0.12
+    assert not any("proximity" in limits for both in away[20:] for limits in both)
+
+
+def test_without_the_margin_they_collide() -> None:
+    """The test above can fail: the same push with the check off ends in contact."""
+    model, robots = iiwa_arms(*FACING)
+    rig = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
+    rig.hold(200)
+    push(rig, 0.2, 600)
+    assert gap(rig, Proximity(model, robots, ControlConfig())) < 0.005
+
+
+SLIDERS = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
+<body name="a"><body><joint name="a" type="slide" axis="1 0 0"/>
+  <geom size=".1" pos="0 0 1"/><site name="a" pos="0 0 1"/>
+  <body name="finger" pos="{finger} 0 1"><geom size=".01"/>
+    <body name="pad"><geom size=".01"/></body></body></body></body>
+<body name="b"><body><joint name="b" type="slide" axis="1 0 0"/>
+  <geom size=".1" pos="{apart} 0 1"/><site name="b" pos="{apart} 0 1"/></body></body>
+<body name="c"><body><joint name="c" type="slide"/>
+  <geom size=".1" contype="0" conaffinity="0"/><site name="c"/></body></body></worldbody></mujoco>"""
+
+
+def sliders(apart: float, finger: float = 0.0) -> tuple[mujoco.MjModel, mujoco.MjData, list[RobotSpec]]:
+    """Two balls on rails, the first with a finger; a third robot without collision geoms."""
+    model = mujoco.MjModel.from_xml_string(SLIDERS.format(apart=apart, finger=finger))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    fingers = {"a": ("finger",), "b": (), "c": ()}
+    return model, data, [RobotSpec(n, (n,), (n,), n, n, finger_bodies=f) for n, f in fingers.items()]
+
+
+def factors(apart: float, va: float, vb: float, finger: float = 0.0) -> list[float]:
+    model, data, robots = sliders(apart, finger)
+    return Proximity(model, robots, ControlConfig()).factors(data, [np.array([va]), np.array([vb]), np.array([0.0])])
+
+
+@pytest.mark.parametrize(
+    ("apart", "va", "vb", "expected"),
+    [
+        (0.25, 1.0, 0.0, [0.12, 1.0]),  # 5 cm apart: 4 * (0.05 - 0.02) = 0.12 m/s may close
+        (0.25, 1.0, -1.0, [0.06, 0.06]),
+        (0.25, 1.0, 0.5, [0.62, 1.0]),  # b retreats: a may follow it
+        (0.25, -1.0, 1.0, [1.0, 1.0]),
+        (0.25, 0.05, -0.05, [1.0, 1.0]),
+        (0.215, 1.0, 0.0, [0.0, 1.0]),
+        (0.19, 1.0, 0.0, [0.0, 1.0]),  # in contact: no further
+        (0.19, -1.0, 0.0, [1.0, 1.0]),  # but out
+        (0.5, 1.0, -1.0, [1.0, 1.0]),
+    ],
+)
+def test_closing_speed_is_bounded_by_distance(apart: float, va: float, vb: float, expected: list[float]) -> None:
+    assert factors(apart, va, vb)[:2] == pytest.approx(expected, abs=1e-9)
+
+
+def test_fingers_are_exempt() -> None:
+    assert factors(0.6, 1.0, 0.0, finger=0.48) == [1.0, 1.0, 1.0]
+    model, _, robots = sliders(0.6, 0.48)
+    guarded = Proximity(model, [msgspec.structs.replace(r, finger_bodies=()) for r in robots], ControlConfig())
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert guarded.factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == 0.0
+
+
+def test_coincident_centres_give_no_direction_and_no_crash() -> None:
+    assert factors(0.0, 1.0, 0.0)[2] == 1.0
+
+
+def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
+    model, _, robots = sliders(0.5)
+    assert not Proximity(model, robots[:1], ControlConfig()).active
+    assert not Proximity(model, [robots[0], robots[2]], ControlConfig()).active
+    assert not Proximity(model, robots, ControlConfig(proximity_margin=0.0)).active
+    assert not Proximity(model, [], ControlConfig()).active
+    assert Proximity(model, robots, ControlConfig()).active
