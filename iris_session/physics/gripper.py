@@ -28,7 +28,7 @@ class Gripper:
     closed: float | None
 
 
-def find_gripper(tree: Tree, palm: int, finger_roots: list[int], site: int | None) -> Gripper | None:
+def find_gripper(tree: Tree, palm: int, finger_roots: list[int]) -> Gripper | None:
     """The gripper on the link `palm`; `finger_roots` are the moving bodies right below it. None when nothing drives it.
 
     An actuator belongs to it when all joints it drives, directly or by a tendon, are below the palm.
@@ -42,7 +42,7 @@ def find_gripper(tree: Tree, palm: int, finger_roots: list[int], site: int | Non
         return None
     with_geoms = tuple(b for b in bodies if int(tree.model.body_geomnum[b]))
     ctrl_range = _ctrl_range(tree, actuators[0])
-    larger_opens = _larger_ctrl_opens(tree, actuators[0], palm, finger_roots, site)
+    larger_opens = _larger_ctrl_opens(tree, actuators[0], palm, finger_roots)
     if len(actuators) > 1 or ctrl_range is None or larger_opens is None:
         return Gripper(actuators, with_geoms, ctrl_range, None, None)
     low, high = ctrl_range
@@ -77,7 +77,7 @@ def _directions(tree: Tree, actuator: int) -> dict[int, float]:
     return moves
 
 
-def _larger_ctrl_opens(tree: Tree, actuator: int, palm: int, finger_roots: list[int], site: int | None) -> bool | None:
+def _larger_ctrl_opens(tree: Tree, actuator: int, palm: int, finger_roots: list[int]) -> bool | None:
     """Compares the aperture at both ends of the finger joints. None: it does not change."""
     model = tree.model
     data = mujoco.MjData(model)
@@ -91,16 +91,16 @@ def _larger_ctrl_opens(tree: Tree, actuator: int, palm: int, finger_roots: list[
             else:
                 data.qpos[address] += _TRIAL * np.sign(direction * end)
         mujoco.mj_kinematics(model, data)
-        apertures.append(_aperture(tree, data, palm, finger_roots, site))
+        apertures.append(_aperture(tree, data, palm, finger_roots))
     change = apertures[1] - apertures[0]
     return None if abs(change) < _MIN_CHANGE else change > 0.0
 
 
-def _aperture(tree: Tree, data: mujoco.MjData, palm: int, finger_roots: list[int], site: int | None) -> float:
-    """Mean distance [m] of the fingers' centres; of a single finger to the end-effector site or the palm."""
+def _aperture(tree: Tree, data: mujoco.MjData, palm: int, finger_roots: list[int]) -> float:
+    """Mean distance [m] of the fingers' centres; of the tip of a single finger to the palm."""
+    if len(finger_roots) == 1:
+        return _jaw_aperture(tree, data, palm, finger_roots[0])
     centres = [_centre(tree, data, root) for root in finger_roots]
-    if len(centres) == 1:
-        centres.append(data.site_xpos[site] if site is not None else data.xpos[palm])
     pairs = [(a, b) for i, a in enumerate(centres) for b in centres[i + 1 :]]
     return float(np.mean([np.linalg.norm(a - b) for a, b in pairs]))
 
@@ -112,6 +112,33 @@ def _centre(tree: Tree, data: mujoco.MjData, root: int) -> NDArray[np.float64]:
     points = data.geom_xpos[geoms] if len(geoms) else data.xpos[bodies]
     centre: NDArray[np.float64] = points.mean(axis=0)
     return centre
+
+
+def _jaw_aperture(tree: Tree, data: mujoco.MjData, palm: int, root: int) -> float:
+    """Distance [m] from the tip of a jaw, its box corner farthest from its joint, to the boxes of the palm's geoms."""
+    model = tree.model
+    anchor = data.xanchor[tree.scalar_joints_of(root)[0]]
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, tree.subtree(root))).tolist()
+    if not geoms:
+        return 0.0
+    corners = np.concatenate([_corners(model, data, g) for g in geoms])
+    # Rounded, so that among corners equally far the same one is taken at both ends.
+    tip = corners[int(np.argmax(np.round(np.linalg.norm(corners - anchor, axis=1), 6)))]
+    rigid = [b for b, weld in enumerate(tree.weld) if weld == tree.weld[palm]]
+    distances = []
+    for geom in np.flatnonzero(np.isin(model.geom_bodyid, rigid)):
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        local = data.geom_xmat[geom].reshape(3, 3).T @ (tip - data.geom_xpos[geom]) - centre
+        distances.append(float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0))))
+    return min(distances, default=float(np.linalg.norm(tip - data.xpos[palm])))
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
+    """World positions [m] of the corners of a geom's bounding box, shape (8, 3)."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+    corners: NDArray[np.float64] = data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
+    return corners
 
 
 def describe(tree: Tree, gripper: Gripper) -> str:

@@ -1,10 +1,10 @@
 """Robots found in any model: serial chains of at least three actuated joints, their site, gripper and name.
 
 Rules, in order. A chain follows the actuated hinges and slides from the root of the tree; it ends at a leaf, or where
-the tree branches into parts of fewer than three actuated joints (fingers). It is cut where it branches into two or
-more long parts: what comes before (a torso) is no part of a robot. Trailing joints that are named like a jaw belong
-to the gripper. The end-effector site is on the last link, preferred by name. What these rules leave open is never
-guessed: `AmbiguousModelError` says it and carries a robots file (`robots_toml`) to complete.
+the tree branches into fingers (fewer than three actuated joints; behind a chain of three, fewer than six). It is cut
+where it branches into several longer parts: what comes before (a torso) is no part of a robot. Trailing joints that
+are named like a jaw belong to the gripper. The end-effector site is on the last link, preferred by name. What these
+rules leave open is never guessed: `AmbiguousModelError` says it and carries a robots file (`robots_toml`) to complete.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from iris_session.physics.tree import Tree
 from iris_session.protocol.specs import RobotSpec
 
 MIN_JOINTS: Final = 3
+#: A branch with this many actuated joints is an arm on a torso; a finger has at most five.
+ARM_JOINTS: Final = 6
 #: Words in the names of end-effector sites, best first: the grasp point before the flange that carries a gripper.
 SITE_WORDS: Final = (
     *("tcp", "pinch", "grasp", "grip", "ee", "eef", "effector", "endeffector", "gripper"),
@@ -38,7 +40,7 @@ class _Arm:
     """A chain on its way to a `RobotSpec`. `link`: body that the last joint moves. `notes`: field -> TOML comment."""
 
     joints: list[int]
-    fingers: list[int]
+    fingers: list[int] = field(default_factory=list)
     link: int = 0
     problems: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
@@ -80,17 +82,16 @@ def _walk(tree: Tree, body: int, chain: list[int], arms: list[_Arm]) -> None:
     """Follows one chain down from `body`; adds it to `arms` where it ends, and the chains it splits into."""
     chain = chain + _actuated(tree, body)
     branches = tree.jointed_below(body)
-    long = [b for b in branches if _reach(tree, b) >= MIN_JOINTS]
+    # Behind an arm only another arm goes on; several shorter branches are fingers.
+    least = ARM_JOINTS if len(chain) >= MIN_JOINTS and len(branches) > 1 else MIN_JOINTS
+    long = [b for b in branches if _reach(tree, b) >= least]
     if len(branches) == 1 or len(long) == 1:
         _walk(tree, (long or branches)[0], chain, arms)
-    elif len(long) > 1 and len(chain) < MIN_JOINTS:
-        for branch in long:
+    elif long:
+        for branch in [b for b in branches if _reach(tree, b) >= MIN_JOINTS]:
             _walk(tree, branch, [], arms)
     elif len(chain) >= MIN_JOINTS:
-        arm = _Arm(chain, fingers=[])
-        if long:
-            arm.problems.append(f"it ends in {len(long)} chains of {MIN_JOINTS} or more actuated joints")
-        arms.append(arm)
+        arms.append(_Arm(chain))
 
 
 def _split_jaw(tree: Tree, arm: _Arm) -> None:
@@ -108,7 +109,7 @@ def _is_jaw(tree: Tree, last: int, before: int) -> bool:
     if any(_JAW.search(n) for n in names):
         return True
     on_last, on_before = _sites_on(tree, tree.joint_body[last]), _sites_on(tree, tree.joint_body[before])
-    return not on_last and any(_rank(element_name(tree.model, "site", s)) < len(SITE_WORDS) for s in on_before)
+    return not on_last and any(_rank(element_name(tree.model, "site", s))[0] < len(SITE_WORDS) for s in on_before)
 
 
 # --- one robot --------------------------------------------------------------------------------------------------------
@@ -120,7 +121,7 @@ def _spec(tree: Tree, arm: _Arm, name: str, arms: list[_Arm]) -> RobotSpec:
     bodies = body_names(model)
     site = _choose_site(tree, arm)
     actuators = _choose_actuators(tree, arm)
-    gripper = find_gripper(tree, arm.link, arm.fingers, site) if arm.fingers else None
+    gripper = find_gripper(tree, arm.link, arm.fingers) if arm.fingers else None
     base = _base(tree, arm, arms)
     if not base:
         arm.problems.append(f"body {tree.joint_body[arm.joints[0]]} needs a name of 1 to 64 characters in the model")
@@ -178,16 +179,16 @@ def _sites_on(tree: Tree, link: int) -> list[int]:
     ]
 
 
-def _rank(site: str) -> int:
-    """Position of the best `SITE_WORDS` word in a site's name; beyond the last when it has none."""
-    words = re.split(r"[^a-z]+", site.lower())
-    return min((SITE_WORDS.index(w) for w in words if w in SITE_WORDS), default=len(SITE_WORDS))
+def _rank(site: str) -> tuple[int, int]:
+    """Position of the best `SITE_WORDS` word in a site's name (beyond the last: none), then its number of words."""
+    words = [w for w in re.split(r"[^a-z]+", site.lower()) if w]
+    return min((SITE_WORDS.index(w) for w in words if w in SITE_WORDS), default=len(SITE_WORDS)), len(words)
 
 
 def _choose_site(tree: Tree, arm: _Arm) -> int | None:
     sites = _sites_on(tree, arm.link)
     names = {s: element_name(tree.model, "site", s) for s in sites}
-    best = min((_rank(n) for n in names.values()), default=0)
+    best = min((_rank(n) for n in names.values()), default=(0, 0))
     chosen = [s for s in sites if _rank(names[s]) == best]
     if len(chosen) == 1:
         return chosen[0]
@@ -238,7 +239,7 @@ def _prefix(names: list[str]) -> str:
     first, last = min(names), max(names)
     common = first[: next((i for i, c in enumerate(first) if last[i : i + 1] != c), len(first))]
     cut = max(common.rfind(s) for s in _SEPARATORS)
-    return common[:cut].strip(_SEPARATORS) if cut > 0 else ""
+    return re.sub(r"(^|[/_.-]+)(joint|j)?$", "", common[:cut]) if cut > 0 else ""
 
 
 def _model_name(model: mujoco.MjModel) -> str:

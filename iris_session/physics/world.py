@@ -64,6 +64,7 @@ class _Saved(msgspec.Struct, frozen=True, array_like=True):
     scene_hash: str
     tick: int
     forces: tuple[float, ...]
+    diverged: str
     state: bytes
 
 
@@ -108,7 +109,8 @@ class World:
         self.scene_hash = scene_hash(model_bytes(model))
         self._tick = 0
         self._forces: tuple[float, ...] = (0.0,) * len(robots)
-        #: Empty while all is well, else what went wrong; cleared by `reset` and `restore`.
+        self._shown_state = b""
+        #: Empty while all is well, else what went wrong, until `reset` or `restore`.
         self.diverged = ""
         self._user_time = float(self.data.time)
         if self.user_owned:
@@ -179,6 +181,9 @@ class World:
         """
         self._require_owner(user=False)
         self._load_state(state)
+        if state == self._shown_state:  # shown already: only inputs may have been written since
+            mujoco.mj_setState(self.model, self._shown, self._state, STATE)
+            return
         self._show(round(float(self._state[0]) / float(self.model.opt.timestep)))
 
     def _show(self, tick: int) -> None:
@@ -192,6 +197,7 @@ class World:
         self._forces = self._tables.gripper_forces(model, data)
         mujoco.mj_setState(model, data, self._state, STATE)  # mj_forward moved the solver's warm start
         self._set_tick(tick)
+        self._shown_state = self._state.tobytes()
 
     # --- what others see ----------------------------------------------------------------------------------------------
 
@@ -229,7 +235,7 @@ class World:
 
     def snapshot(self) -> bytes:
         """Everything that later ticks and the view depend on."""
-        return _encoder.encode(_Saved(self.scene_hash, self._tick, self._forces, self.state_bytes()))
+        return _encoder.encode(_Saved(self.scene_hash, self._tick, self._forces, self.diverged, self.state_bytes()))
 
     def restore(self, snapshot: bytes) -> None:
         """Inverse of `snapshot`, bit for bit. Raises `SnapshotError` for other bytes or another model's."""
@@ -247,6 +253,7 @@ class World:
         mujoco.mj_setState(self.model, self._shown, self._state, STATE)
         self._forces = saved.forces
         self._derive(saved.tick)
+        self.diverged = saved.diverged
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -266,6 +273,7 @@ class World:
 
     def _set_tick(self, tick: int) -> None:
         self._tick = tick
+        self._shown_state = b""
         self._view.advance(tick, self._forces)
 
     def _check(self, data: Any) -> None:

@@ -135,7 +135,7 @@ def test_names_without_a_prefix() -> None:
     [
         ({"end": ""}, "", "no end-effector site on its last link 'a/link3'"),
         ({"end": '<site name="p1"/><site name="p2"/>'}, "", r"2 sites on its last link .* \(p1, p2\)"),
-        ({"end": '<site name="tcp"/><site name="b/tcp"/>'}, "", r"\(tcp, b/tcp\)"),
+        ({"end": '<site name="l_tcp"/><site name="r_tcp"/><site name="x"/>'}, "", r"2 sites .* \(l_tcp, r_tcp\)"),
         ({}, '<velocity name="twice" joint="a/j1"/>', r"joint 'a/j1' has 2 actuators \(a/a1, twice\)"),
         ({"end": FINGERS}, "", ""),
         (
@@ -175,7 +175,7 @@ def test_a_hand_of_long_fingers_is_not_guessed() -> None:
     fingers = "".join(arm(f"f{n}", joints=3, end="")[0] for n in range(2))
     acts = "".join(arm(f"f{n}", joints=3, end="")[1] for n in range(2))
     body, actuators = arm("a", end='<site name="tcp"/>' + fingers)
-    with pytest.raises(AmbiguousModelError, match="robot 'a': it ends in 2 chains of 3 or more actuated joints"):
+    with pytest.raises(AmbiguousModelError, match="robot 'a': 6 actuators move its gripper"):
         find_robots(scene(body, actuators + acts))
 
 
@@ -184,3 +184,41 @@ def test_unnamed_joints_are_refused() -> None:
     unnamed = scene(body, actuators.replace('name="a/a2" ', ""))
     with pytest.raises(AmbiguousModelError, match="actuator 2 needs a name of 1 to 64 characters"):
         find_robots(unnamed)
+
+
+def test_a_hand_with_a_long_thumb_is_no_arm() -> None:
+    thumb = arm("thumb", joints=4, end='<site name="thumb/tip"/>')
+    index = arm("index", joints=2, end="")
+    body, actuators = arm("a", joints=6, end='<site name="tcp"/>' + thumb[0] + index[0])
+    with pytest.raises(AmbiguousModelError, match="robot 'a': 6 actuators move its gripper"):
+        find_robots(scene(body, actuators + thumb[1] + index[1]))
+
+
+def test_a_three_joint_torso_carries_two_long_arms() -> None:
+    left, right = arm("l", joints=6), arm("r", joints=7)
+    body, actuators = arm("torso", joints=3, end=left[0] + right[0])
+    assert [r.name for r in find_robots(scene(body, actuators + left[1] + right[1]))] == ["l", "r"]
+
+
+def test_the_shortest_site_name_wins_among_equals() -> None:
+    body, actuators = arm("x", end='<site name="ee_x"/><site name="ee"/><site name="ee_y"/><site name="imu"/>')
+    assert find_robots(scene(body, actuators))[0].site == "ee"
+
+
+@pytest.mark.parametrize(("joints", "name"), [("joint_{i}", "arm"), ("{p}joint_{i}", "b"), ("ur_joint_{i}", "ur")])
+def test_generic_joint_prefixes_are_no_names(joints: str, name: str) -> None:
+    body, actuators = arm("b", joint_name=joints)
+    m = scene(body.replace("b/base", "arm" if name == "arm" else "b/base"), actuators)
+    assert [r.name for r in find_robots(m)] == [name]
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_jaw_opens_away_from_the_fixed_one(sign: int) -> None:
+    """Closed at 0, open at `sign` times a right angle, as on a Spot arm, whose jaw opens towards negative angles."""
+    low, high = sorted((0.0, sign * 1.57))
+    jaw = f"""<site name="{{p}}tcp" pos="0 0 .1"/><geom type="box" size=".005 .02 .05" pos="{-sign * 0.012} 0 .15"/>
+      <body name="{{p}}jaw" pos="0 0 .1"><joint name="{{p}}jaw" axis="0 1 0" range="{low} {high}"/>
+      <geom type="box" size=".005 .02 .05" pos="0 0 .05"/></body>"""
+    body, actuators = arm("s", joints=6, end=jaw)
+    (robot,) = find_robots(scene(body, actuators + f'<position name="s/j" joint="s/jaw" ctrlrange="{low} {high}"/>'))
+    assert (robot.gripper_open, robot.gripper_closed) == (sign * 1.57, 0.0)
