@@ -88,7 +88,7 @@ class Authority:
         commands = self._commands.build(ctx)
         objects = grasps.build(ctx) if ctx.held_objects else ()
         feedback.report(ctx, commands)
-        for connection, request_id in ctx.snapshots.items():
+        for connection, request_id in ctx.snapshots:
             if connection in ctx.by_connection:
                 ctx.outgoing.append(Outgoing(connection, self._snapshot(request_id)))
         state = ctx.state
@@ -289,7 +289,7 @@ def _marker(ctx: Context, p: Participant, m: cm.Marker) -> None:
 
 
 def _get_snapshot(ctx: Context, p: Participant, m: cm.GetSnapshot) -> None:
-    ctx.snapshots[p.connection] = m.request_id
+    ctx.snapshots[(p.connection, m.request_id)] = None
 
 
 def _observation(ctx: Context, p: Participant, m: cm.Observation) -> None:

@@ -62,7 +62,7 @@ class Context:
         self.dropped: list[Dropped] = []
         self.events: list[Event] = []
         self.presence: dict[tuple[str, str], PresenceItem] = {}
-        self.snapshots: dict[int, int] = {}
+        self.snapshots: dict[tuple[int, int], None] = {}  # (connection, request_id) in order
         self.reset = False
         self.step_ticks = 0
         self.estop_arrived = False

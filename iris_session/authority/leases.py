@@ -96,6 +96,9 @@ def release(ctx: Context, p: Participant, m: Release) -> None:
     for t in m.targets:
         lease = ctx.lease(t.kind, t.name)
         grants = [g for g in lease.grants if g.participant == p.id] if lease is not None else []
+        if t.kind not in (TargetKind.ROBOT, TargetKind.OBJECT):
+            known = f"kinds: {TargetKind.ROBOT}, {TargetKind.OBJECT}"
+            return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown kind {t.kind}", known))
         if lease is None:
             known = ", ".join((*ctx.robots, *ctx.objects))
             return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_TARGET, f"{t.name}: no such target", known))

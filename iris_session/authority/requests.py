@@ -58,7 +58,7 @@ def _acquire_denial(
     if not MIN_WEIGHT <= m.weight <= 1.0 / MIN_WEIGHT:
         text = f"weight {m.weight} is not between {MIN_WEIGHT} and {1.0 / MIN_WEIGHT:g}"
         return Denial(DenialReason.INVALID, text, "use 1.0")
-    return assignment.permitted(ctx, p, robots)
+    return assignment.permitted(ctx, p, robots) if robots else None
 
 
 def _role_denial(p: Participant) -> Denial | None:

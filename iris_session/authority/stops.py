@@ -82,7 +82,10 @@ def gap(ctx: Context, duration_ns: int) -> None:
     ctx.state.hold_expiry_until_ns = ctx.now_ns + ctx.config.drain_ns
     for p in ctx.state.participants.values():
         if p.connection == NO_CONNECTION:
-            p.expires_ns = max(p.expires_ns, ctx.state.hold_expiry_until_ns)
+            if p.expires_ns < ctx.state.hold_expiry_until_ns:
+                p.expires_ns = ctx.state.hold_expiry_until_ns
+                for lease in ctx.leases_of(p):
+                    ctx.publish(lease, "left", p.id)
         else:
             p.heard_ns = max(p.heard_ns, ctx.now_ns)
     ctx.emit(Gap("stalled", max(0, duration_ns)))

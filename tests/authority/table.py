@@ -48,6 +48,7 @@ class Table:
         self.view = make_view()
         self.control: tuple[ControlStatus, ...] = ()
         self.people = 0
+        self.persons: dict[int, Person] = {}
         self.decision = Decision(())
         self.events: list[EventBody] = []
 
@@ -57,6 +58,9 @@ class Table:
         self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view, self.control)
         self.view = view
         self.events += [e.body for e in self.decision.events]
+        for out in self.decision.outgoing:
+            if isinstance(out.message, Feedback) and out.connection in self.persons:
+                self.persons[out.connection].told[out.message.robot] = out.message
         return self.decision
 
     def wait(self, duration_ns: int) -> Decision:
@@ -71,7 +75,7 @@ class Table:
     def join(self, role: str = "operator", **fields: Any) -> Person:
         self.people += 1
         fields = {"key_id": f"key{self.people}", "name": f"person{self.people}", **fields}
-        person = Person(self, self.people, fields["name"])
+        person = self.persons[self.people] = Person(self, self.people, fields["name"])
         self.step(Entry(self.people, self.people, self.now_ns, Join(role=role, **fields)))
         if self.decision.admitted:
             person.id = self.decision.admitted[0].participant_id
@@ -112,6 +116,7 @@ class Person:
         self.id = ""
         self.seq = 0
         self.versions: dict[str, int] = {}
+        self.told: dict[str, Feedback] = {}
         self.alignment_version = 1
         self.scene_epoch = 1
         self.tracking_epoch = 0

@@ -1,0 +1,94 @@
+"""Which robot a participant gets that names none."""
+
+from __future__ import annotations
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.protocol.client_messages import Acquire, Release, TrackingEpoch
+from iris_session.protocol.common import Pose
+
+from .table import Person, Table, robot
+
+ANY = Acquire(1)
+
+
+def got(person: Person, message: Acquire = ANY) -> list[str]:
+    reply = person.asks(message)
+    assert reply.ok, reply.denial
+    return [lease.target for lease in reply.leases]
+
+
+def test_join_order_gives_the_first_free_robot() -> None:
+    t = Table()
+    anna, bert, carl = t.join(), t.join(), t.join()
+    assert (got(anna), got(bert)) == (["left"], ["right"])
+    assert carl.denied(ANY) == "held"
+    carl.does(Acquire(2, wait=True))
+    bert.does(Release())
+    assert carl.replies()[0].leases[0].target == "right"
+
+
+def test_a_robot_that_a_pair_waits_for_is_not_given_away() -> None:
+    t = Table()
+    t.operator("left")
+    bert, carl = t.join(), t.join()
+    bert.does(Acquire(1, ("left", "right"), wait=True))
+    assert carl.denied(ANY) == "held"
+    carl.does(Acquire(2, wait=True))
+    assert carl.replies() == []
+    bert.does(Release())
+    assert carl.replies()[0].leases[0].target == "right"
+
+
+def test_config_gives_a_name_its_robots_and_nobody_elses() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left", "right")}))
+    anna, bert = t.join(name="anna"), t.join(name="bert")
+    assert bert.denied(ANY) == "policy"
+    assert bert.denied(Acquire(1, ("left",))) == "policy"
+    assert t.join("director").acquire("left").ok
+    assert anna.denied(ANY) == "held"
+    t.step(t.persons[3].says(Release()))
+    assert got(anna) == ["left", "right"]
+
+
+def test_unassigned_robots_are_free_for_all_under_config() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left",)}))
+    assert t.join().acquire("right").ok
+    assert t.join(name="anna").acquire("left").ok
+
+
+def test_director_policy_leaves_it_to_directors() -> None:
+    t = Table(AuthorityConfig(policy="director"))
+    anna = t.join()
+    assert anna.denied(ANY) == "policy"
+    assert anna.denied(Acquire(1, ("left",))) == "policy"
+    assert got(t.join("director")) == ["left"]
+
+
+def test_nearest_to_the_head() -> None:
+    t = Table(AuthorityConfig(policy="nearest"), robots=(robot("left"), robot("right"), robot("third")))
+    anna = t.join()
+    assert anna.denied(ANY) == "unaligned"
+    anna = t.operator()
+    anna.sends(device="head", pose=Pose((0.3, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)))
+    assert got(anna) == ["third"]
+    assert got(anna) == ["right"]
+    assert got(t.join("agent", alignment="not_needed")) == ["left"]
+
+
+def test_waiting_for_the_nearest_while_unaligned_keeps_waiting() -> None:
+    t = Table(AuthorityConfig(policy="nearest"), robots=(robot("left"),))
+    anna, bert = t.operator("left"), t.operator()
+    bert.sends(device="head")
+    bert.does(Acquire(1, wait=True))
+    bert.tracking_epoch = 1
+
+    bert.does(TrackingEpoch(1))
+    anna.does(Release())
+    assert bert.replies() == []
+
+
+def test_no_robots_at_all() -> None:
+    t = Table()
+
+    t.authority = Authority(AuthorityConfig(), (), ())
+    assert t.join().denied(ANY) == "unknown_target"

@@ -1,0 +1,181 @@
+"""`Authority` as a whole: urgent lane, quotas, snapshots for late joiners, construction, time, snapshot and restore."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.client.session_state import SessionMirror
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Bye,
+    Episode,
+    EStop,
+    GetSnapshot,
+    Grasp,
+    Heartbeat,
+    Marker,
+    Release,
+    TrackingEpoch,
+)
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import Entry, Lost
+from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
+from iris_session.protocol.specs import ObjectSpec
+from iris_session.protocol.steps import Outgoing
+
+from .table import Table, make_view, proposal, robot
+
+
+def test_one_command_per_robot_in_order_even_in_an_empty_session() -> None:
+    t = Table()
+    t.step()
+    assert [(c.robot, c.kind, c.hold_reason) for c in t.decision.commands] == [
+        ("left", "hold", "no_lease"),
+        ("right", "hold", "no_lease"),
+    ]
+    t.step(n_ticks=0)
+    assert len(t.decision.commands) == 2
+
+
+def test_release_and_lost_act_in_the_step_they_arrive_in_behind_any_flood() -> None:
+    t = Table()
+    anna, bert, carl = t.operator("left"), t.operator("right"), t.operator()
+    anna.engage("left")
+    bert.engage("right")
+    flood = [carl.says(Heartbeat()) for _ in range(2000)]
+    t.step(*flood, anna.says(Release()), bert.says(Lost()))
+    assert (t.hold("left"), t.hold("right")) == ("no_lease", "disconnected")
+
+
+def test_excess_over_the_quota_is_counted_denied_and_holds() -> None:
+    t = Table(AuthorityConfig(quota=4))
+    anna, bert = t.operator("left"), t.operator("right")
+    bert.engage("right")
+    anna.engage("left")
+    batch = [anna.says(anna.sample("left", clutch=True)) for _ in range(6)]
+    t.step(*batch, bert.says(bert.sample("right", clutch=True)))
+    assert t.since(SamplesRejected) == [SamplesRejected(anna.id, "controller/right", "quota", 1)]
+    assert t.hold("left") == "rejected"
+    assert t.command("right").sources[0].new
+    t.step(*(anna.says(Marker(i, "x")) for i in range(6)))
+    assert [(r.request_id, r.ok) for r in anna.replies()] == [(4, False), (5, False)] + [(i, True) for i in range(4)]
+    t.step(*(Entry(50, 50, t.now_ns, Heartbeat()) for _ in range(6)))
+    assert t.since(SamplesRejected)[0].participant == ""
+
+
+def test_host_has_no_quota_and_the_rights_of_a_director() -> None:
+    t = Table(AuthorityConfig(quota=1))
+    t.step(*(t.host(Marker(i, "x")) for i in range(3)))
+    assert len(t.since(MarkerAdded)) == 3
+    assert t.since(MarkerAdded)[0].participant == "host"
+
+
+def test_strangers_and_wrong_envelopes_are_answered() -> None:
+    t = Table()
+    anna = t.join()
+    t.step(Entry(9, 9, t.now_ns, Acquire(3, ("left",))))
+    (out,) = t.decision.outgoing
+    assert (out.connection, out.message.denial.reason) == (9, "not_joined")
+    t.step(Entry(anna.connection, 9, t.now_ns, Acquire(3, ("left",))), Entry(9, 9, t.now_ns, EStop()))
+    assert anna.replies()[0].denial.reason == "not_joined"
+    assert not t.decision.estop
+    t.step(Entry(anna.connection, 9, t.now_ns, Bye()))
+    assert t.decision.dropped == ()
+
+
+def test_late_joiner_sees_what_the_others_saw() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    anna.does(GetSnapshot(1))
+    early = SessionMirror()
+    early.apply_snapshot(snapshots(t)[0])
+    bert.does(Acquire(1, ("left",), wait=True))
+    follow(t, early)
+    for message in (EStop(), Episode(1, "start"), TrackingEpoch(4), Heartbeat(worn=False), Grasp(2, "hammer", "head")):
+        anna.does(message)
+        follow(t, early)
+    t.step(anna.says(Lost()), bert.says(GetSnapshot(1)), bert.says(GetSnapshot(2)))
+    follow(t, early)
+    assert [s.request_id for s in snapshots(t)] == [1, 2]
+    late = SessionMirror()
+    late.apply_snapshot(snapshots(t)[0])
+    assert late.mirror_hash() == early.mirror_hash()
+    assert late.estop
+    assert late.leases["left"].queue == (bert.id,)
+
+
+def snapshots(t: Table) -> list[Snapshot]:
+    return [o.message for o in t.decision.outgoing if isinstance(o.message, Snapshot)]
+
+
+def follow(t: Table, mirror: SessionMirror) -> None:
+    for event in t.decision.events:
+        assert mirror.apply_event(event)
+
+
+def test_snapshot_asked_by_one_who_is_gone_by_the_end_of_the_step_is_not_sent() -> None:
+    t = Table(AuthorityConfig(heartbeat_timeout_ns=1))
+    anna = t.join()
+    t.step(Entry(anna.connection, anna.connection, 0, GetSnapshot(1)))
+    assert t.decision.outgoing == ()
+
+
+def test_presence_is_in_the_world_and_only_of_the_aligned() -> None:
+    t = Table()
+    anna, watcher = t.operator("left"), t.join("observer")
+    watcher.sends(device="head")
+    assert t.decision.presence == ()
+    t.step(watcher.says(proposal()))
+    t.step(
+        watcher.says(watcher.sample(device="head")),
+        watcher.says(watcher.sample(device="head", p=(0.01, 0.0, 1.0))),
+        anna.says(anna.sample("left")),
+    )
+    shown = {(i.participant, i.device): i.pose for i in t.decision.presence}
+    assert shown[(watcher.id, "head")] == Pose((1.01, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+    assert shown.keys() == {(watcher.id, "head"), (anna.id, "controller/right")}
+    t.step()
+    assert t.decision.presence == ()
+
+
+def test_join_order_of_effects_is_that_of_the_entries() -> None:
+    t = Table()
+    anna = t.join()
+    t.step(anna.says(Marker(1, "a")), anna.says(Marker(2, "b")))
+    assert [e.event_seq for e in t.decision.events] == [2, 3]
+    assert t.decision.event_seq == 3
+    assert isinstance(t.decision.outgoing[0], Outgoing)
+
+
+@pytest.mark.parametrize(
+    ("config", "robots", "objects", "text"),
+    [
+        ({}, (robot("a"), robot("a")), (), "robot names must differ"),
+        ({}, (), (ObjectSpec("o", "o"), ObjectSpec("o", "p")), "object names must differ"),
+        ({}, (robot("a", "anarchy"),), (), "unknown lease mode 'anarchy'"),
+        ({"default_mode": "anarchy"}, (), (), "unknown lease mode 'anarchy'"),
+        ({"policy": "luck"}, (), (), "unknown assignment policy 'luck'"),
+        ({"assignments": {"anna": ("b",)}}, (robot("a"),), (), "unknown robots"),
+        ({"leader_apart": "jump"}, (), (), "must be 'ramp' or 'refuse'"),
+    ],
+)
+def test_construction_says_what_would_be_right(config: dict[str, Any], robots: Any, objects: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Authority(AuthorityConfig(**config), robots, objects)
+
+
+def test_time_does_not_go_back() -> None:
+    t = Table()
+    t.step()
+    for now_ns, n_ticks in ((t.now_ns - 1, 1), (t.now_ns, -1)):
+        with pytest.raises(ValueError, match="must be >= 0"):
+            t.authority.step(now_ns, (), n_ticks, make_view())
+
+
+def test_restore_needs_the_same_robots_and_objects() -> None:
+    snapshot = Table().authority.snapshot()
+    with pytest.raises(ValueError, match="the snapshot has robots"):
+        Table(robots=(robot("other"),)).authority.restore(snapshot)

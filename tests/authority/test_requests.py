@@ -1,0 +1,374 @@
+"""Leases by request: every mode, the queue, consent, directors; nobody deadlocks, every request gets one reply."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, Release, SetMode
+from iris_session.protocol.common import Target
+from iris_session.protocol.entries import Lost
+from iris_session.protocol.server_messages import ConsentRequested, Feedback, Intervention, LeaseChanged
+
+from .table import MS, SECOND, Table, robot
+
+
+def with_mode(mode: str, **config: int) -> Table:
+    return Table(AuthorityConfig(**config), robots=(robot("left", mode), robot("right", mode)))  # type: ignore[arg-type]
+
+
+# --- exclusive and the queue ---
+
+
+def test_exclusive_denial_names_the_holder_and_what_to_do() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    denial = bert.acquire("left").denial
+    assert denial is not None
+    assert (denial.reason, denial.holder, denial.holder_name, denial.target) == ("held", anna.id, anna.name, "left")
+    assert "wait" in denial.advice
+    assert t.since(LeaseChanged) == []
+
+
+def test_acquire_is_all_or_none() -> None:
+    t = Table()
+    anna, bert = t.operator("right"), t.join()
+    assert bert.denied(Acquire(1, ("left", "right"))) == "held"
+    assert t.hold("left") == "no_lease"
+    anna.does(Release())
+    reply = bert.acquire("left", "right")
+    assert reply.ok
+    assert {lease.target: lease.holder for lease in reply.leases} == {"left": bert.id, "right": bert.id}
+    again = bert.acquire("left", "left")
+    assert again.leases[0].lease_version == reply.leases[0].lease_version
+
+
+def test_queue_is_first_come_first_served_and_answers_when_granted() -> None:
+    t = Table()
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    for waiting in (bert, carl):
+        waiting.does(Acquire(7, ("left",), wait=True))
+        assert waiting.replies() == []
+    assert t.last(LeaseChanged).lease.queue == (bert.id, carl.id)
+    anna.does(Release())
+    (reply,) = bert.replies()
+    assert (reply.request_id, reply.ok, reply.leases[0].holder) == (7, True, bert.id)
+    assert carl.replies() == []
+    bert.does(Release(targets=(Target("left", reply.leases[0].lease_version),)))
+    assert carl.replies()[0].ok
+
+
+def test_a_waiting_pair_takes_nothing_and_is_not_overtaken() -> None:
+    t = Table()
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(1, ("left", "right"), wait=True))
+    assert t.hold("right") == "no_lease"
+    assert carl.denied(Acquire(1, ("right",))) == "held"
+    anna.does(Release())
+    assert [lease.target for lease in bert.replies()[0].leases] == ["left", "right"]
+
+
+def test_who_holds_a_robot_cannot_wait_for_another_so_two_armed_operators_never_deadlock() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.operator("right")
+    assert anna.denied(Acquire(1, ("right",), wait=True)) == "held"
+    assert bert.denied(Acquire(1, ("left",), wait=True)) == "held"
+
+
+def test_a_robot_got_otherwise_ends_the_wait() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    bert.does(Acquire(3, ("left",), wait=True))
+    bert.does(Acquire(4, ("right",)))
+    assert [(r.request_id, r.ok) for r in bert.replies()] == [(4, True), (3, False)]
+    anna.does(Release())
+    assert t.hold("left") == "no_lease"
+
+
+def test_queue_is_bounded_and_one_place_each() -> None:
+    t = Table(AuthorityConfig(max_queue=1))
+    t.operator("left")
+    bert, carl = t.join(), t.join()
+    bert.does(Acquire(1, ("left",), wait=True))
+    assert bert.denied(Acquire(2, ("left",), wait=True)) == "queue_full"
+    assert carl.denied(Acquire(1, ("left",), wait=True)) == "queue_full"
+    bert.does(Release(9))
+    assert [(r.request_id, r.ok) for r in bert.replies()] == [(1, False), (9, True)]
+    carl.does(Acquire(1, ("left",), wait=True))
+    assert carl.replies() == []
+
+
+def test_lost_waiters_leave_the_queue() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    bert.does(Acquire(1, ("left",), wait=True))
+    t.step(bert.says(Lost()))
+    anna.does(Release())
+    assert t.last(LeaseChanged).lease.queue == ()
+    assert t.hold() == "no_lease"
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (Acquire(1, ("nothing",)), "unknown_target"),
+        (Acquire(1, (), ("nothing",)), "unknown_target"),
+        (Acquire(1, ("left",), weight=float("nan")), "invalid"),
+        (Acquire(1, ("left",), weight=0.0), "invalid"),
+        (Release(1, (Target("nothing", 1),)), "unknown_target"),
+        (Release(1, (Target("left", 1, "planet"),)), "unknown_value"),
+        (Release(1, (Target("left", 1),)), "not_holder"),
+        (Consent(1, 5, True), "unknown_request"),
+        (Assign(1, ("left",), "p1"), "role"),
+        (SetMode(1, "left", "shared"), "role"),
+        (Grasp(1, "nothing", "hand/left"), "unknown_target"),
+        (Grasp(1, "hammer", "foot"), "unknown_value"),
+        (Grasp(1, "hammer", "hand/left"), "unaligned"),
+    ],
+)
+def test_typed_denials(message: Acquire, reason: str) -> None:
+    t = Table()
+    assert t.join().denied(message) == reason
+
+
+def test_observers_hold_nothing() -> None:
+    t = Table()
+    watcher = t.join("observer")
+    assert watcher.denied(Acquire(1, ("left",))) == "role"
+    assert watcher.denied(Grasp(1, "hammer", "hand/left")) == "role"
+
+
+def test_release_with_an_old_token_is_denied() -> None:
+    t = Table()
+    anna = t.operator("left")
+    assert anna.denied(Release(1, (Target("left", 0),))) == "lease_version"
+    assert anna.asks(Release(1, (Target("left", anna.versions["left"]),) * 2)).ok
+
+
+# --- request ---
+
+
+def test_request_mode_asks_the_holder() -> None:
+    t = with_mode("request")
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(1, ("left",)))
+    asked = t.last(ConsentRequested)
+    assert (asked.target, asked.requester, asked.holder) == ("left", bert.id, anna.id)
+    assert carl.denied(Acquire(1, ("left",))) == "consent_pending"
+    assert carl.denied(Consent(2, asked.consent_id, True)) == "role"
+    anna.engage("left")
+    anna.does(Consent(2, asked.consent_id, True))
+    assert anna.replies()[0].ok
+    assert bert.replies()[0].leases[0].holder == bert.id
+    assert t.hold() == "no_sample"
+    assert (t.last(LeaseChanged).cause, t.last(LeaseChanged).previous_holder) == ("consent", anna.id)
+
+
+def test_consent_refused_by_a_director_times_out_or_resolves_itself() -> None:
+    t = with_mode("request", max_consents=1)
+    anna, bert, boss = t.operator("left"), t.join(), t.join("director")
+    carl = t.operator("right")
+    bert.does(Acquire(1, ("left",)))
+    assert t.join().denied(Acquire(1, ("right",))) == "queue_full"
+    boss.does(Consent(1, t.last(ConsentRequested).consent_id, False))
+    denial = bert.replies()[0].denial
+    assert denial is not None
+    assert (denial.reason, denial.holder) == ("consent_refused", anna.id)
+    bert.does(Acquire(2, ("left", "right")))
+    ids = [e.consent_id for e in t.since(ConsentRequested)]
+    carl.does(Consent(1, ids[1], True))
+    assert bert.replies() == []
+    anna.does(Release())
+    assert bert.replies()[0].ok
+    anna.does(Acquire(3, ("left",)))
+    for _ in range(160):
+        t.step(*(p.says(p.sample()) for p in (anna, bert)), dt_ns=100 * MS)
+        if anna.replies():
+            break
+    assert anna.replies()[0].denial.reason == "consent_refused"  # type: ignore[union-attr]
+
+
+def test_consented_request_that_met_another_obstacle_is_denied() -> None:
+    t = Table(robots=(robot("left", "request"), robot("right")))
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(1, ("left", "right")))
+    carl.acquire("right")
+    anna.does(Consent(1, t.last(ConsentRequested).consent_id, True))
+    assert bert.replies()[0].denial.reason == "held"  # type: ignore[union-attr]
+    assert anna.acquire("left").leases[0].holder == anna.id
+
+
+# --- takeover ---
+
+
+def test_takeover_is_granted_at_once_and_the_old_holder_is_told() -> None:
+    t = with_mode("takeover")
+    anna, bert = t.operator("left"), t.operator()
+    anna.engage("left")
+    assert bert.acquire("left").ok
+    assert t.hold() == "no_sample"
+    assert anna.feedback() == [Feedback("left", "hold", "no_lease")]
+    assert (t.last(LeaseChanged).cause, t.last(LeaseChanged).previous_holder) == ("takeover", anna.id)
+    anna.sends("left", clutch=True)
+    assert t.hold() == "no_sample"
+    bert.engage("left")
+    assert t.command().sources[0].participant == bert.id
+
+
+# --- priority ---
+
+
+def test_human_preempts_agent_and_the_agent_gets_the_robot_back() -> None:
+    t = with_mode("priority")
+    agent = t.join("agent", alignment="not_needed")
+    agent.acquire("left")
+    agent.engage("left", device="target")
+    assert t.command().sources[0].absolute
+    human, other = t.operator(), t.operator()
+    reply = human.acquire("left")
+    assert reply.leases[0].sub_holders == (agent.id, human.id)
+    assert reply.leases[0].weights == (1.0, 0.0)
+    assert other.denied(Acquire(1, ("left",))) == "held"
+    assert t.command().sources[0].participant == agent.id  # standing by changes nothing
+    human.sends("left")
+    human.sends("left", clutch=True)
+    assert t.since(Intervention) == [Intervention("left", human.id, agent.id, True)]
+    assert t.command().sources[0].participant == human.id
+    agent.engage("left", device="target")
+    assert t.command().sources[0].participant == human.id
+    human.sends("left")
+    assert t.since(Intervention) == [Intervention("left", human.id, agent.id, False)]
+    assert t.hold() == "rearm"
+    agent.sends("left", device="target", clutch=True)
+    assert t.hold() == "rearm"
+    agent.engage("left", device="target")
+    assert t.command().sources[0].participant == agent.id
+    human.sends("left", clutch=True)
+    assert t.last(Intervention).active
+
+
+@pytest.mark.parametrize("leaving", ["human", "agent", "human_lost", "mode"])
+def test_an_intervention_ends_when_either_side_leaves(leaving: str) -> None:
+    t = with_mode("priority")
+    agent, human = t.join("agent", alignment="not_needed"), t.operator()
+    boss = t.join("director")
+    agent.acquire("left")
+    human.acquire("left")
+    human.engage("left")
+    if leaving == "human":
+        human.does(Release())
+        assert t.hold() == "rearm"
+    elif leaving == "agent":
+        agent.does(Release())
+        assert t.command().sources[0].participant == human.id
+    elif leaving == "human_lost":
+        t.step(human.says(Lost()))
+        assert t.hold() == "rearm"
+    else:
+        boss.does(SetMode(1, "left", "exclusive"))
+        assert t.last(LeaseChanged).lease.holder == human.id
+        assert t.hold() == "rearm"
+    assert not t.last(Intervention).active
+    if leaving != "human_lost":
+        assert len(t.last(LeaseChanged).lease.sub_holders) == 0
+
+
+def test_humans_and_agents_among_themselves_are_exclusive_in_priority_mode() -> None:
+    t = with_mode("priority")
+    human, agent, other = t.operator("left"), t.join("agent"), t.join("agent")
+    assert agent.denied(Acquire(1, ("left",))) == "held"
+    agent.acquire("right")
+    assert other.denied(Acquire(1, ("right",))) == "held"
+    assert human.acquire("left").ok
+
+
+# --- shared ---
+
+
+def test_shared_robot_blends_by_normalised_weights() -> None:
+    t = with_mode("shared", max_sub_holders=2)
+    anna, bert = t.operator(), t.operator()
+    anna.acquire("left", weight=3.0)
+    lease = bert.acquire("left").leases[0]
+    assert (lease.holder, lease.sub_holders, lease.weights) == (anna.id, (anna.id, bert.id), (3.0, 1.0))
+    assert t.join().denied(Acquire(1, ("left",))) == "held"
+    assert t.hold() == "no_sample"
+    anna.engage("left", gripper=1.0)
+    assert [s.weight for s in t.command().sources] == [1.0]
+    bert.engage("left", gripper=0.0)
+    assert [(s.participant, s.weight) for s in t.command().sources] == [(anna.id, 0.75), (bert.id, 0.25)]
+    assert t.command().gripper == 0.75
+    bert.acquire("left", weight=3.0)
+    assert [s.weight for s in t.command().sources] == [0.5, 0.5]
+    anna.sends("left")
+    assert [(s.participant, s.weight) for s in t.command().sources] == [(bert.id, 1.0)]
+    twist = {"kind": "twist", "pose": None, "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.0)}
+    anna.sends("left", **twist)
+    anna.sends("left", **twist, clutch=True)
+    assert [s.participant for s in t.command().sources] == [bert.id]  # another kind of command waits for its turn
+    bert.sends("left")
+    assert t.command().kind == "twist"
+    assert t.command().gripper is None
+
+
+def test_joining_does_not_fence_the_first_sharer() -> None:
+    t = with_mode("shared")
+    anna = t.operator("left")
+    anna.engage("left")
+    t.operator("left")
+    anna.sends("left", clutch=True)
+    assert t.command().sources[0].new
+    anna.versions["left"] += 1  # what the event told
+    anna.sends("left", clutch=True)
+    assert t.command().sources[0].new
+
+
+# --- directors ---
+
+
+def test_director_assigns_frees_and_changes_modes() -> None:
+    t = Table()
+    anna, bert, boss, watcher = t.operator("left"), t.operator(), t.join("director"), t.join("observer")
+    anna.engage("left")
+    assert boss.asks(Assign(1, ("left", "right"), bert.name)).ok
+    assert (t.hold("left"), t.hold("right")) == ("no_sample", "no_sample")
+    assert anna.feedback()[0].hold_reason == "no_lease"
+    assert boss.asks(Assign(1, ("left", "right"))).leases[0].holder == ""
+    assert boss.denied(Assign(1, ("left",), "nobody")) == "unknown_participant"
+    assert boss.denied(Assign(1, ("nothing",), bert.id)) == "unknown_target"
+    assert boss.denied(Assign(1, ("left",), watcher.id)) == "role"
+    assert boss.denied(SetMode(1, "nothing", "shared")) == "unknown_target"
+    assert boss.denied(SetMode(1, "left", "anarchy")) == "unknown_value"
+    assert boss.asks(SetMode(1, "left", "shared")).leases[0].mode == "shared"
+    assert anna.acquire("left").ok
+    assert bert.acquire("left").ok
+    assert boss.asks(SetMode(1, "left", "exclusive")).leases[0].holder == anna.id
+    assert bert.denied(Acquire(1, ("left",))) == "held"
+
+
+def test_assigning_a_shared_robot_replaces_everyone() -> None:
+    t = with_mode("shared")
+    anna, bert, boss = t.operator("left"), t.operator("left"), t.join("director")
+    boss.asks(Assign(1, ("left",), bert.id))
+    assert t.last(LeaseChanged).lease.sub_holders == (bert.id,)
+    assert anna.denied(Release(1, (Target("left", anna.versions["left"]),))) == "not_holder"
+
+
+def test_assignment_ends_the_wait_of_the_assigned() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    bert.does(Acquire(5, ("left",), wait=True))
+    t.step(t.host(Assign(1, ("right",), bert.id)))
+    assert [(r.request_id, r.ok) for r in bert.replies()] == [(5, False)]
+    anna.does(Release())
+    assert t.last(LeaseChanged).lease.holder == ""
+
+
+def test_waiting_for_seconds_keeps_the_reply_for_the_end() -> None:
+    t = Table()
+    anna, bert = t.operator("left"), t.join()
+    bert.does(Acquire(1, ("left",), wait=True))
+    for _ in range(50):
+        t.step(anna.says(anna.sample()), bert.says(bert.sample()), dt_ns=100 * MS)
+        assert bert.replies() == []
+    assert t.now_ns > 5 * SECOND

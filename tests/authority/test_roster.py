@@ -1,0 +1,237 @@
+"""Join, resume, lost connections, heartbeats, grace, gateways."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.protocol.client_messages import Bye, GetSnapshot, Heartbeat, Release
+from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost
+from iris_session.protocol.server_messages import (
+    LeaseChanged,
+    ParticipantChanged,
+    ParticipantJoined,
+    ParticipantLeft,
+    Refused,
+    Snapshot,
+)
+from iris_session.protocol.steps import Admitted, Dropped
+
+from .table import MS, SECOND, Person, Table
+
+
+def rejoin(t: Table, old: Person, **fields: Any) -> Person:
+    """`old` comes back on a new connection with its resume token."""
+    t.people += 1
+    key = f"key{old.connection}"
+    join = Join(**{"key_id": key, "role": "operator", "name": old.name, "resume_of": old.id, **fields})
+    person = t.persons[t.people] = Person(t, t.people, old.name)
+    person.id = old.id
+    t.step(Entry(t.people, t.people, t.now_ns, join))
+    return person
+
+
+def refused(t: Table) -> str:
+    (message,) = [o.message for o in t.decision.outgoing if isinstance(o.message, Refused)]
+    return message.code
+
+
+def test_join_admits_and_tells_everyone() -> None:
+    t = Table()
+    anna = t.join(devices=("head",))
+    assert t.decision.admitted == (Admitted(1, "p1", "operator", False),)
+    (event,) = t.since(ParticipantJoined)
+    assert (event.participant.id, event.participant.devices, event.participant.alignment) == ("p1", ("head",), None)
+    agent = t.join("agent", alignment="not_needed")
+    assert t.since(ParticipantJoined)[0].participant.alignment.kind == "not_needed"
+    assert (anna.id, agent.id) == ("p1", "p2")
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"role": "king"}, "unknown_value"),
+        ({"alignment": "guessed"}, "unknown_value"),
+        ({"gateway": 1}, "gateway_only"),
+        ({"gateway": 5}, "gateway_only"),
+    ],
+)
+def test_refused_joins(fields: dict[str, Any], code: str) -> None:
+    t = Table()
+    t.join()
+    t.join(**fields)
+    assert refused(t) == code
+    assert t.decision.admitted == ()
+
+
+def test_a_connection_joins_once() -> None:
+    t = Table()
+    anna = t.join()
+    t.step(anna.says(Join("key1", "operator", "anna")))
+    assert refused(t) == "already_joined"
+    anna.does(Bye())
+    t.step(anna.says(Join("key1", "operator", "anna")))
+    assert refused(t) == "already_joined"
+
+
+def test_session_full_forgets_lost_people_without_leases_first() -> None:
+    t = Table(AuthorityConfig(max_participants=2))
+    anna, bert = t.operator("left"), t.join()
+    t.join()
+    assert refused(t) == "session_full"
+    t.step(anna.says(Lost()), bert.says(Lost()))
+    assert t.join().id == "p3"
+    assert t.last(ParticipantLeft).participant == bert.id
+    t.join()
+    assert refused(t) == "session_full"
+
+
+def test_lost_holder_holds_disconnected_and_keeps_the_lease_for_the_grace_period() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(anna.says(Lost("closed")))
+    assert t.hold() == "disconnected"
+    assert t.since(ParticipantLeft) == [ParticipantLeft(anna.id, "closed", True)]
+    lease = t.last(LeaseChanged).lease
+    assert (lease.holder, lease.expires_ns) == (anna.id, t.now_ns + 30 * SECOND)
+    t.step(anna.says(Lost()))
+    t.wait(30 * SECOND)
+    assert t.hold() == "no_lease"
+    assert t.last(LeaseChanged).cause == "expired"
+    assert t.last(ParticipantLeft) == ParticipantLeft(anna.id, "expired", False)
+
+
+def test_grace_goes_on_while_physics_is_paused() -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.step(anna.says(Lost()), n_ticks=0)
+    for _ in range(1500):
+        t.step(dt_ns=20 * MS, n_ticks=0)
+    assert t.hold() == "no_lease"
+
+
+def test_resume_fences_old_tokens_and_drops_the_old_connection() -> None:
+    t = Table()
+    anna = t.operator("left", capabilities=("run:a",))
+    anna.engage("left")
+    again = rejoin(t, anna, capabilities=("run:a",))
+    assert t.decision.dropped == (Dropped(anna.connection, "replaced"),)
+    assert t.decision.admitted[0].resumed
+    lease = t.last(LeaseChanged).lease
+    assert (lease.lease_version, t.last(LeaseChanged).cause) == (anna.versions["left"] + 1, "resumed")
+    assert t.hold() == "rearm"
+    again.versions = anna.versions
+    again.engage("left")
+    assert t.hold() == "rearm"
+    again.learn([lease])
+    again.engage("left")
+    assert t.command().kind == "pose"
+    anna.versions = again.versions
+    anna.sends("left", clutch=False)
+    assert t.command().kind == "pose"
+
+
+def test_resume_after_lost_keeps_the_lease() -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.step(anna.says(Lost()))
+    again = rejoin(t, anna)
+    assert t.last(LeaseChanged).lease.expires_ns == 0
+    t.wait(2 * SECOND)
+    assert again.id == anna.id
+    assert t.hold() == "rearm"
+
+
+@pytest.mark.parametrize(("run", "kept"), [("run:a", True), ("run:b", False), ("other", False)])
+def test_alignment_survives_a_resume_only_within_one_run_of_the_app(run: str, kept: bool) -> None:
+    t = Table()
+    anna = t.operator("left", capabilities=("run:a",))
+    rejoin(t, anna, capabilities=(run,))
+    assert (t.last(ParticipantJoined).participant.alignment is not None) == kept
+
+
+def test_resume_needs_the_same_key_and_role() -> None:
+    for fields in ({"key_id": "other"}, {"role": "director"}):
+        t = Table()
+        anna = t.operator("left")
+        rejoin(t, anna, **fields)
+        assert refused(t) == "resume_token"
+
+
+def test_resume_of_a_forgotten_participant_joins_anew() -> None:
+    t = Table()
+    anna = t.join()
+    anna.does(Bye())
+    rejoin(t, anna)
+    assert t.decision.admitted == (Admitted(2, "p2", "operator", False),)
+
+
+def test_bye_releases_at_once() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.does(Bye("done"))
+    assert t.hold() == "no_lease"
+    assert t.decision.dropped == (Dropped(1, "bye"),)
+    assert t.since(ParticipantLeft) == [ParticipantLeft(anna.id, "done", False)]
+
+
+def test_three_silent_seconds_are_a_lost_connection() -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.wait(2 * SECOND)
+    anna.does(Heartbeat())
+    t.wait(2900 * MS)
+    assert t.hold() == "no_sample"
+    t.wait(200 * MS)
+    assert t.hold() == "disconnected"
+    assert Dropped(1, "heartbeat") in t.decision.dropped or t.last(ParticipantLeft).reason == "heartbeat"
+
+
+def test_front_restart_loses_everyone_but_the_host() -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.step(t.host(FrontRestarted()))
+    assert t.hold() == "disconnected"
+    assert t.last(ParticipantLeft).reason == "front_restarted"
+    t.step(t.host(GetSnapshot(1)))
+    (snapshot,) = [o.message for o in t.decision.outgoing]
+    assert isinstance(snapshot, Snapshot)
+    assert [(p.id, p.connected) for p in snapshot.participants] == [(anna.id, False)]
+
+
+def test_host_cannot_be_lost_say_bye_or_be_resumed() -> None:
+    t = Table()
+    t.step(t.host(Lost()), t.host(Bye()))
+    t.step(t.host(Release(4)))
+    assert t.decision.outgoing[0].connection == 0
+    anna = t.join()
+    anna.id = "host"
+    rejoin(t, anna, role="director", key_id="")
+    assert not t.decision.admitted[0].resumed
+
+
+def test_worn_is_shown_and_a_gateway_takes_its_clients_along() -> None:
+    t = Table()
+    gate = t.join("gateway")
+    anna = t.operator("left", gateway=gate.connection)
+    anna.does(Heartbeat(worn=False))
+    assert not t.since(ParticipantChanged)[0].participant.worn
+    anna.does(Heartbeat())
+    assert t.since(ParticipantChanged)[0].participant.worn
+    t.step(gate.says(Lost()))
+    assert t.hold() == "disconnected"
+    gate = t.join("gateway")
+    t.operator("right", gateway=gate.connection)
+    gate.does(Bye())
+    assert t.hold("right") == "disconnected"
+
+
+def test_join_and_bye_in_one_step_leave_no_ghost() -> None:
+    t = Table()
+    join = Join("k", "operator", "anna")
+    t.step(Entry(1, 1, t.now_ns, join), Entry(1, 1, t.now_ns, Bye()))
+    assert t.decision.admitted == ()

@@ -1,0 +1,218 @@
+"""Every reason for which a sample does not count, and what a rejection may and may not do."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.server_messages import SamplesRejected
+
+from .table import MS, Person, Table, make_view
+
+TURNED = (0.0, 1.0, 0.0, 0.0)
+NAN = math.nan
+
+
+def engaged() -> tuple[Table, Person]:
+    t = Table(objects=("hammer",))
+    op = t.operator("left")
+    op.engage("left")
+    assert t.command().kind == "pose"
+    return t, op
+
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    ("scene_epoch", {"scene_epoch": 2}),
+    ("tracking_epoch", {"tracking_epoch": 1}),
+    ("alignment_version", {"alignment_version": 2}),
+    ("stale", {"age_ns": 149 * MS}),  # the step itself comes 2 ms later
+    ("future", {"age_ns": -8 * MS}),
+    ("unknown_value", {"kind": "telepathy"}),
+    ("device", {"kind": "joints", "q": (0.0,) * 7}),
+    ("not_finite", {"p": (0.0, NAN, 1.0)}),
+    ("not_finite", {"p": (0.0, 2000.0, 1.0)}),
+    ("not_finite", {"pose": Pose((0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0))}),
+    ("not_finite", {"gripper": NAN}),
+    ("not_finite", {"twist": (0.0, 0.0, NAN, 0.0, 0.0, 0.0)}),
+    ("not_finite", {"hand_joints": (NAN,) * 7}),
+    ("not_unit", {"pose": Pose((0.0, 0.0, 1.0), (1.002, 0.0, 0.0, 0.0))}),
+    ("not_unit", {"pose": Pose((0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0))}),
+    ("too_fast", {"p": (0.5, 0.0, 1.0)}),
+    ("too_fast", {"pose": Pose((0.0, 0.0, 1.0), TURNED)}),
+    ("shape", {"pose": None}),
+    ("shape", {"kind": "twist"}),
+    ("too_fast", {"kind": "twist", "twist": (11.0, 0.0, 0.0, 0.0, 0.0, 0.0)}),
+    ("lease_version", {"targets": (Target("left", 0),)}),
+    ("lease_version", {"targets": (Target("left", 2),)}),
+]
+
+
+@pytest.mark.parametrize(("reason", "fields"), CASES)
+def test_rejection_has_its_reason_is_counted_and_rearms_the_senders_own_robot(
+    reason: str, fields: dict[str, Any]
+) -> None:
+    t, op = engaged()
+    op.sends("left", clutch=True, **fields)
+    (event,) = t.since(SamplesRejected)
+    assert (event.participant, event.reason, event.count) == (op.id, reason, 1)
+    assert t.hold() == "rejected"
+    op.sends("left", clutch=True)
+    assert t.hold() == "rejected"
+    op.engage("left")
+    assert t.command().kind == "pose"
+
+
+@pytest.mark.parametrize("fields", [{"device": "controller/third"}, {"targets": (Target("left", 1, "planet"),)}])
+def test_unknown_words_are_rejected_and_touch_no_other_device_or_target(fields: dict[str, Any]) -> None:
+    t, op = engaged()
+    op.sends("left", clutch=True, **fields)
+    assert t.since(SamplesRejected)[0].reason == "unknown_value"
+    assert t.command().kind == "pose"
+
+
+def test_old_seq_is_only_counted() -> None:
+    t, op = engaged()
+    op.seq -= 1
+    op.sends("left", clutch=True)
+    assert t.since(SamplesRejected)[0].reason == "seq"
+    assert t.command().kind == "pose"
+
+
+def test_old_or_future_receive_time() -> None:
+    for shift, reason in ((-160 * MS, "stale"), (10 * MS, "future")):
+        t, op = engaged()
+        s = op.sample("left", clutch=True)
+        t.step(Entry(op.connection, op.connection, t.now_ns + shift, s))
+        assert t.since(SamplesRejected)[0].reason == reason
+
+
+def test_capture_after_receipt_is_from_the_future() -> None:
+    t, op = engaged()
+    t.step(dt_ns=20 * MS)
+    s = op.sample("left", clutch=True)
+    t.step(Entry(op.connection, op.connection, t.now_ns - 6 * MS, s))
+    assert t.since(SamplesRejected)[0].reason == "future"
+
+
+def test_foreign_target_is_not_holder_and_leaves_the_holder_engaged() -> None:
+    t, op = engaged()
+    thief = t.operator("right")
+    thief.versions["left"] = op.versions["left"]
+    thief.engage("left")
+    assert t.since(SamplesRejected) == []  # the second one of a kind is not reported again within a second
+    assert t.last(SamplesRejected).reason == "not_holder"
+    assert t.command().sources[0].participant == op.id
+    assert t.command().kind == "pose"
+
+
+def test_another_connection_cannot_speak_for_a_participant() -> None:
+    t, op = engaged()
+    s = op.sample("left", scene_epoch=9)
+    t.step(Entry(77, op.connection, t.now_ns, s))
+    assert t.since(SamplesRejected)[0] == SamplesRejected("", "controller/right", "connection_epoch", 1)
+    assert t.command().kind == "pose"
+    t.step(Entry(op.connection, 77, t.now_ns, op.sample("left", clutch=True)))
+    assert t.since(SamplesRejected)[0].reason == "connection_epoch"
+    assert t.hold() == "rejected"
+
+
+def test_unknown_target_and_role() -> None:
+    t, op = engaged()
+    op.sends("nothing")
+    assert t.since(SamplesRejected)[0].reason == "unknown_target"
+    watcher = t.join("observer")
+    watcher.sends("left")
+    assert t.since(SamplesRejected)[0].reason == "role"
+    assert t.command().kind == "pose"
+
+
+def test_undeclared_device() -> None:
+    t = Table()
+    op = t.operator("left", devices=("head",))
+    op.sends("left")
+    assert t.since(SamplesRejected)[0].reason == "device"
+
+
+def test_unaligned_holder_holds_unaligned() -> None:
+    t = Table()
+    op = t.join()
+    op.acquire("left")
+    op.sends("left")
+    assert t.hold() == "unaligned"
+    assert t.since(SamplesRejected)[0].reason == "unaligned"
+
+
+def test_too_fast_counts_from_the_last_counted_sample() -> None:
+    t, op = engaged()
+    op.sends("left", clutch=True, p=(0.5, 0.0, 1.0))
+    t.step(dt_ns=60 * MS)
+    op.engage("left", p=(0.5, 0.0, 1.0))
+    assert t.command().kind == "pose"
+
+
+def test_objects_take_poses_only_and_leaders_the_right_number_of_joints() -> None:
+    t = Table(objects=("hammer",))
+    leader = t.join("leader", alignment="not_needed")
+    leader.acquire("left", objects=("hammer",))
+    joints: dict[str, Any] = {"device": "joints", "kind": "joints", "pose": None}
+    leader.engage("left", **joints, q=(0.0,) * 6)
+    assert t.last(SamplesRejected).reason == "shape"
+    leader.engage("left", **joints, q=(0.1,) * 7, qd=(0.2,) * 7)
+    source = t.command().sources[0]
+    assert (t.command().kind, source.q, source.qd) == ("joints", (0.1,) * 7, (0.2,) * 7)
+    leader.sends("left", **joints, q=(1.0,) * 7, clutch=True)
+    assert t.since(SamplesRejected)[0].reason == "too_fast"
+    leader.sends("left", **joints, q=(0.1,) * 7, qd=(0.2,) * 3)
+    leader.sends("hammer", **joints, q=(0.1,) * 7)
+    leader.sends("hammer", **joints, q=(0.1,) * 7, clutch=True)
+    t.wait(100 * MS)
+    assert leader.told["left"].rejected == {"shape": 3, "too_fast": 1}
+
+
+def test_leader_apart_is_refused_when_the_configuration_says_so() -> None:
+    t = Table(AuthorityConfig(leader_apart="refuse"))
+    leader = t.join("leader", alignment="not_needed")
+    leader.acquire("left")
+    joints: dict[str, Any] = {"device": "joints", "kind": "joints", "pose": None, "q": (0.3,) * 7}
+    leader.engage("left", **joints)
+    assert t.last(SamplesRejected).reason == "leader_apart"
+    t.view = make_view(q={"left": (0.25,) * 7})
+    leader.engage("left", **joints)
+    assert t.command().kind == "joints"
+
+
+def test_rejections_are_reported_at_most_once_per_second() -> None:
+    t, op = engaged()
+    for _ in range(600):
+        op.sends("left", scene_epoch=5)
+    reports = [e for e in t.events if isinstance(e, SamplesRejected)]
+    assert [r.count for r in reports] == [1, 501]
+
+
+def test_untracked_and_unworn_samples_need_no_payload() -> None:
+    for fields, reason in (({"tracked": False}, "untracked"), ({"worn": False}, "not_worn")):
+        t, op = engaged()
+        op.sends("left", clutch=True, pose=None, **fields)
+        assert t.hold() == reason
+        op.sends("left", clutch=True)
+        assert t.command().kind == "hold"
+
+
+def test_float_fields_may_hold_whole_numbers_of_a_host_program() -> None:
+    t = Table()
+    agent = t.join("agent", alignment="not_needed")
+    agent.acquire("left")
+    pose = Pose((0, 0, 1), (1, 0, 0, 0))
+    s = Sample("target", "pose", 1, t.now_ns, 1, 0, 0, (agent.target("left"),), pose=pose)
+    agent.does(s)
+    agent.seq = 1
+    agent.sends("left", device="target", pose=pose, clutch=True, gripper=1)
+    source = t.command().sources[0]
+    assert source.absolute
+    assert all(isinstance(c, float) for c in (*source.pose_world.p, *source.pose_world.q, t.command().gripper))

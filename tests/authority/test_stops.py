@@ -1,0 +1,183 @@
+"""E-stop, pause, reset, gaps and scene epochs; episodes."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Release
+from iris_session.protocol.entries import Entry, ExternalReset, Lost, RecordingGap, StalledGap
+from iris_session.protocol.server_messages import (
+    EpisodeChanged,
+    EStopChanged,
+    Gap,
+    LeaseChanged,
+    PauseChanged,
+    SceneChanged,
+)
+
+from .table import MS, SECOND, Person, Table
+
+
+def playing() -> tuple[Table, Person, Person]:
+    t = Table()
+    op, boss = t.operator("left"), t.join("director")
+    op.engage("left")
+    return t, op, boss
+
+
+def test_anyone_stops_everything_in_the_same_step_however_long_the_batch() -> None:
+    t, op, _ = playing()
+    watcher = t.join("observer")
+    flood = [op.says(op.sample("left", clutch=True)) for _ in range(500)]
+    t.step(*flood, watcher.says(EStop("fire")))
+    assert t.decision.estop
+    assert t.hold() == "estop"
+    assert t.since(EStopChanged) == [EStopChanged(True, watcher.id, "fire")]
+    op.engage("left")
+    assert t.hold() == "estop"
+    watcher.does(EStop())
+    assert t.since(EStopChanged) == []
+
+
+def test_an_estop_with_an_old_envelope_still_stops() -> None:
+    t, op, _ = playing()
+    t.step(Entry(op.connection, 99, t.now_ns, EStop()))
+    assert t.hold() == "estop"
+
+
+def test_clearing_needs_a_director_and_a_new_clutch() -> None:
+    t, op, boss = playing()
+    op.does(EStop())
+    assert op.denied(ClearEStop(1)) == "role"
+    op.engage("left")
+    assert boss.asks(ClearEStop(1)).ok
+    assert boss.asks(ClearEStop(1)).ok
+    assert t.hold() == "estop"
+    op.sends("left", clutch=True)
+    assert t.hold() == "estop"
+    op.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_a_stop_in_the_same_step_beats_the_clear() -> None:
+    t, op, boss = playing()
+    op.does(EStop())
+    t.step(boss.says(ClearEStop(1)), op.says(EStop()))
+    assert not boss.replies()[0].ok
+    assert t.decision.estop
+
+
+def test_pause_and_resume_rearm() -> None:
+    t, op, boss = playing()
+    assert op.denied(Control(1, "pause")) == "role"
+    assert boss.denied(Control(1, "fly")) == "unknown_value"
+    assert boss.denied(Control(1, "step")) == "invalid"
+    assert boss.asks(Control(1, "pause")).ok
+    assert t.decision.paused
+    assert t.hold() == "gap"
+    op.engage("left")
+    assert t.command().kind == "hold"
+    boss.asks(Control(1, "step", 5))
+    assert t.decision.step_ticks == 5
+    boss.asks(Control(1, "pause"))
+    assert t.since(PauseChanged) == []
+    boss.asks(Control(1, "resume"))
+    assert t.since(PauseChanged) == [PauseChanged(False, boss.id)]
+    assert t.decision.step_ticks == 0
+    op.sends("left", clutch=True)
+    assert t.command().kind == "hold"
+    op.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_reset_starts_a_scene_epoch_and_keeps_leases() -> None:
+    t, op, boss = playing()
+    t.step(boss.says(Control(1, "reset")), boss.says(Control(2, "reset")))
+    assert (t.decision.reset, t.decision.scene_epoch) == (True, 2)
+    assert t.since(SceneChanged) == [SceneChanged(2, 0, "reset")]
+    assert t.hold() == "scene_changed"
+    op.engage("left")
+    assert t.hold() == "scene_changed"
+    op.scene_epoch = 2
+    op.engage("left")
+    assert t.command().kind == "pose"
+    t.step(t.host(ExternalReset()))
+    assert (t.decision.reset, t.decision.scene_epoch, t.hold()) == (False, 3, "scene_changed")
+
+
+def test_a_loop_of_the_user_is_not_paused_or_reset() -> None:
+    t = Table(AuthorityConfig(user_owned_loop=True))
+    boss = t.join("director")
+    for action in ("pause", "resume", "step", "reset"):
+        assert boss.denied(Control(1, action)) == "user_owned"
+    assert boss.denied(Episode(1, "reset")) == "user_owned"
+
+
+def test_a_gap_between_steps_holds_until_clutched_again() -> None:
+    t, op, _ = playing()
+    t.step(op.says(op.sample("left", clutch=True)), t.host(StalledGap(SECOND)), dt_ns=151 * MS)
+    assert t.since(Gap) == [Gap("stalled", 151 * MS)]
+    assert t.hold() == "gap"
+    op.engage("left")
+    t.step(t.host(StalledGap(40 * MS)))
+    assert t.since(Gap) == [Gap("stalled", 40 * MS)]
+    assert t.hold() == "gap"
+
+
+def test_nobody_expires_in_a_gap_before_the_waiting_entries_came() -> None:
+    t, op, _ = playing()
+    lost = t.operator("right")
+    t.step(lost.says(Lost()))
+    t.step(dt_ns=40 * SECOND)
+    assert (t.hold("left"), t.hold("right")) == ("gap", "gap")
+    assert t.last(LeaseChanged).lease.expires_ns == t.now_ns + 250 * MS
+    t.step(op.says(op.sample("left")), dt_ns=100 * MS)
+    t.wait(200 * MS)
+    assert (t.hold("left"), t.hold("right")) == ("clutch_open", "no_lease")
+
+
+def test_recording_gap_is_announced_and_only_by_the_host() -> None:
+    t, op, _ = playing()
+    t.step(t.host(RecordingGap(3)))
+    assert t.since(Gap) == [Gap("recording", 0)]
+    t.step(op.says(RecordingGap(3)))
+    assert t.since(Gap) == []
+
+
+# --- episodes ---
+
+
+def test_episode_life() -> None:
+    t, op, boss = playing()
+    assert op.denied(Episode(1, "dance")) == "unknown_value"
+    assert t.join("observer").denied(Episode(1, "start")) == "role"
+    assert op.denied(Episode(1, "success")) == "episode_state"
+    assert op.asks(Episode(1, "start", "stack")).ok
+    assert t.since(EpisodeChanged) == [EpisodeChanged(1, "running", "stack", op.id)]
+    assert op.denied(Episode(1, "start")) == "episode_state"
+    assert op.denied(Episode(1, "reset")) == "episode_state"
+    assert boss.asks(Episode(1, "rerecord")).ok
+    assert [(e.number, e.state) for e in t.since(EpisodeChanged)] == [(1, "discarded"), (2, "running")]
+    assert t.decision.reset
+    assert op.asks(Episode(1, "success")).ok
+    assert t.last(EpisodeChanged).state == "success"
+    assert op.asks(Episode(1, "reset")).ok
+    assert t.decision.reset
+
+
+@pytest.mark.parametrize(("action", "state"), [("failure", "failure"), ("discard", "discarded")])
+def test_episode_verdicts(action: str, state: str) -> None:
+    t, op, _ = playing()
+    op.asks(Episode(1, "start"))
+    op.asks(Episode(1, action))
+    assert t.last(EpisodeChanged).state == state
+
+
+def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:
+    t = Table()
+    other = t.join()
+    t.step(other.says(Acquire(1, ("right",))), other.says(Release(2)))
+    assert [(r.request_id, r.ok) for r in other.replies()] == [(2, True), (1, False)]
+    t.step(other.says(Release(3)), other.says(Acquire(4, ("right",))))
+    assert [(r.request_id, r.ok) for r in other.replies()] == [(3, True), (4, True)]
