@@ -1,0 +1,346 @@
+"""The composition: what is written and what is not, twists, absolute targets, sharing, resets, targets without IK."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from anchors.pose import quat_from_rotvec
+from iris_session.control import ControlConfig, ControlError, Controller
+from iris_session.control.arm_model import site_pose
+from iris_session.protocol.common import Pose
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import Command, FixedView, ObjectCommand
+from tests.control.rigs import (
+    IIWA_HOME,
+    Rig,
+    aloha_model,
+    aloha_robots,
+    apart,
+    decision,
+    hold_command,
+    iiwa_model,
+    iiwa_spec,
+    old,
+    pose_command,
+)
+
+TARGETS = ControlConfig(output="targets")
+
+
+def iiwa(config: ControlConfig | None = None) -> Rig:
+    made = Rig(iiwa_model(), [iiwa_spec()], config, home=IIWA_HOME)
+    made.hold(3)
+    return made
+
+
+def drive(made: Rig, *sources: object, steps: int = 1, **more: object) -> None:
+    for _ in range(steps):
+        made.step(decision([pose_command("iiwa", *sources, **more)]))  # type: ignore[arg-type]
+        sources = tuple(old(s) for s in sources)  # type: ignore[arg-type]
+
+
+def twist(made: Rig, v: tuple[float, ...], **more: object) -> Command:
+    return Command("iiwa", "twist", sources=(made.source((0.0,) * 3, pose_world=None, twist_world=v, **more),))
+
+
+def test_targets_after_reset_are_where_the_robots_stand() -> None:
+    rig = Rig(aloha_model(), aloha_robots())
+    for i in range(2):
+        assert apart(rig.target(i), rig.tip(i))[0] < 1e-12
+    rig.controller.tick(rig.data)
+    assert rig.data.ctrl == pytest.approx(rig.model.key_ctrl[0])
+
+
+def test_control_must_be_told_where_the_robots_stand() -> None:
+    model = iiwa_model()
+    with pytest.raises(ControlError, match=r"call reset\(data\) or restore\(bytes\) first"):
+        Controller(model, [iiwa_spec()]).tick(mujoco.MjData(model))
+
+
+def test_only_the_ctrl_of_its_own_robots_is_written() -> None:
+    rig = Rig(aloha_model(), aloha_robots()[:1])
+    right = [rig.model.actuator(f"right/{n}").id for n in ("waist", "elbow", "gripper")]
+    rig.data.ctrl[right] = (0.11, 0.22, 0.033)
+    for k in range(50):
+        rig.step(decision([pose_command("left", rig.source((0.001 * k, 0.0, 0.0)), gripper=0.5)]))
+    assert rig.data.ctrl[right].tolist() == [0.11, 0.22, 0.033]
+    assert not rig.data.xfrc_applied.any()
+
+
+def test_a_robot_without_a_command_or_sources_holds_and_unknown_robots_are_refused() -> None:
+    rig = iiwa()
+    drive(rig, rig.source((0.0, 0.0, 0.0)), steps=2)
+    drive(rig, rig.source((0.1, 0.0, 0.0)), steps=20)
+    assert rig.controller._joints.moving
+    rig.step(decision([]))
+    assert rig.controller._states[0].latch is None
+    drive(rig, rig.source((0.0, 0.0, 0.0), engagement=2), steps=2)
+    rig.step(decision([Command("iiwa", "pose")]))
+    assert rig.controller._states[0].latch is None
+    with pytest.raises(ControlError, match=r"robot 'ur5' is not known. Available robots: iiwa"):
+        rig.step(decision([hold_command("ur5")]))
+
+
+def test_steps_without_ticks_take_samples_but_move_nothing() -> None:
+    rig = iiwa()
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    ctrl, applied = rig.data.ctrl.copy(), rig.controller.status()[0].applied
+    last = rig.source((0.05, 0.0, 0.0))
+    for source in (rig.source((0.02, 0.0, 0.0)), last, old(last)):
+        rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
+    assert (rig.data.ctrl == ctrl).all()
+    assert rig.controller.status()[0].applied is applied
+    rig.step(decision([pose_command("iiwa", old(last))]), n_ticks=3)
+    now = rig.controller.status()[0].applied
+    assert now is not None
+    assert (now.seq, now.step_ns) == (last.seq, rig.steps * 2_000_000)
+
+
+def test_an_engagement_during_a_pause_is_applied_with_the_first_tick() -> None:
+    rig = iiwa()
+    source = rig.source((0.0, 0.0, 0.0))
+    rig.step(decision([pose_command("iiwa", source)]), n_ticks=0)
+    assert rig.controller.status()[0].applied is None
+    rig.step(decision([pose_command("iiwa", old(source))]))
+    applied = rig.controller.status()[0].applied
+    assert applied is not None
+    assert applied.seq == source.seq
+
+
+def test_the_gripper_follows_and_stays_in_hold() -> None:
+    rig = Rig(aloha_model(), aloha_robots())
+    gripper = rig.model.actuator("left/gripper").id
+    both = [hold_command("right")]
+    for _ in range(20):
+        rig.step(decision([pose_command("left", rig.source((0.0, 0.0, 0.0)), gripper=1.0), *both]))
+    assert 0.002 < rig.data.ctrl[gripper] < 0.036
+    before = rig.data.ctrl[gripper]
+    rig.hold(50)
+    assert rig.data.ctrl[gripper] == before
+    for _ in range(200):
+        rig.step(decision([pose_command("left", rig.source((0.0, 0.0, 0.0), engagement=2), gripper=1.0), *both]))
+    assert rig.data.ctrl[gripper] == 0.002
+    for _ in range(20):
+        rig.step(decision([pose_command("left", rig.source((0.0, 0.0, 0.0), engagement=2)), *both]))
+    assert rig.data.ctrl[gripper] == 0.002  # None: unchanged
+
+
+def test_a_twist_moves_at_its_speed_and_stops_with_hold() -> None:
+    rig = iiwa()
+    start = rig.target()
+    command = twist(rig, (0.0, 0.1, 0.0, 0.0, 0.0, 0.2))
+    before = rig.data.ctrl.copy()
+    rig.step(decision([command]))
+    assert (rig.data.ctrl == before).all()
+    for _ in range(500):
+        rig.step(decision([command]))
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.0, 0.1, 0.0), abs=2e-3)
+    assert apart(start, rig.target())[1] == pytest.approx(math.degrees(0.2), abs=0.5)
+    rig.hold(100)
+    stopped = rig.target()
+    rig.hold(100)
+    assert rig.target() == stopped
+    assert not rig.controller._joints.moving
+
+
+def test_a_twist_target_does_not_run_away_from_an_arm_that_cannot_follow() -> None:
+    rig = iiwa()
+    command = twist(rig, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for _ in range(3000):
+        rig.step(decision([command]))
+    state = rig.controller._states[0]
+    assert state.latch is not None
+    assert apart(rig.controller._reach.tip(0, state), state.latch.target)[0] <= 0.05 + 1e-9
+    # A zero twist ends it, and the opposite one works at once.
+    back = twist(rig, (-0.2, 0.0, 0.0, 0.0, 0.0, 0.0))
+    where = rig.tip()[0][0]
+    for _ in range(500):
+        rig.step(decision([back]))
+    assert rig.tip()[0][0] < where - 0.1
+
+
+def test_an_absolute_target_is_reached_at_bounded_speed_from_one_sample() -> None:
+    rig = iiwa(ControlConfig(tip_speed=0.25))
+    start = rig.target()
+    goal = ((start[0][0], start[0][1] + 0.2, start[0][2]), start[1])
+    before = rig.data.ctrl.copy()
+    drive(rig, rig.source(*goal, absolute=True, device="target"))
+    assert (rig.data.ctrl == before).all()
+    drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=150)
+    assert 0.02 < rig.target()[0][1] - start[0][1] < 0.3 * 0.25 + 0.02
+    drive(rig, old(rig.source(*goal, absolute=True, device="target")), steps=1000)
+    assert apart(rig.controller._reach.tip(0, rig.controller._states[0]), goal)[0] < 3e-5
+
+
+def test_sharing_blends_and_nobody_joining_or_leaving_moves_the_robot() -> None:
+    rig = iiwa()
+    start = rig.target()
+    alone = rig.source((0.0, 0.0, 0.0), participant="a")
+    drive(rig, alone, steps=5)
+
+    def both(a: float, b: float, steps: int) -> None:
+        one = rig.source((a, 0.0, 0.0), participant="a", weight=0.5)
+        two = rig.source((9.0, b, 0.0), participant="b", weight=0.5)
+        drive(rig, one, two, steps=steps)
+
+    for _ in range(20):
+        both(0.0, 3.0, 5)
+    assert apart(start, rig.target())[0] < 1e-12
+    for _ in range(60):
+        both(0.1, 3.1, 7)
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, 0.05, 0.0), abs=1e-12)
+    for _ in range(60):
+        drive(rig, rig.source((9.0, 3.1, 0.0), participant="b"), steps=7)
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, 0.05, 0.0), abs=1e-12)
+
+
+def test_shared_twists_are_weighted() -> None:
+    rig = iiwa()
+    start = rig.target()
+    one = rig.source((0.0,) * 3, participant="a", pose_world=None, twist_world=(0.1, 0, 0, 0, 0, 0), weight=0.5)
+    two = rig.source((0.0,) * 3, participant="b", pose_world=None, twist_world=(0, -0.1, 0, 0, 0, 0), weight=0.5)
+    for _ in range(501):
+        rig.step(decision([Command("iiwa", "twist", sources=(one, two))]))
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.05, -0.05, 0.0), abs=2e-3)
+
+
+def test_changing_the_scale_while_engaged_does_not_jump() -> None:
+    rig = iiwa()
+    start = rig.target()
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    for _ in range(40):
+        drive(rig, rig.source((0.1, 0.0, 0.0)), steps=7)
+    for _ in range(40):
+        drive(rig, rig.source((0.1, 0.0, 0.0)), steps=7, scale=0.1)
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.1, 0.0, 0.0), abs=1e-9)
+    for _ in range(40):
+        drive(rig, rig.source((0.2, 0.0, 0.0)), steps=7, scale=0.1)
+    assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.11, 0.0, 0.0), abs=1e-9)
+
+
+def test_changing_the_kind_while_engaged_does_not_jump() -> None:
+    rig = iiwa()
+    for _ in range(60):
+        drive(rig, rig.source((0.05, 0.0, 0.0)), steps=7)
+    before = rig.data.ctrl.copy()
+    rig.step(decision([Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=IIWA_HOME),))]))
+    assert np.abs(rig.data.ctrl - before).max() < 1e-6
+
+
+def test_the_workspace_is_kept_and_reported() -> None:
+    tip = iiwa().target()[0]
+    box = ((-2.0, -2.0, tip[2] - 0.02), (2.0, 2.0, 2.0))
+    rig = iiwa(ControlConfig(workspaces={"iiwa": box}))
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    for _ in range(60):
+        drive(rig, rig.source((0.0, 0.0, -0.3)), steps=7)
+    assert rig.target()[0][2] == pytest.approx(tip[2] - 0.02)
+    assert rig.controller.status()[0].limits == ("workspace",)
+
+
+def test_reset_forgets_everything() -> None:
+    box = """<body name="box" pos="3 0 1"><freejoint/><geom size=".1"/></body>"""
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
+    arm = mujoco.MjSpec.from_file(str(__import__("tests.control.rigs", fromlist=["x"]).iiwa_path()))
+    body = arm.worldbody.add_body(name="box", pos=spec.body("box").pos)
+    body.add_freejoint()
+    body.add_geom(size=[0.1, 0, 0])
+    for key in list(arm.keys):
+        arm.delete(key)
+    rig = Rig(arm.compile(), [iiwa_spec()], objects=[ObjectSpec("box", "box")], home=IIWA_HOME)
+    grasp = (ObjectCommand("box", 1, Pose((3.0, 0.0, 1.5), (1.0, 0.0, 0.0, 0.0))),)
+    for k in range(60):
+        source = rig.source((0.002 * k, 0.0, 0.0))
+        rig.step(decision([pose_command("iiwa", source)], grasp))
+    assert rig.data.body("box").xfrc_applied.any()
+    assert rig.data.body("box").xpos[2] > 1.02
+    mujoco.mj_resetData(rig.model, rig.data)
+    mujoco.mj_forward(rig.model, rig.data)
+    rig.controller.reset(rig.data)
+    fresh = Rig(rig.model, [iiwa_spec()], objects=[ObjectSpec("box", "box")])
+    assert rig.controller.snapshot() == fresh.controller.snapshot()
+    assert rig.controller.status()[0].applied is None
+
+
+def test_a_robot_on_a_moving_base_reaches_world_targets() -> None:
+    arm = mujoco.MjSpec.from_file(str(__import__("tests.control.rigs", fromlist=["x"]).iiwa_path()))
+    for key in list(arm.keys):
+        arm.delete(key)
+    base = arm.body("base")
+    base.add_joint(name="rail", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+    rig = Rig(arm.compile(), [iiwa_spec()], home=IIWA_HOME)
+    goal = rig.target()
+    for k in range(700):
+        rig.data.joint("rail").qpos[:] = 0.0002 * k
+        rig.data.joint("rail").qvel[:] = 0.1
+        mujoco.mj_forward(rig.model, rig.data)
+        rig.step(decision([pose_command("iiwa", rig.source(*goal, absolute=True, new=k % 7 == 0))]))
+    state = rig.controller._states[0]
+    assert state.T_world_root[0][0] == pytest.approx(0.139, abs=2e-3)
+    assert apart(rig.controller._reach.tip(0, state), goal)[0] < 5e-3  # follows at 0.1 m/s
+
+
+def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mink", None)
+    with pytest.raises(ImportError, match=r"iris-session\[control\]"):
+        Controller(iiwa_model(), [iiwa_spec()])
+    rig = iiwa(TARGETS)
+    start, ctrl = rig.target(), rig.data.ctrl.copy()
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    assert rig.target() == start
+    drive(rig, rig.source((0.0, 0.3, 0.0), quat_from_rotvec((0.0, 0.0, 0.2))), steps=50)
+    assert rig.target()[0][1] - start[0][1] == pytest.approx(50 * 0.002 * 1.5)
+    drive(rig, rig.source((0.0, 0.3, 0.0), quat_from_rotvec((0.0, 0.0, 0.2))), steps=100)
+    assert rig.target()[0][1] - start[0][1] == pytest.approx(0.3)
+    assert apart(start, rig.target())[1] == pytest.approx(math.degrees(0.2))
+    applied = rig.controller.status()[0].applied
+    assert applied is not None
+    assert applied.seq == rig.seq
+    held = rig.target()
+    rig.hold(10)
+    assert rig.target() == held
+    for _ in range(251):
+        rig.step(decision([twist(rig, (0.0, 0.0, -0.2, 0.0, 0.0, 0.0), engagement=2)]))
+    assert rig.target()[0][2] - held[0][2] == pytest.approx(-0.1, abs=1e-3)
+    q = np.add(IIWA_HOME, 0.02)
+    rig.hold(1)
+    joints = Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, pose_world=None, q=tuple(q), engagement=3),))
+    for _ in range(400):
+        rig.step(decision([joints]))
+    data = mujoco.MjData(rig.model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(rig.model, data)
+    assert apart(site_pose(data, 0), rig.target())[0] < 1e-9
+    assert (rig.data.ctrl == ctrl).all()
+
+
+def test_a_snapshot_of_other_robots_is_refused() -> None:
+    two, one = Rig(aloha_model(), aloha_robots()), Rig(aloha_model(), aloha_robots()[:1])
+    with pytest.raises(ControlError, match="snapshot is of 1 robots with 6 joints; this controller has 2 with 12"):
+        two.controller.restore(one.controller.snapshot())
+    with pytest.raises(msgspec.DecodeError):
+        two.controller.restore(b"\x00")
+
+
+def test_no_robots_at_all() -> None:
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    data = mujoco.MjData(model)
+    controller = Controller(model, [])
+    controller.reset(data)
+    controller.begin(0, 1, decision([]), FixedView())
+    controller.tick(data)
+    assert controller.status() == ()
+    assert controller.targets() == {}
+    controller.restore(controller.snapshot())
+
+
+def test_a_robot_that_control_cannot_drive_is_refused_at_construction() -> None:
+    bare = RobotSpec("iiwa", iiwa_spec().joints, iiwa_spec().actuators, "attachment_site", "base")
+    with pytest.raises(ControlError, match="declare hold = 'gravity_pd'"):
+        Controller(iiwa_model("torque"), [bare])
