@@ -1,8 +1,9 @@
 """Errors of the recording room. Every text is one line for the person who reads it.
 
 RecordingError
- +-- RecorderError    the recorder process cannot start
- +-- NotARecordingError    the file cannot be read as a recording
+ +-- RecorderError        the recorder process cannot start
+ +-- WriteError           a file that was begun can no longer be written
+ +-- NotARecordingError   the file cannot be read as a recording
 """
 
 from __future__ import annotations
@@ -14,6 +15,10 @@ class RecordingError(Exception):
 
 class RecorderError(RecordingError):
     """The recorder cannot write where it was told to, or did not start."""
+
+
+class WriteError(RecordingError):
+    """The disk is full, or the file system refuses: the file is good up to an earlier write."""
 
 
 class NotARecordingError(RecordingError):

@@ -164,7 +164,7 @@ class RecorderFeed:
             return not self._window
         self.flush()
         waits = max(1, round(timeout_s / 0.02))
-        while waits and self._header and (self._window or self._spill) and not self._fault():
+        while waits and self._header and (self._window or self._spill):
             self._socket.poll(20)
             self._exchange()
             waits -= 1
@@ -225,6 +225,3 @@ class RecorderFeed:
             self._socket.send_multipart((messages.FRAME.pack(messages.HEADER, first), self._header), zmq.NOBLOCK)
             for number, body in self._window:
                 self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)
-
-    def _fault(self) -> str:
-        return self.stats.recorder.fault if self.stats.recorder else ""

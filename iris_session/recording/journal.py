@@ -111,6 +111,17 @@ def header_root(header: SessionHeader) -> bytes:
     return hashlib.blake2b(_encoder.encode(header), digest_size=HASH_BYTES).digest()
 
 
+def seal_blob(blob: bytes) -> bytes:
+    """`blob` behind its CRC-32 (4 bytes, little-endian)."""
+    return zlib.crc32(blob).to_bytes(4, "little") + blob
+
+
+def open_blob(sealed: bytes) -> tuple[bytes, bool]:
+    """The blob, and whether it is as `seal_blob` got it."""
+    blob = sealed[4:]
+    return blob, zlib.crc32(blob).to_bytes(4, "little") == sealed[:4]
+
+
 def pack_model(mjb: bytes) -> bytes:
     """Compresses a binary MuJoCo model for `SessionHeader.model`."""
     return zlib.compress(mjb, 6)

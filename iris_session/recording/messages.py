@@ -16,18 +16,27 @@ from iris_session.protocol.common import Applied, Count, Denial, Name, Nanosecon
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
+#: Begins the line on standard error that says why the recorder ended; other lines are Rerun's.
+FAULT_PREFIX: Final = "recorder: "
+#: Chunks after which a new part begins: about an hour. Rerun keeps some 4 KB in memory per chunk for a file's footer.
+PART_CHUNKS: Final = 100_000
+
 
 class RecorderConfig(msgspec.Struct, frozen=True):
-    """Configuration of the recorder process. `path`: the file of this part, must not exist. Endpoints: `ipc://` sockets
-    that it binds. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: process id that it outlives only to
-    finish the file."""
+    """Configuration of the recorder process.
+
+    `path`: the recording; `part`: which of its files to begin with, none of them may exist. Endpoints: `ipc://` sockets
+    that it binds. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: process that it outlives only to finish.
+    """
 
     path: str
+    part: int
     recording_id: str
     feed_endpoint: str
     samples_endpoint: str
     origin_ns: int
     parent: int
+    part_chunks: int = PART_CHUNKS
 
 
 HEADER: Final = b"H"

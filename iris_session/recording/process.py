@@ -19,9 +19,11 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.recording.errors import RecorderError
+from iris_session.recording.errors import RecorderError, WriteError
+from iris_session.recording.journal import SessionHeader
 from iris_session.recording.messages import (
     BATCH,
+    FAULT_PREFIX,
     FRAME,
     HEADER,
     RecorderConfig,
@@ -30,7 +32,8 @@ from iris_session.recording.messages import (
     decode_header,
     encode_status,
 )
-from iris_session.recording.writer import RrdWriter, WriteError
+from iris_session.recording.paths import part_path
+from iris_session.recording.writer import RrdWriter
 
 #: Sockets are drained at this period instead of at every message: one wake-up for some twenty messages.
 DRAIN_S: Final = 0.03
@@ -55,10 +58,9 @@ class Recorder:
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
         self._front = self._bind(zmq.PULL, config.samples_endpoint)
-        claim(Path(config.path))
-        self._writer = RrdWriter(config.path, config.recording_id)
-        self._writer.flush()
-        self._syncer = _Syncer(config.path)
+        self._part = config.part
+        self._begin_part()
+        self._header: SessionHeader | None = None
         self._instance = time.time_ns()
         self._expecting = -1
         self._received = -1
@@ -80,7 +82,7 @@ class Recorder:
         except WriteError as error:
             self._fault = str(error)
             self._say(-1)
-            sys.stderr.write(self._fault + "\n")
+            sys.stderr.write(f"{FAULT_PREFIX}{self._fault}\n")
             return 3
         finally:
             self._syncer.stop()
@@ -90,6 +92,25 @@ class Recorder:
     def stop(self) -> None:
         """Asks the loop to finish the file."""
         self._stopping = True
+
+    def _begin_part(self) -> None:
+        path = part_path(self._config.path, self._part)
+        claim(Path(path))
+        self._writer = RrdWriter(path, self._config.recording_id)
+        self._writer.flush()
+        self._syncer = _Syncer(path)
+
+    def _next_part(self) -> None:
+        """Goes on in a new file: each is whole, and Rerun's memory for the footer is bounded."""
+        self._writer.close()
+        self._syncer.stop()
+        self._part += 1
+        try:
+            self._begin_part()
+        except RecorderError as error:
+            raise WriteError(str(error)) from error
+        if self._header is not None:
+            self._writer.header(self._header)
 
     def _bind(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
@@ -115,6 +136,8 @@ class Recorder:
                 if n or now >= status_at:
                     status_at = now + STATUS_S
                     self._say(self._received)
+                if self._writer.chunks >= self._config.part_chunks:
+                    self._next_part()
 
     def _drain_all(self) -> None:
         until = time.monotonic() + FINISH_S
@@ -147,7 +170,8 @@ class Recorder:
             return
         kind, number = FRAME.unpack(frames[0])
         if kind == HEADER and self._expecting < 0:
-            self._writer.header(decode_header(frames[1]))
+            self._header = decode_header(frames[1])
+            self._writer.header(self._header)
             self._expecting = number
             self._received = number - 1
         elif kind == BATCH and number == self._expecting:
@@ -168,7 +192,7 @@ class Recorder:
         self._writer.add_sample(connection, receive_ns, sample)
 
     def _say(self, written: int) -> None:
-        size = os.stat(self._config.path).st_size
+        size = os.stat(self._writer.path).st_size
         status = RecorderStatus(
             self._instance,
             self._expecting,
@@ -217,12 +241,12 @@ class _Syncer:
 
 def claim(path: Path) -> None:
     """Creates the folder and the empty file. Raises `RecorderError`: no right, no space, or a file that exists."""
+    if path.exists():
+        raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
         free = os.statvfs(path.parent)
-    except FileExistsError:
-        raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file") from None
     except OSError as error:
         raise RecorderError(f"cannot record to {path}: {error.strerror or error}") from error
     if free.f_bavail * free.f_frsize < MIN_FREE_BYTES:
@@ -238,7 +262,7 @@ def main() -> int:
         recorder = Recorder(config)
     except (RecorderError, WriteError) as error:
         print(f"failed: {error}", flush=True)
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(f"{FAULT_PREFIX}{error}\n")
         return 1
     signal.signal(signal.SIGTERM, lambda *_: recorder.stop())
     print("ready", flush=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import zlib
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
@@ -23,11 +22,13 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, open_blob
 from iris_session.recording.messages import DenialRecord, decode_header
 
 _decode_event = msgspec.msgpack.Decoder(Event).decode
 _decode_denial = msgspec.msgpack.Decoder(DenialRecord).decode
+_decode_keyframe = msgspec.msgpack.Decoder(Keyframe).decode
+_decode_end = msgspec.msgpack.Decoder(tuple[int, bytes]).decode
 _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 _decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
 
@@ -60,8 +61,8 @@ class State(NamedTuple):
 class Recording:
     """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
 
-    `damage`: one line per thing that could not be read; it grows while reading. `finished`: every part was closed
-    in order, not killed.
+    `damage`: one line per thing that could not be read; it grows while reading. `end`: last step and its chain value
+    as the recorder noted when it closed the last part, None when it was killed.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -69,10 +70,15 @@ class Recording:
         self.files: list[str] = []
         self._readable: list[str] = []
         self.damage: list[str] = []
-        self.finished = True
         for path in files:
             self._add_part(path)
         self.header = self._header(files[0])
+        self.end = self._end()
+
+    @property
+    def finished(self) -> bool:
+        """False when the recorder was killed: the newest quarter of a second may be missing."""
+        return self.end is not None
 
     @classmethod
     def open(cls, path: str | Path) -> Recording:
@@ -98,7 +104,11 @@ class Recording:
 
     def keyframes(self) -> Iterator[Keyframe]:
         """The keyframes in order."""
-        return self._unique(paths.KEYFRAMES, _keyframes, lambda keyframe: keyframe.step)
+        return self._unique(
+            paths.KEYFRAMES,
+            lambda batch: map(_decode_keyframe, _values(batch, "keyframe")),
+            lambda keyframe: (keyframe.step, keyframe.chain),
+        )
 
     def states(self) -> Iterator[State]:
         """Poses of all bodies at the state rate, with presence and the applied samples."""
@@ -190,12 +200,10 @@ class Recording:
             found = rrd_file.scan(path)
             self.files.append(path)
             self._readable.append(path)
-            self.finished &= found.complete
             if found.good_bytes < found.size:
                 self._salvage(len(self.files) - 1)
         except NotARecordingError as error:
             self.damage.append(str(error))
-            self.finished = False
             if self.files and self.files[-1] == path:
                 self.files.pop()
                 self._readable.pop()
@@ -208,14 +216,20 @@ class Recording:
         self.damage += [f"{name}: {line}" for line in rrd_file.salvage(self.files[i], copy)]
         self._readable[i] = copy
 
+    def _end(self) -> tuple[int, bytes] | None:
+        for part, batch in self._batches(paths.END):
+            if part == len(self.files) - 1:
+                return _decode_end(_values(batch, "end")[0])
+        return None
+
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._batches(paths.HEADER):
-            blob = _values(batch, "blob")[0]
+            blob, intact = open_blob(_values(batch, "blob")[0])
             try:
                 header = decode_header(blob)
             except msgspec.DecodeError as error:
                 raise NotARecordingError(f"the header of {path} is damaged: {error}") from error
-            if zlib.crc32(blob) != _values(batch, "crc")[0]:
+            if not intact:
                 self.damage.append("header: its bytes were changed (checksum)")
             return header
         why = f" ({self.damage[0]})" if self.damage else ": nothing was recorded, or it is not ours"
@@ -239,16 +253,6 @@ def _rows(batch: Any) -> Iterator[JournalRow]:
         strict=True,
     )
     return (JournalRow(*values) for values in columns)
-
-
-def _keyframes(batch: Any) -> Iterator[Keyframe]:
-    columns = zip(
-        _index(batch, paths.STEP),
-        *(_values(batch, name) for name in ("plant", "authority", "controller", "status", "chain")),
-        map(tuple, batch.column("crcs").to_pylist()),
-        strict=True,
-    )
-    return (Keyframe(*values) for values in columns)
 
 
 def _states(batch: Any, n_bodies: int) -> Iterator[State]:

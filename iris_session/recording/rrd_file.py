@@ -18,7 +18,7 @@ from iris_session.recording.errors import NotARecordingError
 
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
-FILE_TAIL: Final = 32  # locates the end message from the end of the file
+FILE_TAIL: Final = 32  # after the end message of a file with a footer
 _HEAD: Final = struct.Struct("<QQ")
 KIND_END: Final = 0
 KIND_STORE_INFO: Final = 1
@@ -36,12 +36,11 @@ class Message(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """`good_bytes`: the file is whole up to here. `complete`: the file was finished (it has an end message)."""
+    """`good_bytes`: the file is whole up to here."""
 
     messages: list[Message]
     good_bytes: int
     size: int
-    complete: bool
 
 
 def scan(path: str | Path) -> Scan:
@@ -61,8 +60,8 @@ def scan(path: str | Path) -> Scan:
             at += _HEAD.size + length
             if kind == KIND_END:
                 break
-    complete = bool(found) and found[-1].kind == KIND_END and size - at == FILE_TAIL
-    return Scan(found, size if complete else at, size, complete)
+    has_footer = bool(found) and found[-1].kind == KIND_END and size - at == FILE_TAIL
+    return Scan(found, size if has_footer else at, size)
 
 
 def chunks(path: str | Path, entity: str) -> Iterator[Any]:

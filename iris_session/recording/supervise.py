@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 
 from iris_session.recording.errors import RecorderError
-from iris_session.recording.messages import RecorderConfig
+from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
 
 START_S: Final = 20.0
@@ -43,8 +43,11 @@ class RecorderProcess:
 
     @property
     def part_path(self) -> str:
-        """The file that is being written."""
-        return part_path(self.path, max(1, self.part))
+        """The newest file of the recording."""
+        part = max(1, self.part)
+        while os.path.exists(part_path(self.path, part + 1)):
+            part += 1
+        return part_path(self.path, part)
 
     @property
     def pid(self) -> int:
@@ -62,7 +65,7 @@ class RecorderProcess:
         if self._process is None or not (code := self._process.poll()):
             return ""
         how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
-        return f"the recorder ended ({how}): {_last_line(self._log) or 'no message'}"
+        return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}"
 
     def start(self) -> None:
         """Begins the recording and waits until it writes. Raises `RecorderError`: no right, no space, file exists."""
@@ -76,7 +79,7 @@ class RecorderProcess:
     def restart(self) -> None:
         """Begins the next part without waiting for it: look at `alive` and `failure` later, as after a crash."""
         self._end(0.0)
-        while os.path.exists(self.part_path):
+        while os.path.exists(part_path(self.path, self.part)):
             self.part += 1
         self._spawn()
 
@@ -88,7 +91,13 @@ class RecorderProcess:
 
     def _spawn(self) -> None:
         config = RecorderConfig(
-            self.part_path, self._recording_id, self.feed_endpoint, self.samples_endpoint, self._origin_ns, os.getpid()
+            self.path,
+            self.part,
+            self._recording_id,
+            self.feed_endpoint,
+            self.samples_endpoint,
+            self._origin_ns,
+            os.getpid(),
         )
         # RERUN=off in a user's shell would silence the stream.
         environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error"}
@@ -120,7 +129,7 @@ class RecorderProcess:
                     break
                 text += chunk
         line = text.decode(errors="replace").strip()
-        return line or f"the recorder did not start within {START_S:g} s: {_last_line(self._log) or 'no message'}"
+        return line or f"the recorder did not start within {START_S:g} s: {_reason(self._log) or 'no message'}"
 
     def _end(self, timeout_s: float) -> bool:
         process, self._process = self._process, None
@@ -138,9 +147,11 @@ class RecorderProcess:
         return clean
 
 
-def _last_line(log: Path) -> str:
+def _reason(log: Path) -> str:
+    """The recorder's own last word in its log, else the last line of it."""
     try:
         lines = log.read_text(errors="replace").strip().splitlines()
     except OSError:
         return ""
-    return lines[-1][:300] if lines else ""
+    own = [line.removeprefix(FAULT_PREFIX) for line in lines if line.startswith(FAULT_PREFIX)]
+    return (own or lines or [""])[-1][:300]

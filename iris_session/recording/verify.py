@@ -140,6 +140,7 @@ def verify(
                 progress(done, total)
         if progress is not None:
             progress(total, total)
+        run.end(recording.end)
         report.damage = list(recording.damage)
         report.finished = recording.finished
         report.problems += [Problem(run.last_step, "unreadable", "file", line) for line in recording.damage]
@@ -179,6 +180,16 @@ class _Run:
         self.last_step = row.step if problem is None or problem.field != "step" else expected
         self._simulate(row)
         self._meet_keyframe(self.last_step)
+
+    def end(self, mark: tuple[int, bytes] | None) -> None:
+        """Checks that the rows reach as far as the recorder noted at its end."""
+        if mark is None or not mark[1]:
+            return
+        if mark[0] > self.last_step:
+            self._gap(self.last_step + 1, mark[0])
+        elif self._chain is not None and mark != (self.last_step, self._chain):
+            text = f"the end mark names step {mark[0]}, the journal ends at step {self.last_step} or with another chain"
+            self._problem(Problem(self.last_step, "changed", "end", text))
 
     def _gap(self, first: int, last: int) -> None:
         if last < first:  # the same or an earlier step again: not a gap, but never what was written

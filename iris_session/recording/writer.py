@@ -22,7 +22,8 @@ from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import BodyInfo, Event
 from iris_session.recording import paths, scene
 from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
-from iris_session.recording.journal import SessionHeader, unpack_model
+from iris_session.recording.errors import WriteError
+from iris_session.recording.journal import SessionHeader, seal_blob, unpack_model
 from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame, encode_header
 from iris_session.recording.text import describe_denial, describe_event, describe_session
 
@@ -33,15 +34,12 @@ _encode = msgspec.msgpack.Encoder().encode
 _BATCHER = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
 
 
-class WriteError(Exception):
-    """The file can no longer be written. The text is one line."""
-
-
 class RrdWriter:
     """One file. `add` and `add_sample` only collect; `flush` writes and returns when the bytes are with the system."""
 
     def __init__(self, path: str | Path, recording_id: str) -> None:
         self.path = str(path)
+        self.chunks = 0
         self._rec = rr.RecordingStream(paths.APPLICATION, recording_id=recording_id, batcher_config=_BATCHER)
         self._rec.set_sinks(rr.FileSink(self.path))
         self._rec.send_blueprint(_blueprint())
@@ -51,15 +49,15 @@ class RrdWriter:
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
         self._last_poses: NDArray[np.float64] | None = None
+        self._newest_row = (-1, b"")
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._people: dict[str, tuple[int, int, int]] = {}
         self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
 
     def header(self, header: SessionHeader) -> None:
         """Writes the header and the scene. Must come before the first flush with data."""
-        blob = encode_header(header)
         self._rec.send_recording_name(header.session_name)
-        self._static(paths.HEADER, rr.AnyValues(blob=pa.array([blob], pa.binary()), crc=pa.array([zlib.crc32(blob)])))
+        self._static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
         self._bodies = header.bodies
         self._moving = np.array([i for i, body in enumerate(header.bodies) if body.moving], np.intp)
@@ -108,7 +106,10 @@ class RrdWriter:
             raise WriteError(f"{self.path} cannot be written: {' '.join(str(error).split())}") from error
 
     def close(self) -> None:
-        """Writes the rest and finishes the file."""
+        """Writes the rest and the end mark, and closes the file."""
+        self.flush()
+        step, chain = self._newest_row
+        self._static(paths.END, rr.AnyValues(end=pa.array([_encode((step, chain))], pa.binary())))
         self.flush()
         self._rec.disconnect()
 
@@ -116,6 +117,7 @@ class RrdWriter:
         self._rec.log(entity, *values, static=True, strict=True)
 
     def _send(self, entity: str, times: Sequence[Any], columns: Sequence[Any]) -> None:
+        self.chunks += 1
         rr.send_columns(entity, times, columns, recording=self._rec, strict=True)
 
     def _rows(self, batch: Batch) -> None:
@@ -138,14 +140,14 @@ class RrdWriter:
             nanoseconds(paths.SESSION_TIME, [row.now_ns for row in rows]),
         ]
         self._send(paths.ROWS, times, columns)
+        self._newest_row = (rows[-1].step, rows[-1].chain)
 
     def _keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
         if not frames:
             return
-        columns = [blobs(name, [getattr(k, name) for k in frames]) for name in _KEYFRAME_BLOBS]
-        columns.append(lists("crcs", [k.crcs for k in frames], pa.uint32()))
-        self._send(paths.KEYFRAMES, [sequence(paths.STEP, [k.step for k in frames])], columns)
+        times = [sequence(paths.STEP, [k.step for k in frames])]
+        self._send(paths.KEYFRAMES, times, [blobs("keyframe", [_encode(k) for k in frames])])
 
     def _states(self, states: list[StateFrame]) -> None:
         if not states:
@@ -253,9 +255,6 @@ class RrdWriter:
     def _moments(self, steps: list[int], session_times: list[int]) -> list[Any]:
         moments = [(step, *self._clock, now_ns) for step, now_ns in zip(steps, session_times, strict=True)]
         return _times(np.array(moments, np.int64).T)
-
-
-_KEYFRAME_BLOBS = ("plant", "authority", "controller", "status", "chain")
 
 
 def _times(times: NDArray[np.int64]) -> list[Any]:

@@ -1,0 +1,213 @@
+"""The recorder as a real process: what it writes, what a crash costs, how it ends and what it says when it cannot."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.recording import RecorderError, RecorderProcess, Recording, verify
+from iris_session.recording.paths import part_path
+from tests.recording.support import SmallCore, SmallSession, record, recorder, wait_until
+
+pytestmark = pytest.mark.e2e
+REPOSITORY = Path(__file__).parents[2]
+
+
+def test_everything_comes_back_exactly(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "session.rrd"
+    session = record(path, 300)
+    with Recording.open(path) as recording:
+        assert recording.header == session.header
+        assert recording.finished
+        assert recording.damage == []
+        assert [row.step for row in recording.rows()] == list(range(300))
+        assert [k.step for k in recording.keyframes()] == [-1, 99, 199, 299]
+        states = list(recording.states())
+        assert len(states) == len(session.poses)
+        assert all(np.array_equal(s.poses, p) for s, p in zip(states, session.poses, strict=True))
+        assert states[-1].presence[0].participant == "p1"
+        assert [event.body.text for event in recording.events()] == [f"event {50 * i}" for i in range(6)]
+        times, values = recording.metrics()["late_ms"]
+        assert values.tolist() == [step / 10 for step in range(300)]
+        assert times[-1] == 300 * 2_000_000
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.keyframes) == (300, 4)
+
+
+def test_rerun_itself_takes_the_file(tmp_path: Path) -> None:
+    record(tmp_path / "session.rrd", 100)
+    command = [Path(sys.executable).parent / "rerun", "rrd", "verify", tmp_path / "session.rrd"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+def test_raw_samples_of_the_front(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        SmallSession(feed).take(10)
+        with zmq.Context() as context, context.socket(zmq.PUSH) as front:
+            front.connect(process.samples_endpoint)
+            for i in range(50):
+                front.send(msgspec.msgpack.encode([3, 1000 + i, bytes([i, 255])]))
+            front.send(b"\xc1 no message")
+            wait_until(lambda: _status(feed).samples == 50 and _status(feed).samples_refused == 1)
+        assert feed.close()
+        assert process.close()
+    with Recording.open(path) as recording:
+        samples = list(recording.samples())
+    assert [s.receive_ns for s in samples] == list(range(1000, 1050))
+    assert samples[7].connection == 3
+    assert samples[7].data == bytes([7, 255])
+
+
+def test_a_killed_recorder_loses_no_row(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(150, pause_s=0.002)
+        wait_until(lambda: _status(feed).written >= 3)
+        os.kill(process.pid, signal.SIGKILL)
+        wait_until(lambda: not process.alive)
+        assert "signal 9" in process.failure
+        session.take(100, pause_s=0.002)
+        process.restart()
+        session.take(100, pause_s=0.002)
+        assert feed.close(20.0)
+        assert process.close()
+        assert feed.stats.recorders == 2
+        assert feed.stats.dropped_rows == 0
+    assert os.path.exists(part_path(str(path), 2))
+    report = verify(path, SmallCore)
+    assert report.parts == 2
+    assert report.steps == 350
+    assert not [p for p in report.problems if p.kind != "unreadable"], report.line()
+
+
+def test_a_killed_recorder_leaves_all_but_a_quarter_second(tmp_path: Path) -> None:
+    """Alone, without the part that comes after: what was handed over 0.25 s before the kill is in the file."""
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        began = time.monotonic()
+        stamps = []
+        while time.monotonic() - began < 1.5 or len(stamps) < 100:
+            session.take(1, pause_s=0.002)
+            stamps.append(time.monotonic())
+        os.kill(process.pid, signal.SIGKILL)
+        killed = time.monotonic()
+        wait_until(lambda: not process.alive)
+    with Recording.open(path) as recording:
+        last = list(recording.rows())[-1].step
+        assert not recording.finished
+    assert killed - stamps[last] <= 0.25 + _scheduling_slack()
+
+
+def test_the_file_is_finished_when_the_parent_dies(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    script = (
+        "import os, sys, time; from pathlib import Path; from tests.recording.support import *\n"
+        "r = recorder(Path(sys.argv[1])); process, feed = r.__enter__()\n"
+        "s = SmallSession(feed); s.take(200); \n"
+        "while feed.stats.recorder is None or feed.stats.recorder.expecting < 20: time.sleep(0.01); feed.flush()\n"
+        "print(process.pid, flush=True); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)], cwd=REPOSITORY, stdout=subprocess.PIPE, timeout=60, check=False
+    )
+    pid = int(done.stdout)
+    wait_until(lambda: not _exists(pid))
+    with Recording.open(path) as recording:
+        assert recording.finished
+        assert [row.step for row in recording.rows()] == list(range(200))
+
+
+def test_ctrl_c_does_not_end_the_recorder(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        os.kill(process.pid, signal.SIGINT)
+        session.take(100)
+        assert feed.close()
+        assert process.close()
+    assert verify(path, SmallCore).ok
+
+
+def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    path.write_bytes(b"something of yours")
+    process = RecorderProcess(path, 0)
+    with pytest.raises(RecorderError, match=r"exists.*choose another file"):
+        process.start()
+    assert path.read_bytes() == b"something of yours"
+    assert not process.alive
+
+
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    process = RecorderProcess(tmp_path / "file" / "session.rrd", 0)
+    with pytest.raises(RecorderError) as failure:
+        process.start()
+    assert "\n" not in str(failure.value)
+    assert "cannot record to" in str(failure.value)
+
+
+def test_a_full_disk_is_said_and_the_session_goes_on_elsewhere(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        wait_until(lambda: _status(feed).written >= 4)
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (path.stat().st_size + 1000,) * 2)
+        session.take(200, pause_s=0.002)
+        wait_until(lambda: not process.alive)
+        feed.flush()
+        assert "cannot be written" in _status(feed).fault
+        assert "cannot be written" in process.failure
+        process.restart()
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert report.steps == 300
+    assert not [p for p in report.problems if p.kind != "unreadable"], report.line()
+
+
+def _status(feed):  # type: ignore[no-untyped-def]
+    """The recorder's newest status, waited for."""
+    until = time.monotonic() + 20.0
+    feed.flush()
+    while feed.stats.recorder is None:
+        assert time.monotonic() < until, "the recorder says nothing"
+        time.sleep(0.01)
+        feed.flush()
+    return feed.stats.recorder
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # An orphan in a container may stay a zombie: nobody reaps it.
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def _scheduling_slack() -> float:
+    """How late this machine wakes a sleeper right now [s]: a busy one delays the recorder by as much, twice."""
+    worst = 0.0
+    for _ in range(20):
+        began = time.monotonic()
+        time.sleep(0.01)
+        worst = max(worst, time.monotonic() - began - 0.01)
+    return 2 * worst
