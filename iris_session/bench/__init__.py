@@ -1,1 +1,4 @@
-"""bench"""
+"""Benchmarks behind `iris-session bench`: separate processes, percentiles, one JSON object (`contract`).
+
+`state` and `input` run the authority here and its clients (`clients`) in other processes, at most four in each.
+"""

@@ -50,6 +50,7 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
         state_port=defaults.state_port if arguments.state_port is None else arguments.state_port,
         record=False if arguments.no_record else arguments.record or True,
         curve_key=arguments.curve_key,
+        curve_clients=arguments.curve_clients,
         authority=authority,
     )
 

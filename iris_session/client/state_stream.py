@@ -55,6 +55,8 @@ class StateCounters:
     malformed: int = 0
     unknown_topic: int = 0
     bytes_received: int = 0
+    rigid_messages: int = 0
+    rigid_bytes: int = 0  # topic, header and poses of those
     presence: int = 0
 
 
@@ -108,6 +110,8 @@ class StateStream:
                 except ProtocolError:
                     self.counters.malformed += 1
                     continue
+                self.counters.rigid_messages += 1
+                self.counters.rigid_bytes += sum(map(len, frames))
                 self.counters.superseded += newest is not None
                 newest = header, frames[2]
             elif frames[0] in (TOPIC_RIGID, TOPIC_PRESENCE):

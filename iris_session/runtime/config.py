@@ -25,7 +25,8 @@ class SessionConfig:
 
     `record`: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
     False records nothing. Port 0 takes any free one. `anchors`: `T_world_anchor` per anchor id. `curve_key`: file with
-    the server's CURVE secret key, required for any `host` that is not loopback. `keyframe_s`: distance of the
+    the server's CURVE secret key, required for any `host` that is not loopback; `curve_clients`: folder with the public
+    certificates of the clients that may connect. `keyframe_s`: distance of the
     recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes on without when refused.
     """
 
@@ -37,6 +38,7 @@ class SessionConfig:
     record: bool | str | Path = True
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
     curve_key: str = ""
+    curve_clients: str = ""
     keyframe_s: float = 5.0
     realtime: bool = True
     authority: AuthorityConfig = field(default_factory=AuthorityConfig)

@@ -106,6 +106,7 @@ class SessionProcesses:
             tick_period_ns=self._tick_period_ns,
             state_period_ns=self.state_period_ns,
             curve_secret_file=config.curve_key,
+            curve_clients_dir=config.curve_clients,
             anchors={name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()},
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
@@ -156,6 +157,14 @@ class SessionProcesses:
         if self.recorder is not None and not self.recorder.alive and self._recorder_watch.dead(now_ns):
             self.recorder.restart()
             stepper.post(Marker(request_id=0, text="the recorder process ended and was replaced"))
+
+    @property
+    def front_pid(self) -> int:
+        return 0 if self.front is None else self.front.pid
+
+    @property
+    def recorder_pid(self) -> int:
+        return 0 if self.recorder is None else self.recorder.pid
 
     def drops(self) -> dict[str, int]:
         """Everything that was not delivered, by reason."""

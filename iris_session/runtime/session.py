@@ -29,7 +29,7 @@ from typing import Final, Self
 import msgspec
 import mujoco
 
-from iris_session.physics import Pacer, find_objects, find_robots, load_model
+from iris_session.physics import Pacer, PacerStats, find_objects, find_robots, load_model
 from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage, ExternalReset
@@ -70,8 +70,8 @@ class Session:
         self.data = data
         self.robots = tuple(find_robots(self.model) if robots is None else robots)
         self.objects = tuple(find_objects(self.model) if objects is None else objects)
-        self._origin_ns = time.monotonic_ns()
-        self.clock = session_clock(self._origin_ns)
+        self.origin_ns = time.monotonic_ns()
+        self.clock = session_clock(self.origin_ns)
         self._processes: SessionProcesses | None = None
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
@@ -94,7 +94,7 @@ class Session:
     def start(self) -> None:
         """Opens the sockets and the recording. Called by `with`. Participants can connect from here on."""
         if self._processes is None:
-            self._processes = SessionProcesses(self.config, self.model, self.robots, self.objects, self._origin_ns)
+            self._processes = SessionProcesses(self.config, self.model, self.robots, self.objects, self.origin_ns)
             self._processes.start()
 
     def close(self) -> None:
@@ -257,6 +257,20 @@ class Session:
     def recent_events(self) -> list[Event]:
         """The newest events, oldest first (at most 200; the recording has them all)."""
         return [] if self._stepper is None else list(self._stepper.ledger.recent)
+
+    @property
+    def stepper(self) -> Stepper:
+        """The machinery behind this session, for benchmarks and tests; not part of the public API."""
+        return self._make_stepper(user_owned=self._user_loop is not None)
+
+    @property
+    def processes(self) -> SessionProcesses:
+        """Front and recorder, for benchmarks and tests; not part of the public API."""
+        return self._live()
+
+    def lateness(self) -> PacerStats | None:
+        """Accounting of ticks of the newest `run()`, None before it."""
+        return None if self._pacer is None else self._pacer.stats(self.clock())
 
     @property
     def address(self) -> str:

@@ -12,7 +12,7 @@ import msgspec
 
 from iris_session.client.session_state import SessionMirror
 from iris_session.protocol.common import Applied
-from iris_session.protocol.server_messages import Event, Handover, Snapshot
+from iris_session.protocol.server_messages import Event, Handover, SamplesRejected, Snapshot
 from iris_session.protocol.steps import ControlStatus, Decision
 
 if TYPE_CHECKING:
@@ -74,14 +74,24 @@ class SessionLedger:
         self.handovers: list[HandoverStatus] = []
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.applied: dict[str, Applied] = {}
+        #: Connection number -> participant id, newest connections included.
+        self.connections: dict[int, str] = {}
+        #: Samples not counted so far, by reason, as events tell (at most a second old).
+        self.rejected: dict[tuple[str, str, str], int] = {}
 
     def follow(self, decision: Decision, status: tuple[ControlStatus, ...]) -> None:
         """Takes over one step."""
+        for admitted in decision.admitted:
+            self.connections[admitted.connection] = admitted.participant_id
+        for dropped in decision.dropped:
+            self.connections.pop(dropped.connection, None)
         for event in decision.events:
             self.mirror.apply_event(event)
             self.recent.append(event)
-            if isinstance(event.body, Handover):
-                body = event.body
+            body = event.body
+            if isinstance(body, SamplesRejected):
+                self.rejected[body.participant, body.device, body.reason] = body.count
+            if isinstance(body, Handover):
                 self.handovers.append(
                     HandoverStatus(
                         body.object, body.giver, body.receiver, event.session_time * 1e-9, body.duration_ns * 1e-9
@@ -90,6 +100,10 @@ class SessionLedger:
         for robot in status:
             if robot.applied is not None:
                 self.applied[robot.robot] = robot.applied
+
+    def names(self) -> dict[str, str]:
+        """Participant id -> name."""
+        return {info.id: info.name for info in self.mirror.participants.values()}
 
     def participants(self) -> tuple[ParticipantStatus, ...]:
         """The roster with what each participant holds."""

@@ -93,6 +93,9 @@ class Stepper:
         self._next_keyframe_ns = 0
         self._chain = chain
         self.ledger = SessionLedger()
+        #: Called with what was published, and with the entries of every step: for measurements and tests.
+        self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
+        self.on_entries: Callable[[Sequence[Entry]], None] | None = None
         self._last_now_ns = -1
         self._poses = np.zeros((len(core.world.bodies), 7))
 
@@ -116,6 +119,8 @@ class Stepper:
             self._keyframe(now_ns)
         self._last_now_ns = now_ns
         outcome = self.core.step(now_ns, entries, n_ticks, plant)
+        if self.on_entries is not None:
+            self.on_entries(entries)
         if outcome.diverged and (self.last is None or not self.last.diverged):
             self.post(Control(request_id=0, action="pause"))
             self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
@@ -152,6 +157,8 @@ class Stepper:
             decision.scene_epoch, decision.scene_revision, tick, sim_time, end_ns, 0, 0, 0, applied
         )  # fmt: skip
         self.front.send_state(header, self._poses)
+        if self.on_state is not None:
+            self.on_state(header, self._poses)
         if self.recorder is not None:
             self.recorder.state(self.step_count, tick, sim_time, end_ns, self._poses, applied)
 

@@ -1,0 +1,253 @@
+"""What `state` and `input` share: a session in this process, clients in others, one measured window."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import mujoco
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from iris_session.bench.clients import ClientJob, Job
+from iris_session.physics import PacerStats
+from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.server_messages import StateHeader
+from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.session import Session
+
+#: DESIGN section 11: at most four clients in one process.
+CLIENTS_PER_PROCESS: Final = 4
+WARM_UP_S: Final = 3.0
+Log = dict[str, NDArray[Any]]
+
+
+@dataclass
+class Measured:
+    """One window. `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
+    session time of receipt. `logs`: by client name."""
+
+    seconds: float
+    stats: PacerStats
+    cpu_share: float
+    logs: dict[str, Log]
+    scheduling: str
+    truth: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    received: dict[tuple[int, str], list[tuple[int, int]]] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    connections: dict[str, int] = field(default_factory=dict)
+    drops: dict[str, int] = field(default_factory=dict)
+
+
+class _ClientProcess:
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "iris_session.bench.clients"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(msgspec.json.encode(job) + b"\n")
+        self._process.stdin.flush()
+        os.set_blocking(self._process.stdout.fileno(), False)
+
+    def ready(self) -> bool:
+        """True once its clients have joined. Raises when it died."""
+        assert self._process.stdout is not None
+        if self._process.poll() is not None:
+            raise RuntimeError(f"a client process ended with status {self._process.returncode} before it was ready")
+        return (self._process.stdout.read(6) or b"").startswith(b"ready")
+
+    def window(self, begin_ns: int, end_ns: int) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{begin_ns} {end_ns}\n".encode())
+        self._process.stdin.flush()
+
+    def result(self) -> dict[str, Log]:
+        """The logs by client name, once the process has ended."""
+        if self._process.wait(60.0) != 0:
+            raise RuntimeError(f"a client process failed with status {self._process.returncode}")
+        with np.load(self.job.log) as columns:
+            logs: dict[str, Log] = {}
+            for key in columns.files:
+                name, column = key.rsplit(".", 1)
+                logs.setdefault(name, {})[column] = columns[key]
+        return logs
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        if self.running:
+            self._process.kill()
+        self._process.wait()
+
+
+def measure(
+    model: mujoco.MjModel,
+    specs: Sequence[ClientJob],
+    seconds: float,
+    *,
+    keep_poses: bool = False,
+    curve: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Measured:
+    """Runs a session over `model` with `specs` as clients and measures `seconds` of it, warm-up excluded."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
+        keys = _keys(folder) if curve else None
+        config = SessionConfig(
+            name="bench",
+            control_port=0,
+            state_port=0,
+            record=False,
+            curve_key="" if keys is None else keys["server_file"],
+            curve_clients="" if keys is None else str(folder / "clients"),
+        )
+        session = stack.enter_context(Session(model, config=config))
+        processes = []
+        for i in range(0, len(specs), CLIENTS_PER_PROCESS):
+            job = Job(
+                session.address,
+                session.origin_ns,
+                str(folder / f"log{i}.npz"),
+                tuple(specs[i : i + CLIENTS_PER_PROCESS]),
+                keep_poses,
+                **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
+            )
+            process = _ClientProcess(job)
+            stack.callback(process.kill)
+            processes.append(process)
+        return _run(session, processes, seconds, keep_poses, progress)
+
+
+def _run(
+    session: Session,
+    processes: list[_ClientProcess],
+    seconds: float,
+    keep_poses: bool,
+    progress: Callable[[str], None],
+) -> Measured:
+    waiting = list(processes)
+    progress(f"waiting for {len(processes)} client processes")
+    session.run(seconds=60.0, until=_every(0.05, session.clock, lambda: _all_ready(waiting)))
+    if waiting:
+        raise RuntimeError("the clients did not join within 60 s")
+    progress("warm-up")
+    with _quiet_collector():
+        session.run(seconds=WARM_UP_S)
+        begin = session.clock() + 50_000_000
+        end = begin + round(seconds * 1e9)
+        for process in processes:
+            process.window(begin, end)
+        truth: dict[int, NDArray[np.float64]] = {}
+        received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+        if keep_poses:
+            session.stepper.on_state = lambda header, poses: _keep(truth, header, poses)
+        session.stepper.on_entries = lambda entries: _note(received, entries)
+        cpu = _cpu(session)
+        connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
+        progress(f"measuring {seconds:g} s")
+        session.run(seconds=(end - session.clock()) * 1e-9)
+        cpu_share = (_cpu(session) - cpu) / seconds
+        stats = session.lateness()
+        session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    logs = {name: log for process in processes for name, log in process.result().items()}
+    status = session.status()
+    assert stats is not None
+    ledger = session.stepper.ledger
+    return Measured(
+        seconds,
+        stats,
+        cpu_share,
+        logs,
+        status.scheduling,
+        truth,
+        received,
+        {"/".join(key): count for key, count in ledger.rejected.items()},
+        {names[p]: c for c, p in connections.items()},
+        status.drops,
+    )
+
+
+def _all_ready(waiting: list[_ClientProcess]) -> bool:
+    waiting[:] = [process for process in waiting if not process.ready()]
+    return not waiting
+
+
+def _every(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
+    """`check` at most every `period_s`: it must not disturb the ticks that are measured."""
+    due = 0
+
+    def until() -> bool:
+        nonlocal due
+        now = clock()
+        if now < due:
+            return False
+        due = now + round(period_s * 1e9)
+        return check()
+
+    return until
+
+
+@contextlib.contextmanager
+def _quiet_collector() -> Iterator[None]:
+    """As in `iris-session serve`: what exists now is not looked at again by the garbage collector."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+def _keep(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:
+    truth[header.tick] = poses.copy()
+
+
+def _note(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Sequence[Entry]) -> None:
+    for entry in entries:
+        if isinstance(entry.message, Sample):
+            key = (entry.connection, entry.message.device)
+            received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
+
+
+def _cpu(session: Session) -> float:
+    """CPU seconds of authority and front so far."""
+    total = 0.0
+    for pid in (os.getpid(), session.processes.front_pid):
+        times = psutil.Process(pid).cpu_times()
+        total += times.user + times.system
+    return total
+
+
+def _keys(folder: Path) -> dict[str, str]:
+    """A server and a client certificate in `folder`, as an installation would have them."""
+    import zmq.auth
+
+    (folder / "clients").mkdir()
+    _, server_secret = zmq.auth.create_certificates(folder, "server")
+    client_public, client_secret = zmq.auth.create_certificates(folder, "client")
+    Path(client_public).rename(folder / "clients" / "client.key")
+    os.chmod(server_secret, 0o600)
+    server_public, _ = zmq.auth.load_certificate(server_secret)
+    public, secret = zmq.auth.load_certificate(client_secret)
+    assert secret is not None
+    return {
+        "server_file": server_secret,
+        "server_public": server_public.decode(),
+        "public": public.decode(),
+        "secret": secret.decode(),
+    }

@@ -1,0 +1,182 @@
+"""Benchmark clients: up to four real clients in one process, which log what they were handed and when.
+
+    python -m iris_session.bench.clients < job.json
+
+Prints `ready`, reads `begin end` (session time in ns), runs through that window, writes its log as one .npz file.
+Ages use the session's own clock (one machine, CLOCK_MONOTONIC), not the clients' estimate of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import selectors
+import sys
+import time
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from anchors.pose import PoseTuple
+from iris_session.client import Client, CurveKeys, SceneState, wait_any
+from iris_session.protocol.common import Applied
+from iris_session.protocol.names import Device
+
+SAMPLE_NS: Final = round(1e9 / 72.0)
+DEVICES: Final = (Device.HEAD, Device.CONTROLLER_LEFT, Device.CONTROLLER_RIGHT)
+#: Log entries per client; two minutes at 60 Hz.
+MAX_FRAMES: Final = 8192
+JOIN_S: Final = 30.0
+
+
+class ClientJob(msgspec.Struct, frozen=True):
+    """One client. `robot`: drives it with the right controller. `samples`: sends 3 devices x 72 Hz."""
+
+    name: str
+    role: str
+    robot: str = ""
+    samples: bool = False
+
+
+class Job(msgspec.Struct, frozen=True):
+    """What one process does. `keep_poses`: log every decoded pose of every frame. Keys: Z85 text, empty: plain."""
+
+    address: str
+    origin_ns: int
+    log: str
+    clients: tuple[ClientJob, ...]
+    keep_poses: bool = False
+    server_public: str = ""
+    public: str = ""
+    secret: str = ""
+
+
+class BenchClient:
+    """One client with its log."""
+
+    def __init__(self, job: Job, spec: ClientJob, index: int) -> None:
+        self.spec = spec
+        self._job = job
+        curve = None
+        if job.server_public:
+            curve = CurveKeys(job.server_public.encode(), job.public.encode(), job.secret.encode())
+        devices = DEVICES if spec.samples else ()
+        self.client = Client(
+            job.address,
+            role=spec.role,
+            name=spec.name,
+            devices=devices,
+            alignment="not_needed",
+            curve=curve,
+            on_state=self._on_state,
+        )
+        self.recording = False
+        self.ticks: list[int] = []
+        self.handed_ns: list[int] = []
+        self.state_ns: list[int] = []
+        self.applied_seq: list[int] = []
+        self.poses: list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = []
+        self.sent = 0
+        self.overflow = 0
+        self._phase = 0.7 * index
+        self._next_ns = 0
+        self._open_samples = 5
+
+    def _on_state(self, state: SceneState) -> None:
+        if not self.recording:
+            return
+        if len(self.ticks) >= MAX_FRAMES:
+            self.overflow += 1
+            return
+        self.handed_ns.append(time.monotonic_ns() - self._job.origin_ns)
+        self.ticks.append(state.header.tick)
+        self.state_ns.append(state.header.session_time)
+        self.applied_seq.append(_seq_of(state.header.applied, self.spec.robot))
+        if self._job.keep_poses:
+            self.poses.append(state.poses)
+
+    def join(self) -> None:
+        """Connects, and takes the robot if there is one to take."""
+        self.client.connect(JOIN_S)
+        if self.spec.robot:
+            self.client.acquire([self.spec.robot])
+
+    def step(self, now_ns: int) -> None:
+        """Sends one sample of each device when it is time."""
+        if not self.spec.samples or now_ns < self._next_ns:
+            return
+        self._next_ns = max(self._next_ns + SAMPLE_NS, now_ns - SAMPLE_NS) if self._next_ns else now_ns + SAMPLE_NS
+        t = now_ns * 1e-9
+        for i, device in enumerate(DEVICES):
+            robots = [self.spec.robot] if self.spec.robot and device == Device.CONTROLLER_RIGHT else []
+            clutch = bool(robots) and self._open_samples == 0
+            self.sent += self.client.send_sample(device, self._pose(t, i), robots=robots, clutch=clutch)
+        self._open_samples = max(0, self._open_samples - 1)
+
+    def _pose(self, t: float, device: int) -> PoseTuple:
+        """A slow circle of 3 cm radius, so that inverse kinematics has work to do all the time."""
+        angle = 2.0 * math.pi * 0.25 * t + self._phase
+        return ((0.03 * math.cos(angle), 0.03 * math.sin(angle), 1.0 + 0.1 * device), (1.0, 0.0, 0.0, 0.0))
+
+    @property
+    def next_ns(self) -> int:
+        return self._next_ns if self.spec.samples else 2**63 - 1
+
+
+def _seq_of(applied: tuple[Applied, ...], robot: str) -> int:
+    return next((a.seq for a in applied if a.robot == robot), -1) if robot else -1
+
+
+def run(job: Job) -> None:
+    """Joins, waits for the window, measures, writes the log."""
+    clients = [BenchClient(job, spec, i) for i, spec in enumerate(job.clients)]
+    for client in clients:
+        client.join()
+    gc.collect()
+    gc.freeze()
+    print("ready", flush=True)
+    selector = selectors.DefaultSelector()
+    selector.register(sys.stdin, selectors.EVENT_READ)
+    begin = end = 0
+    while not end or _now(job) < end:
+        now = _now(job)
+        if not end and selector.select(0):
+            begin, end = map(int, sys.stdin.readline().split())
+        recording = bool(end) and begin <= now < end
+        for client in clients:
+            client.recording = recording
+            client.step(now)
+            client.client.poll(0.0)
+        wake = min(now + 20_000_000, *(c.next_ns for c in clients))
+        wait_any([c.client for c in clients], max(0.0, (wake - _now(job)) * 1e-9))
+    _write(job, clients)
+    for client in clients:
+        with contextlib.suppress(Exception):  # the session may have ended first
+            client.client.close()
+
+
+def _now(job: Job) -> int:
+    return time.monotonic_ns() - job.origin_ns
+
+
+def _write(job: Job, clients: list[BenchClient]) -> None:
+    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.int64 | np.float64]]] = {}
+    for client in clients:
+        name = client.spec.name
+        counters = client.client.connection.stream.counters
+        columns[f"{name}.ticks"] = np.array(client.ticks, np.int64)
+        columns[f"{name}.handed_ns"] = np.array(client.handed_ns, np.int64)
+        columns[f"{name}.state_ns"] = np.array(client.state_ns, np.int64)
+        columns[f"{name}.applied_seq"] = np.array(client.applied_seq, np.int64)
+        columns[f"{name}.counts"] = np.array(
+            [client.sent, client.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes], np.int64
+        )
+        if job.keep_poses:
+            columns[f"{name}.poses"] = np.array(client.poses)
+    np.savez(job.log, allow_pickle=False, **columns)
+
+
+if __name__ == "__main__":
+    run(msgspec.json.decode(sys.stdin.readline(), type=Job))

@@ -1,0 +1,78 @@
+"""`bench input`: from a sample's arrival to the first state frame, in its sender's hands, that shows it applied."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from iris_session.bench.arena import Measured, measure
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.contract import BenchReport, bar
+from iris_session.physics.scenes import n_arms_scene
+from iris_session.physics.scenes.generators import arm_names
+from iris_session.protocol.names import Device
+
+STATE_BAR_MS = 3.0
+STATE_PERIOD_MS = 1e3 / 60.0
+
+
+def run_input(
+    operators: int = 8,
+    robots: int = 8,
+    observers: int = 8,
+    seconds: float = 20.0,
+    curve: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """`operators` drive one arm each (3 devices x 72 Hz), `observers` look on, 500 Hz physics."""
+    model = n_arms_scene(robots).compile()
+    arms = arm_names(robots)
+    specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
+    specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
+    got = measure(model, specs, seconds, curve=curve, progress=progress)
+    responses = response_ms(got, [spec.name for spec in specs if spec.robot])
+    tick_ms = model.opt.timestep * 1e3
+    received = sum(map(len, got.received.values()))
+    results: dict[str, Any] = {
+        "response_ms_p50": round(float(np.percentile(responses, 50)), 3) if len(responses) else float("inf"),
+        "response_ms_p99": round(float(np.percentile(responses, 99)), 3) if len(responses) else float("inf"),
+        "samples_followed": len(responses),
+        "late_tick_share": round(got.stats.late_share, 6),
+        "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
+        "ticks": got.stats.ticks,
+        "samples_per_s": round(received / got.seconds, 1),
+        "rejected": got.rejected,
+        "server_cpu_share": round(got.cpu_share, 3),
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+    bound = 2.0 * tick_ms + STATE_PERIOD_MS + (6.0 if curve else STATE_BAR_MS)
+    sent = 3 * 72.0 * operators
+    bars = [
+        bar(results, "response_ms_p99", "<=", round(bound, 3)),
+        bar(results, "late_tick_share", "<", 0.001),
+        bar(results, "samples_per_s", ">=", 0.98 * sent),
+        bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
+    ]
+    params = {"operators": operators, "robots": robots, "observers": observers, "seconds": seconds, "curve": curve}
+    return BenchReport("input", params, results, tuple(bars))
+
+
+def response_ms(got: Measured, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """For every sample of a driving device: handed-out time of the first frame whose `applied` has it or a newer one,
+    minus its receipt. Samples of the last half second, whose frame may come after the window, are left out."""
+    out: list[np.ndarray[Any, np.dtype[np.float64]]] = []
+    for name in names:
+        log = got.logs[name]
+        samples = got.received.get((got.connections[name], Device.CONTROLLER_RIGHT), [])
+        if not samples or not len(log["handed_ns"]):
+            continue
+        table = np.array(samples, np.int64)
+        end_ns = int(log["handed_ns"][-1])
+        table = table[(table[:, 1] >= log["handed_ns"][0]) & (table[:, 1] < end_ns - 500_000_000)]
+        first = np.searchsorted(np.maximum.accumulate(log["applied_seq"]), table[:, 0])
+        shown = first < len(log["handed_ns"])
+        out.append((log["handed_ns"][first[shown]] - table[shown, 1]) * 1e-6)
+    return np.concatenate(out) if out else np.zeros(0)

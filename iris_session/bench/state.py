@@ -1,0 +1,79 @@
+"""`bench state`: how old the rigid state is when a client's application gets it, how exact, and how many bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from iris_session.bench.arena import Measured, measure
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.contract import BenchReport, bar
+from iris_session.physics.scenes import free_bodies_scene
+
+#: DESIGN section 11: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
+SENDERS = 8
+
+
+def run_state(
+    clients: int = 16,
+    bodies: int = 300,
+    seconds: float = 20.0,
+    seed: int = 0,
+    curve: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """`bodies` free bodies in motion without contact, `clients` observers, 60 Hz."""
+    model = free_bodies_scene(bodies, seed).compile()
+    specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
+    got = measure(model, specs, seconds, keep_poses=True, curve=curve, progress=progress)
+    progress("comparing every delivered frame with the state at its tick")
+    ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
+    position_mm, rotation_deg = errors(got)
+    messages = sum(int(log["counts"][3]) for log in got.logs.values())
+    total = sum(int(log["counts"][4]) for log in got.logs.values())
+    results: dict[str, Any] = {
+        "delivered_hz_min": round(min(len(log["ticks"]) for log in got.logs.values()) / got.seconds, 2),
+        "age_ms_p50": round(float(np.percentile(ages, 50)), 3),
+        "age_ms_p95": round(float(np.percentile(ages, 95)), 3),
+        "age_ms_p99": round(float(np.percentile(ages, 99)), 3),
+        "bytes_per_frame": round(total / messages, 1),
+        "bytes_per_body": round(total / messages / bodies, 2),
+        "max_position_error_mm": round(position_mm, 5),
+        "max_rotation_error_deg": round(rotation_deg, 5),
+        "server_cpu_share": round(got.cpu_share, 3),
+        "late_tick_share": round(got.stats.late_share, 6),
+        "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
+        "ticks": got.stats.ticks,
+        "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+    bars = [
+        bar(results, "age_ms_p99", "<=", 6.0 if curve else 3.0),
+        bar(results, "late_tick_share", "<", 0.001),
+        bar(results, "max_position_error_mm", "<=", 0.1),
+        bar(results, "max_rotation_error_deg", "<=", 0.05),
+        bar(results, "bytes_per_frame", "<=", 3800.0 * bodies / 300.0),
+        bar(results, "delivered_hz_min", ">=", 59.0),
+    ]
+    params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}
+    return BenchReport("state", params, results, tuple(bars))
+
+
+def errors(got: Measured) -> tuple[float, float]:
+    """Worst position [mm] and rotation [deg] error over all bodies of every delivered frame of every client."""
+    position = rotation = 0.0
+    for log in got.logs.values():
+        for tick, poses in zip(log["ticks"], log["poses"], strict=True):
+            truth = got.truth[int(tick)]
+            position = max(position, float(np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()))
+            rotation = max(rotation, _worst_angle(poses[:, 3:], truth[:, 3:]))
+    return position * 1e3, float(np.degrees(rotation))
+
+
+def _worst_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
+    """Largest angle between two sets of unit quaternions (n, 4); by the chord, which keeps digits near zero."""
+    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return float(4.0 * np.arcsin(np.minimum(chord.max() / 2.0, 1.0)))
