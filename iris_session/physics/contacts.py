@@ -63,7 +63,8 @@ class ContactTables:
         self._object_names = tuple(spec.name for spec in objects)
         self._last_keys = b""
         self._last_contacts: tuple[ObjectContact, ...] = ()
-        self.has_fingers = bool((geom_finger_robot >= 0).any())
+        self._has_fingers = bool((geom_finger_robot >= 0).any())
+        self._no_forces = (0.0,) * len(robots)
 
     def object_contacts(self, data: Any) -> tuple[ObjectContact, ...]:
         """Objects that touch anything, in the order of the objects; names within in the order of ids."""
@@ -123,15 +124,15 @@ class ContactTables:
         Only valid between `mj_step2` (or `mj_forward`) and the next `mj_step1`. A contact between two fingers of one
         robot counts once.
         """
-        forces = [0.0] * len(self._robot_names)
-        if not data.ncon or not self.has_fingers:
-            return tuple(forces)
+        if not data.ncon or not self._has_fingers:
+            return self._no_forces
         contact = data.contact
         robots = self._geom_finger_robot[contact.geom]
+        if robots.max() < 0:
+            return self._no_forces
         address = contact.efc_address
         rows = np.nonzero((robots.max(axis=1) >= 0) & (address >= 0))[0]
-        if not len(rows):
-            return tuple(forces)
+        forces = list(self._no_forces)
         efc_force = data.efc_force
         pyramidal = int(model.opt.cone) == _PYRAMIDAL
         dims = contact.dim[rows]

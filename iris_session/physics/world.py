@@ -195,7 +195,6 @@ class World:
         mujoco.mj_setState(model, data, self._state, STATE)
         mujoco.mj_forward(model, data)
         self._forces = self._tables.gripper_forces(model, data)
-        mujoco.mj_setState(model, data, self._state, STATE)  # mj_forward moved the solver's warm start
         self._set_tick(tick)
         self._shown_state = self._state.tobytes()
 
