@@ -195,7 +195,9 @@ def _type(node: msgspec.inspect.Type) -> Type:
         case msgspec.inspect.BytesType():
             return Type("bytes", max_length=node.max_length or 0)
         case msgspec.inspect.TupleType():
-            return Type("array", item=_type(node.item_types[0]), length=len(node.item_types))
+            items = [_type(item) for item in node.item_types]
+            if items.count(items[0]) == len(items):
+                return Type("array", item=items[0], length=len(items))
         case msgspec.inspect.VarTupleType():
             return Type("array", item=_type(node.item_type), max_length=node.max_length or 0)
         case msgspec.inspect.DictType():
@@ -204,7 +206,9 @@ def _type(node: msgspec.inspect.Type) -> Type:
             return Type("struct", name=node.cls.__name__)
         case msgspec.inspect.UnionType():
             return _union(node)
-    raise TypeError(f"{node} has no form in the schema: use bool, int, float, str, bytes, tuple, dict or a Struct")
+    raise TypeError(
+        f"{node} has no form in the schema: use bool, int, float, str, bytes, dict, a Struct or a tuple of one type"
+    )
 
 
 def _union(node: msgspec.inspect.UnionType) -> Type:

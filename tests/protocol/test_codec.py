@@ -1,0 +1,262 @@
+"""The trust boundary: round trips, and bytes of strangers end in a typed error, never in another one."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.protocol import codec
+from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, envelope
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.errors import MAX_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
+from iris_session.protocol.generate.examples import extreme, full, least
+from iris_session.protocol.limits import LIMITS, MAX_CLIENT_BYTES, MAX_SERVER_BYTES
+from iris_session.protocol.server_messages import Beacon, Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
+
+pack = msgspec.msgpack.encode
+MAKES = (full, least, extreme)
+BYE = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
+
+
+@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("tag", codec.CLIENT_TYPES)
+def test_client_messages_round_trip(tag: str, make: object) -> None:
+    value = envelope(make(codec.CLIENT_TYPES[tag]), 3)  # type: ignore[operator]
+    data = codec.encode_client(value)
+    assert codec.decode_client(data) == value
+    assert codec.encode_client(codec.decode_client(memoryview(data))) == data
+
+
+@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("tag", codec.SERVER_TYPES)
+def test_server_messages_round_trip(tag: str, make: object) -> None:
+    value = ServerEnvelope(1, 3, make(codec.SERVER_TYPES[tag]))  # type: ignore[operator]
+    data = codec.encode_server(value)
+    assert codec.decode_server(data) == value
+    assert codec.encode_server(codec.decode_server(bytearray(data))) == data
+
+
+@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("tag", codec.EVENT_TYPES)
+def test_events_round_trip(tag: str, make: object) -> None:
+    value = ServerEnvelope(1, 3, Event(1, 2, 3, make(codec.EVENT_TYPES[tag])))  # type: ignore[operator]
+    assert codec.decode_server(codec.encode_server(value)) == value
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_state_channel_round_trips(make: object) -> None:
+    header, presence = make(StateHeader), make(Presence)  # type: ignore[operator]
+    assert codec.decode_state_header(codec.encode_state_header(header)) == header
+    assert codec.decode_presence(codec.encode_presence(presence)) == presence
+
+
+def test_beacon_round_trips() -> None:
+    beacon = msgspec.structs.replace(full(Beacon), protocol=1)
+    assert codec.decode_beacon(codec.encode_beacon(beacon)) == beacon
+
+
+def test_non_finite_floats_pass_to_the_authority() -> None:
+    pose = Pose((math.nan, math.inf, -math.inf), (1.0, 0.0, 0.0, 0.0))
+    decoded = codec.decode_client(codec.encode_client(envelope(Sample("head", "pose", 1, 2, 3, 4, 5, pose=pose))))
+    assert isinstance(decoded.message, Sample)
+    assert decoded.message.pose is not None
+    assert math.isnan(decoded.message.pose.p[0])
+    assert decoded.message.pose.p[1:] == (math.inf, -math.inf)
+
+
+def test_unknown_names_and_fields_pass() -> None:
+    data = pack([1, 0, "", {"type": "hello", "role": "juggler", "name": "A", "hat": {"colour": [1, 2]}}, "more"])
+    assert codec.decode_client(data).message == Hello(role="juggler", name="A")
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"", "truncated"),
+        (b"\xc1", "no envelope"),
+        (pack({"version": 1}), "expected a MessagePack array"),
+        (pack("hello"), "expected a MessagePack array"),
+        (pack([]), "no envelope"),
+        (pack([1.5, 0, "", {"type": "bye"}]), "no envelope"),
+        (pack([1, 0, ""]), "length 4"),
+        (pack([1, 0, "", 5]), "Expected `object`, got `int`"),
+        (pack([1, 0, "", {"type": "teleport"}]), "unknown message type 'teleport', expected one of hello, bye"),
+        (pack([1, 0, "", {"type": "welcome"}]), "unknown message type 'welcome'"),
+        (pack([1, 0, "", {"reason": "x"}]), "missing required field `type`"),
+        (pack([1, 0, "", {"type": 7}]), r"Expected `str`, got `int` - at `\$\[3\].type`"),
+        (pack([1, 0, "", {"type": "clock_ping"}]), "clock_ping: Object missing required field `t0_ns`"),
+        (pack([1, 0, "", {"type": "clock_ping", "t0_ns": 1.5}]), "Expected `int`, got `float`"),
+        (pack([1, 0, "", {"type": "clock_ping", "t0_ns": 2**63}]), "<= 9223372036854775807"),
+        (pack([1, -1, "", {"type": "bye"}]), ">= 0"),
+        (pack([1, 2**64 - 1, "", {"type": "bye"}]), "<= 9223372036854775807"),
+        (pack([1, 0, "x" * 65, {"type": "bye"}]), "length <= 64"),
+        (pack([1, 0, "", {"type": "bye", "reason": b"x"}]), "Expected `str`, got `bytes`"),
+        (pack([1, 0, "", {"type": "acquire", "request_id": 1, "robots": ["r"] * 33}]), "length <= 32"),
+        (pack([1, 0, "", {"type": "bye"}]) + b"\0", "trailing"),
+        (BYE + b"\xa6reason\xa2\xff\xfe", "utf-8"),
+        (BYE + b"\xa1z" + b"\x91" * 3000 + b"\xc0", "recursion"),
+        (BYE + b"\xa1z\xdd\xff\xff\xff\xff", "truncated"),
+        (b"\x94\x01\x00\xa0\xdf\xff\xff\xff\xff\xa4type\xa3bye", "truncated"),
+        (BYE + b"\x05\xa1z", "Expected `str`, got `int`"),
+    ],
+)
+def test_malformed_messages_say_what_is_wrong(data: bytes, match: str) -> None:
+    with pytest.raises(MalformedError, match=match) as caught:
+        codec.decode_client(data)
+    assert caught.value.code == "malformed"
+
+
+def test_unknown_event_and_server_type_are_named() -> None:
+    event = {"type": "event", "event_seq": 1, "step": 1, "session_time": 1, "body": {"event": "fireworks"}}
+    with pytest.raises(MalformedError, match="unknown event 'fireworks', expected one of participant_joined"):
+        codec.decode_server(pack([1, 0, event]))
+    with pytest.raises(MalformedError, match="missing required field `event`"):
+        codec.decode_server(pack([1, 0, {**event, "body": {}}]))
+    with pytest.raises(MalformedError, match="unknown message type 'hello', expected one of welcome"):
+        codec.decode_server(pack([1, 0, {"type": "hello"}]))
+
+
+@pytest.mark.parametrize("version", [0, 2, -1, 2**64 - 1])
+def test_other_versions_are_told_whatever_their_schema(version: int) -> None:
+    for rest in ([{"x": 1}], [0, "", {"type": "bye"}], [0, "", {"type": "new"}], [None] * 9):
+        data = pack([version, *rest])
+        assert codec.peek_version(data) == version
+        with pytest.raises(VersionError, match=f"protocol version {version}, this side speaks 1") as caught:
+            codec.decode_client(data)
+        assert caught.value.version == version
+        assert caught.value.code == "version"
+    with pytest.raises(VersionError):
+        codec.decode_server(pack([version, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3}]))
+
+
+def test_peek_version_refuses_what_is_no_envelope() -> None:
+    with pytest.raises(MalformedError, match="starts with the version"):
+        codec.peek_version(pack({"version": 1}))
+
+
+@pytest.mark.parametrize("tag", codec.CLIENT_TYPES)
+def test_each_type_has_its_size(tag: str) -> None:
+    kind = codec.CLIENT_TYPES[tag]
+    message = msgspec.to_builtins(least(kind), builtin_types=(bytes,))
+    limit = LIMITS[kind].max_bytes
+
+    def padded(size: int) -> bytes:
+        bare = len(pack([1, 0, "", {**message, "pad": bytes(256)}])) - 256
+        return pack([1, 0, "", {**message, "pad": bytes(size - bare)}])
+
+    if limit > 512:  # a shorter pad has another header
+        assert len(padded(limit)) == limit
+        codec.decode_client(padded(limit))
+    with pytest.raises(TooLargeError) as caught:
+        codec.decode_client(padded(limit + 1 if limit > 512 else 700))
+    assert caught.value.limit in (limit, MAX_CLIENT_BYTES)
+    assert caught.value.size > limit
+    assert caught.value.code == "too_large"
+
+
+def test_no_message_may_be_larger_than_the_largest() -> None:
+    with pytest.raises(TooLargeError, match=f"at most {MAX_CLIENT_BYTES}"):
+        codec.decode_client(b"\0" * (MAX_CLIENT_BYTES + 1))
+    with pytest.raises(TooLargeError):
+        codec.decode_server(bytes(MAX_SERVER_BYTES + 1))
+    with pytest.raises(TooLargeError, match="clock_pong"):
+        codec.decode_server(pack([1, 0, {"type": "clock_pong", "t0_ns": 1, "t1_ns": 2, "t2_ns": 3, "z": b"x" * 600}]))
+
+
+def test_the_largest_honest_sample_fits() -> None:
+    """Full hands, a leader of 64 joints and two targets, names of 16 characters."""
+    value = 1.2345678901234567
+    pose = Pose((value,) * 3, (value,) * 4)
+    targets = (Target("left-arm-of-lab1", 2**40), Target("right-arm-of-lab", 2**40))
+    sample = Sample("controller/right", "pose", *(2**50,) * 5, targets=targets, pose=pose, twist=(value,) * 6)
+    sample = msgspec.structs.replace(sample, hand_joints=(value,) * 182, q=(value,) * 64, qd=(value,) * 64)
+    assert codec.decode_client(codec.encode_client(envelope(sample, 2**40, "somebody"))).message == sample
+
+
+def test_state_channel_and_beacon_errors() -> None:
+    for decode in (codec.decode_state_header, codec.decode_presence, codec.decode_beacon):
+        with pytest.raises(MalformedError, match="no "):
+            decode(b"\xc1")
+        with pytest.raises(TooLargeError):
+            decode(bytes(300_000))
+    with pytest.raises(MalformedError, match="no beacon"):
+        codec.decode_beacon(pack({"protocol": 1}))
+    with pytest.raises(VersionError, match="version 9"):
+        codec.decode_beacon(pack({"protocol": 9, "shape": "round"}))
+
+
+def decode_all(data: bytes) -> None:
+    refused = []
+    for decode in (
+        codec.decode_client,
+        codec.decode_server,
+        codec.decode_state_header,
+        codec.decode_presence,
+        codec.decode_beacon,
+        codec.peek_version,
+    ):
+        try:
+            decode(data)
+        except ProtocolError as error:
+            refused.append(error)
+    for error in refused:
+        assert len(str(error)) <= MAX_TEXT
+        answer = ServerEnvelope(1, 0, ProtocolFault(error.code, str(error)))
+        assert codec.decode_server(codec.encode_server(answer)) == answer
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.binary(max_size=300))
+def test_random_bytes_raise_protocol_errors_only(data: bytes) -> None:
+    decode_all(data)
+
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=70)
+    | st.binary(max_size=9),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=12), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(sorted(codec.CLIENT_TYPES)), st.data())
+def test_random_fields_raise_protocol_errors_only(tag: str, data: st.DataObject) -> None:
+    message = msgspec.to_builtins(full(codec.CLIENT_TYPES[tag]), builtin_types=(bytes,))
+    for name in data.draw(st.sets(st.sampled_from(sorted(message)), max_size=3)):
+        message[name] = data.draw(values)
+    decode_all(pack([data.draw(st.just(1) | values), data.draw(st.just(1) | values), "", message]))
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.sampled_from(sorted(codec.CLIENT_TYPES)),
+    st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 255)), max_size=5),
+    st.integers(0, 3),
+)
+def test_damaged_messages_raise_protocol_errors_only(tag: str, flips: list[tuple[int, int]], cut: int) -> None:
+    data = bytearray(pack(envelope(extreme(codec.CLIENT_TYPES[tag]), 1)))
+    for at, value in flips:
+        data[at % len(data)] = value
+    decode_all(bytes(data[: len(data) - cut]))
+
+
+def test_long_texts_of_strangers_are_cut() -> None:
+    with pytest.raises(MalformedError) as caught:
+        codec.decode_client(pack([1, 0, "", {"type": "é" * 5000}]))
+    assert len(str(caught.value)) <= 400
+    assert len(str(MalformedError("x" * 401))) == 400
+
+
+def test_equal_values_give_equal_bytes() -> None:
+    one = ClientEnvelope(1, 2, "", Acquire(1, ("a", "b")))
+    assert codec.encode_client(one) == codec.encode_client(ClientEnvelope(1, 2, "", Acquire(1, ("a", "b"))))
+    assert codec.tag_of(Bye) == "bye"

@@ -1,0 +1,72 @@
+"""Every message has limits; the token bucket lets through what it says."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iris_session.protocol import codec
+from iris_session.protocol.client_messages import EStop, Hello, Sample
+from iris_session.protocol.errors import RateError
+from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Limit, RateLimiter
+from iris_session.protocol.server_messages import Snapshot
+
+SECOND = 1_000_000_000
+
+
+def test_every_message_has_its_limits() -> None:
+    assert set(LIMITS) == set(codec.CLIENT_TYPES.values())
+    assert set(SERVER_LIMITS) == set(codec.SERVER_TYPES.values())
+    assert all(limit.max_bytes > 0 and limit.per_second > 0 and limit.burst > 0 for limit in LIMITS.values())
+
+
+def test_burst_then_rate() -> None:
+    limiter = RateLimiter({Sample: Limit(1, per_second=10, burst=5)})
+    assert [limiter.allow(Sample, 0) for _ in range(7)] == [True] * 5 + [False] * 2
+    assert not limiter.allow(Sample, SECOND // 10 - 1)
+    assert limiter.allow(Sample, SECOND // 10)
+    assert not limiter.allow(Sample, SECOND // 10)
+    assert [limiter.allow(Sample, 100 * SECOND) for _ in range(6)] == [True] * 5 + [False]
+
+
+def test_types_do_not_share_buckets() -> None:
+    limiter = RateLimiter()
+    while limiter.allow(Sample, 0):
+        pass
+    assert limiter.allow(EStop, 0)
+
+
+def test_time_that_goes_back_gives_nothing() -> None:
+    limiter = RateLimiter({Hello: Limit(1, per_second=1, burst=1)})
+    assert limiter.allow(Hello, 10 * SECOND)
+    assert not limiter.allow(Hello, 0)
+    assert not limiter.allow(Hello, 10 * SECOND)
+    assert limiter.allow(Hello, 11 * SECOND)
+
+
+def test_no_burst_is_no_limit() -> None:
+    limiter = RateLimiter(SERVER_LIMITS)
+    assert all(limiter.allow(Snapshot, 0) for _ in range(1000))
+
+
+def test_unknown_types_are_a_mistake_of_the_caller() -> None:
+    with pytest.raises(KeyError):
+        RateLimiter({}).allow(Sample, 0)
+
+
+@given(st.lists(st.integers(0, SECOND // 50), max_size=300), st.integers(1, 200), st.integers(1, 20))
+def test_never_more_than_rate_and_burst(gaps: list[int], per_second: int, burst: int) -> None:
+    limiter = RateLimiter({Sample: Limit(1, per_second=per_second, burst=burst)})
+    now = passed = 0
+    for gap in gaps:
+        now += gap
+        passed += limiter.allow(Sample, now)
+    assert passed <= burst + now * per_second / SECOND
+
+
+def test_rate_error_says_what_is_allowed() -> None:
+    limit = LIMITS[Sample]
+    error = RateError(codec.tag_of(Sample), limit.per_second, limit.burst)
+    assert error.code == "rate"
+    assert str(error) == "too many sample messages: at most 600 per second, 200 at once"

@@ -1,0 +1,157 @@
+"""The rooms keep their walls: imports follow the table of docs/architecture.md, pure rooms stay pure, modules small."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MAX_LINES = 400
+
+SOCKETS = {"zmq", "socket", "socketserver", "selectors", "ssl", "http", "urllib", "asyncio"}
+CLOCKS = {"time", "datetime", "sched", "asyncio"}
+THREADS = {"threading", "_thread", "multiprocessing", "concurrent", "queue", "asyncio", "subprocess", "signal"}
+RANDOM = {"random", "secrets", "uuid"}
+HEAVY = {"numpy", "mujoco", "rerun", "scipy", "cv2", "mink", "open3d"}
+
+#: What a room never imports. Beyond the table: what would make a pure room depend on more than its arguments.
+FORBIDDEN = {
+    "anchors": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
+    "protocol": SOCKETS | CLOCKS | THREADS | RANDOM | HEAVY,
+    "authority": SOCKETS | CLOCKS | THREADS | RANDOM | HEAVY,
+    "control": SOCKETS | CLOCKS | THREADS | RANDOM | {"rerun"},
+    "physics": {"zmq", "rerun"} | RANDOM,
+    "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
+    "transport": {"mujoco", "rerun"},
+    "recording": set(),
+    "client": {"mujoco", "rerun"},
+    "emulator": {"mujoco", "rerun"},
+}
+#: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
+PURE = ("anchors", "protocol", "authority", "control", "streams")
+#: The feed and the process of the recorder talk; the rest of `recording` reads and writes files.
+RECORDING_SOCKETS = {"feed.py", "process.py"}
+
+
+@cache
+def modules() -> tuple[Path, ...]:
+    """All modules of ours, below the checkout."""
+    return tuple(sorted([*(ROOT / "iris_session").rglob("*.py"), *(ROOT / "anchors").rglob("*.py")]))
+
+
+def room_of(path: Path) -> str:
+    """`anchors`, a folder of iris_session, or empty for iris_session's own modules."""
+    parts = path.relative_to(ROOT).parts
+    if parts[0] == "anchors":
+        return "anchors"
+    return parts[1] if len(parts) > 2 else ""
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Dotted names that a module imports, anywhere in it (also lazily, and for type checkers only)."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import, write the full name"
+            assert node.module
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def rooms_imported(path: Path) -> set[str]:
+    found = set()
+    for name in imports(path):
+        first, *rest = name.split(".")
+        if first == "anchors":
+            found.add("anchors")
+        elif first == "iris_session":
+            found.add(rest[0] if rest else "iris_session")
+    return found
+
+
+def table() -> dict[str, set[str] | None]:
+    """Room -> rooms that it may import, by docs/architecture.md; `None` for everything."""
+    rows = re.findall(r"^\| (`.+?) \| (.+?) \| .*\|$", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
+    allowed: dict[str, set[str] | None] = {}
+    every = {room for names, _ in rows for room in re.findall(r"`(\w+)`", names)}
+    for names, rule in rows:
+        named = set(re.findall(r"`(\w+)`", rule))
+        for room in re.findall(r"`(\w+)`", names):
+            if rule.startswith("everything"):
+                allowed[room] = every - named if named else None
+            else:
+                allowed[room] = named
+    return allowed
+
+
+def test_table_names_every_room() -> None:
+    assert set(table()) >= {room_of(path) for path in modules()} - {""}
+    assert table()["authority"] == {"protocol", "anchors"}
+    assert table()["protocol"] == set()
+    assert "cli" not in (table()["runtime"] or {"cli"})
+    assert table()["cli"] is None
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_module_keeps_to_its_room(path: Path) -> None:
+    room = room_of(path)
+    if not room:
+        return
+    allowed = table()[room]
+    if allowed is not None:
+        wrong = rooms_imported(path) - allowed - {room}
+        assert not wrong, f"{room} may import {sorted(allowed) or 'nothing of ours'}, not {sorted(wrong)}"
+    outside = {name.split(".")[0] for name in imports(path)}
+    forbidden = outside & FORBIDDEN.get(room, set())
+    assert not forbidden, f"{room} must not import {sorted(forbidden)}"
+    if room == "recording" and path.name not in RECORDING_SOCKETS:
+        assert "zmq" not in outside, f"sockets of recording live in {sorted(RECORDING_SOCKETS)}"
+
+
+def impurities(module: ast.Module) -> Iterator[str]:
+    """Places where a result could depend on hash order, addresses, or hidden random state."""
+    for node in ast.walk(module):
+        looped = node.iter if isinstance(node, ast.For | ast.comprehension) else None
+        calls_set = (
+            isinstance(looped, ast.Call)
+            and isinstance(looped.func, ast.Name)
+            and looped.func.id in ("set", "frozenset")
+        )
+        if calls_set or isinstance(looped, ast.Set | ast.SetComp):
+            yield f"line {getattr(looped, 'lineno', '?')}: loop over a set"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("hash", "id"):
+            yield f"line {node.lineno}: {node.func.id}()"
+        if isinstance(node, ast.Attribute) and node.attr in ("random", "urandom", "environ"):
+            yield f"line {node.lineno}: .{node.attr}"
+
+
+@pytest.mark.parametrize("path", [p for p in modules() if room_of(p) in PURE], ids=lambda p: str(p.relative_to(ROOT)))
+def test_pure_module_depends_on_its_arguments_only(path: Path) -> None:
+    assert list(impurities(tree(path))) == []
+
+
+def test_impurities_are_found() -> None:
+    source = (
+        "for a in {1, 2}:\n    pass\nb = [c for c in set(d)]\ne = hash(f)\ng = np.random.normal()\nh = os.environ\n"
+    )
+    assert [line.split(":")[0] for line in sorted(impurities(ast.parse(source)))] == [
+        f"line {n}" for n in (1, 3, 4, 5, 6)
+    ]
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_module_is_a_small_room(path: Path) -> None:
+    """Its first lines say what lives there, and it stays below `MAX_LINES` lines."""
+    assert ast.get_docstring(tree(path)), "a module begins with a docstring that says what lives there"
+    assert path.read_text(encoding="utf-8").count("\n") < MAX_LINES
