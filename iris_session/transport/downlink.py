@@ -7,6 +7,7 @@ from collections.abc import Callable
 import msgspec
 import zmq
 
+from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import Event, ProtocolFault, Refused, ServerMessage, Snapshot
 from iris_session.protocol.steps import Outgoing
 from iris_session.transport import link_messages as link
@@ -98,7 +99,7 @@ class Downlink:
             connection = self._clients.by_number.get(dropped.connection)
             if connection is not None:
                 text = f"the session let this connection go: {dropped.reason}"
-                self._outbox.send(connection, ProtocolFault("dropped", text))
+                self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text))
                 self._forget(connection)
 
     def _answer(self, outgoing: Outgoing) -> None:

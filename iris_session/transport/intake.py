@@ -21,7 +21,7 @@ from iris_session.protocol.codec import decode_client, tag_of
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.errors import MalformedError, ProtocolError, RateError, VersionError
 from iris_session.protocol.limits import LIMITS
-from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.names import PROTOCOL_VERSION, FaultCode
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused
 from iris_session.transport.admission import Admission
 from iris_session.transport.alignment_desk import AlignmentDesk
@@ -30,8 +30,6 @@ from iris_session.transport.coalescer import Coalescer
 from iris_session.transport.config import FrontConfig
 from iris_session.transport.limiter import Drops, TokenBucket
 
-#: Fault code: this connection has not said hello (or the front was restarted): say it again.
-HELLO_NEEDED: Final = "hello"
 #: Faults to strangers, per second: they have no connection to count on.
 _STRANGER_FAULTS: Final = 20
 _RECORDER_HWM: Final = 20_000
@@ -95,11 +93,8 @@ class Intake:
             if extra_frames:
                 raise MalformedError(f"a client message is one frame, got {1 + extra_frames}")
             envelope = decode_client(data)
-        except VersionError as error:
-            self._wrong_version(route, peer, error, now_ns)
-            return
         except ProtocolError as error:
-            self._fault(route, self._clients.find(route, peer), error.code, str(error), now_ns)
+            self._unreadable(route, peer, error, now_ns)
             return
         if envelope.on_behalf_of:
             route = Route(routing_id, envelope.on_behalf_of)
@@ -123,7 +118,7 @@ class Intake:
             if entry is not None:
                 self._coalescer.offer(entry)
         elif connection is None:
-            self._fault(route, None, HELLO_NEEDED, "this connection has not said hello: say hello (again)", now_ns)
+            self._fault(route, None, FaultCode.HELLO, "this connection has not said hello: say hello (again)", now_ns)
         else:
             self._from_connection(connection, envelope, now_ns)
 
@@ -161,15 +156,18 @@ class Intake:
         if not desk.observe(observation):
             self._drops.count("observation_unusable", connection.number)
 
-    def _wrong_version(self, route: Route, peer: Peer, error: VersionError, now_ns: int) -> None:
+    def _unreadable(self, route: Route, peer: Peer, error: ProtocolError, now_ns: int) -> None:
+        """Before `hello` this is the answer to it, so it is a refusal."""
         connection = self._clients.find(route, peer)
         if connection is not None:
             self._fault(route, connection, error.code, str(error), now_ns)
             return
-        self._drops.count("hello_version")
+        self._drops.count(f"hello_{error.code}")
         if self._stranger_faults.take(now_ns):
-            older = "the client" if error.version < PROTOCOL_VERSION else "the session"
-            self._outbox.send_to_route(route, Refused(error.code, str(error), f"update {older}"))
+            advice = "send the hello of docs/protocol.md"
+            if isinstance(error, VersionError):
+                advice = f"update {'the client' if error.version < PROTOCOL_VERSION else 'the session'}"
+            self._outbox.send_to_route(route, Refused(error.code, str(error), advice))
 
     def _fault(self, route: Route, connection: Connection | None, code: str, text: str, now_ns: int) -> None:
         """Counts, and says so at a bounded rate."""

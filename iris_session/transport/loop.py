@@ -13,6 +13,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from iris_session.protocol.entries import Entry, Lost, encode_entries
+from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
@@ -136,7 +137,7 @@ class Front:
         while not self.ended:
             poller.poll(0 if busy else IDLE_MS)
             busy = self._pass()
-        self._downlink.broadcast(ProtocolFault("session_ended", f"the session has ended: {self.ended}"))
+        self._downlink.broadcast(ProtocolFault(FaultCode.SESSION_ENDED, f"the session has ended: {self.ended}"))
 
     def _pass(self) -> bool:
         """One pass of the loop. True when clients still have something to say."""
@@ -284,9 +285,9 @@ class Front:
         stalled = heard_ns > 0 and now_ns - heard_ns > self._config.stall_ns
         if stalled and not self._stalled:
             self._stalls += 1
-            self._downlink.broadcast(ProtocolFault("stalled", "the session does not step: robots hold"))
+            self._downlink.broadcast(ProtocolFault(FaultCode.STALLED, "the session does not step: robots hold"))
         elif self._stalled and not stalled:
-            self._downlink.broadcast(ProtocolFault("recovered", "the session steps again"))
+            self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
         self._stalled = stalled
         if not parent_is(self._start.parent_pid):
             self.end(ORPHANED)

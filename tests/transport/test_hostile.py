@@ -46,7 +46,9 @@ def test_garbage_is_answered_with_bounded_faults_and_harms_nobody(session: Front
     assert fault.code == "malformed"
     assert len(joined.got(ProtocolFault)) < 30
     assert session.wait_drops("malformed") > 300
-    assert session.wait_drops("stranger_malformed") > 300
+    assert session.wait_drops("hello_malformed") > 300
+    assert stranger.wait_for(Refused).code == "malformed"
+    assert len(stranger.got(Refused)) < 200
 
 
 def test_wrong_values_say_what_would_be_right(session: FrontSession) -> None:
