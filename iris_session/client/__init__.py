@@ -4,7 +4,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
-from iris_session.client.client import Client, poll_all, wait_any
+from iris_session.client.client import Client
 from iris_session.client.errors import (
     ClientError,
     DeniedError,
@@ -19,6 +19,7 @@ from iris_session.client.interpolation import PoseBuffer, Shown
 from iris_session.client.session_state import SessionMirror
 from iris_session.client.sockets import CurveKeys
 from iris_session.client.state_stream import SceneState
+from iris_session.client.waiting import poll_all, wait_any
 
 __all__ = [
     "Client",

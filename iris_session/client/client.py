@@ -7,6 +7,7 @@ thread: from then on only that thread touches the sockets, and callbacks run in 
 from __future__ import annotations
 
 import os
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -23,6 +24,7 @@ from iris_session.client.scene_view import SceneView
 from iris_session.client.sockets import ClientSockets, CurveKeys, parse_address
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
+from iris_session.client.waiting import milliseconds
 from iris_session.protocol.client_messages import ClientMessage, Hello, Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.names import AlignmentKind, Role, SampleKind
@@ -76,7 +78,8 @@ class Client(SceneView, Requests):
             name=name or role,
             software=software,
             devices=tuple(devices),
-            capabilities=tuple(capabilities),
+            # The session keeps our alignment over a lost connection only while this `run` lasts.
+            capabilities=(*capabilities, f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
             join_code=join_code,
         )
@@ -84,7 +87,6 @@ class Client(SceneView, Requests):
         self.on_state = on_state
         self.on_event = on_event
         self.on_feedback = on_feedback
-        self.tracking_epoch = 0
         self.feedback: dict[str, Feedback] = {}
         self._state: SceneState | None = None
         self._seq: dict[str, int] = {}
@@ -152,7 +154,7 @@ class Client(SceneView, Requests):
     def poll(self, timeout_s: float = 0.0) -> bool:
         """Receives, answers, keeps the connection alive. Waits up to `timeout_s` for something to come.
 
-        True when anything came. Raises `RefusedError` after the session refused us for good.
+        True when anything came or the connection's phase changed. Raises `RefusedError` after the session refused us for good.
         """
         if self._thread is not None and threading.current_thread() is not self._thread:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
@@ -166,6 +168,11 @@ class Client(SceneView, Requests):
         if self.connection.failure is not None:
             raise self.connection.failure
         return progressed
+
+    def register(self, poller: zmq.Poller) -> None:
+        """Adds everything that can wake this client to `poller`; `poll` is due at `connection.next_deadline_ns`."""
+        if self.connection.phase is not Phase.CLOSED:
+            self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
 
     def wait_for(self, condition: Callable[[Self], bool], timeout_s: float = DEFAULT_TIMEOUT_S) -> bool:
         """Polls (or waits for the thread) until `condition(client)` is true; false after `timeout_s`."""
@@ -202,6 +209,11 @@ class Client(SceneView, Requests):
     @worn.setter
     def worn(self, worn: bool) -> None:
         self.connection.worn = worn
+
+    @property
+    def tracking_epoch(self) -> int:
+        """Jumps of our tracking frame so far; `new_tracking_frame` counts one more."""
+        return self.connection.tracking_epoch
 
     # --- sending ------------------------------------------------------------------------------------------------------
 
@@ -309,13 +321,14 @@ class Client(SceneView, Requests):
         with self._lock:
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            now = time.monotonic_ns()
+            now, phase = time.monotonic_ns(), self.connection.phase
             state, progressed = self._drain_state()
             if self._sockets.disconnected() and self._generation == self.connection.generation:
                 self.connection.lost(now)
             progressed |= self._drain_control(now)
             self.connection.tick(now)
             self._flush()
+            progressed |= self.connection.phase is not phase
             inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
             for message in inbox:
                 if isinstance(message, Feedback):
@@ -360,8 +373,8 @@ class Client(SceneView, Requests):
 
     def _wait(self, timeout_ns: int) -> None:
         poller = zmq.Poller()
-        self._sockets.register(poller)
-        poller.poll(_milliseconds(timeout_ns))
+        self.register(poller)
+        poller.poll(milliseconds(timeout_ns))
         self._sockets.clear_wake()
 
     def _run(self) -> None:
@@ -374,27 +387,3 @@ class Client(SceneView, Requests):
             with self._changed:
                 self._crash = error
                 self._changed.notify_all()
-
-
-def wait_any(clients: Sequence[Client], timeout_s: float) -> None:
-    """Waits until one of several clients has something to do, at most `timeout_s`. Polls none of them."""
-    now = time.monotonic_ns()
-    deadline = now + int(timeout_s * 1e9)
-    poller = zmq.Poller()
-    for client in clients:
-        if client.connection.phase is not Phase.CLOSED:
-            deadline = min(deadline, client.connection.next_deadline_ns(now))
-            client._sockets.register(poller)
-    poller.poll(_milliseconds(deadline - now))
-
-
-def poll_all(clients: Sequence[Client], timeout_s: float = 0.0) -> None:
-    """Polls several clients that have no thread, after `wait_any`."""
-    wait_any(clients, timeout_s)
-    for client in clients:
-        client.poll(0.0)
-
-
-def _milliseconds(nanoseconds: int) -> int:
-    """Rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
-    return max(0, -(-nanoseconds // 1_000_000))

@@ -33,6 +33,7 @@ from iris_session.protocol.client_messages import (
     Hello,
     Release,
     Sample,
+    TrackingEpoch,
     envelope,
 )
 from iris_session.protocol.codec import decode_server, encode_client
@@ -66,6 +67,9 @@ TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.S
 #: Faults after which the front no longer knows this connection: hello is needed again.
 CONNECTION_ENDED: Final = frozenset({"session_ended", "dropped", "hello"})
 
+#: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
+REPLACED: Final = "replaced"
+
 
 class Connection:
     """One participant's connection, over any number of sockets."""
@@ -79,6 +83,7 @@ class Connection:
         self.failure: RefusedError | None = None
         self.stalled = False
         self.worn = True
+        self.tracking_epoch = 0
         self.mirror = SessionMirror()
         self.clock = ClockSync()
         self.stream = StateStream()
@@ -266,6 +271,8 @@ class Connection:
         self._backoff_ns = BACKOFF_MIN_NS
         self._heartbeat_at = now_ns + welcome.heartbeat_ns // 2
         self._snapshot_at = now_ns
+        if self.tracking_epoch:
+            self._queue(TrackingEpoch(self.tracking_epoch))
         self._keep_up(now_ns)
 
     def _refused(self, refused: Refused, now_ns: int) -> None:
@@ -285,6 +292,10 @@ class Connection:
         self._deliver(fault)
         if fault.code in ("stalled", "recovered"):
             self.stalled = fault.code == "stalled"
+        elif fault.code == "dropped" and fault.message.endswith(REPLACED):
+            advice = "give every client that runs at the same time an identity of its own"
+            self.failure = RefusedError(Refused(REPLACED, "another client took over with this identity", advice))
+            self.phase = Phase.REFUSED
         elif fault.code in CONNECTION_ENDED:
             self.lost(now_ns)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from anchors.pose import PoseTuple
+from iris_session.client.connection import Connection
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
@@ -32,7 +33,7 @@ from iris_session.protocol.server_messages import Reply
 class Requests:
     """Mixin of `Client`: everything a participant can ask for."""
 
-    tracking_epoch: int
+    connection: Connection
 
     @abstractmethod
     def request(self, message: Any, timeout_s: float = 5.0) -> Reply: ...
@@ -102,9 +103,10 @@ class Requests:
 
     def new_tracking_frame(self) -> int:
         """The tracking frame jumped: our alignment is void. Returns the new tracking epoch."""
-        self.tracking_epoch += 1
-        self.send(TrackingEpoch(self.tracking_epoch))
-        return self.tracking_epoch
+        epoch = self.connection.tracking_epoch = self.connection.tracking_epoch + 1
+        if self.connection.joined:  # else the next welcome is answered with it
+            self.send(TrackingEpoch(epoch))
+        return epoch
 
     def observe(
         self,
@@ -125,7 +127,7 @@ class Requests:
                 kind=kind,
                 T_tracking_anchor=Pose(*T_tracking_anchor),
                 capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                tracking_epoch=self.tracking_epoch,
+                tracking_epoch=self.connection.tracking_epoch,
                 viewpoint_id=viewpoint_id,
                 size_m=size_m,
                 quality=quality,

@@ -116,16 +116,18 @@ class ClientSockets:
             lost = True
         return lost
 
-    def register(self, poller: zmq.Poller) -> None:
-        """Adds everything that can wake this client to `poller`."""
+    def register(self, poller: zmq.Poller, *, sending: bool) -> None:
+        """Adds everything that can wake this client to `poller`; `sending`: also that the control socket takes more."""
         poller.register(self._wake_in, zmq.POLLIN)
-        for sock in (self._control, self._monitor, self._state):
+        if self._control is not None:
+            poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
+        for sock in (self._monitor, self._state):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
 
     def wake(self) -> None:
         """Ends a wait on these sockets, from any thread."""
-        with contextlib.suppress(BlockingIOError):  # full: it is awake already
+        with contextlib.suppress(OSError):  # full: it is awake already; closed: nobody waits
             self._wake_out.send(b"\0")
 
     def clear_wake(self) -> None:

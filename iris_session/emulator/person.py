@@ -153,6 +153,7 @@ class Person:
 
     def _sample(self, now_ns: int) -> None:
         self.display.refresh(self.client.session_now_ns())
+        self._fall_back(now_ns)
         if self.report.phase == "look":
             self._look(now_ns)
         elif self.report.phase == "acquire":
@@ -275,18 +276,22 @@ class Person:
             if reply is not None and reply.denial is not None:
                 self._refused_because = f"{reply.denial.reason}: {reply.denial.message} {reply.denial.advice}"
 
+    def _fall_back(self, now_ns: int) -> None:
+        """What was won can be lost: the alignment with a jump or a new session, the robot to somebody else."""
+        if self.report.phase in ("watch", "acquire", "work") and self._alignment() is None:
+            self._viewpoint = 0
+            self._enter("look", now_ns)
+        elif self.report.phase == "work" and self.client.lease_version(self.spec.robot) is None:
+            self._enter("acquire", now_ns)
+
     def _scheduled(self, now_ns: int) -> None:
         """What was planned for this moment: the tracking frame jumps, the headset comes off and on."""
         elapsed = (now_ns - self._joined_ns) / 1e9
         if self._jumps and elapsed >= self._jumps[0]:
             self._jumps.pop(0)
             self.headset.recentre(now_ns)
-            self.client.tracking_epoch = self.headset.tracking_epoch - 1
             self.client.new_tracking_frame()
             self._open_clutch = RECLUTCH_SAMPLES
-            if not self.finished:
-                self._viewpoint = 0
-                self._enter("look", now_ns)
         doff, don = self.spec.doff_at_s, self.spec.don_at_s
         worn = not (doff is not None and elapsed >= doff and (don is None or elapsed < don))
         if worn != self.headset.worn:

@@ -1,0 +1,34 @@
+"""Fixtures of the client tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from iris_session.client import Client
+from tests.client.harness import LiveSession
+
+
+@pytest.fixture
+def session() -> Iterator[LiveSession]:
+    """Front process and authority on free ports."""
+    live = LiveSession()
+    yield live
+    live.close()
+
+
+@pytest.fixture
+def join(session: LiveSession) -> Iterator[Callable[..., Client]]:
+    """Makes connected clients that end with the test."""
+    clients: list[Client] = []
+
+    def make(name: str = "ann", *, connect: bool = True, **settings: object) -> Client:
+        settings.setdefault("alignment", "not_needed")
+        client = Client(session.address, name=name, **settings)  # type: ignore[arg-type]
+        clients.append(client)
+        return client.connect() if connect else client
+
+    yield make
+    for client in clients:
+        client.close()

@@ -1,0 +1,281 @@
+"""The client against a real front process and the real authority."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iris_session.client import (
+    Client,
+    ClientError,
+    DeniedError,
+    NotConnectedError,
+    RefusedError,
+    RequestTimeoutError,
+    SceneState,
+    poll_all,
+)
+from iris_session.client.sockets import parse_address
+from iris_session.protocol.client_messages import Acquire, Sample
+from iris_session.protocol.names import DenialReason, Device, HoldReason
+from iris_session.protocol.server_messages import Event, LeaseChanged
+from tests.client.harness import BODIES, LiveSession
+
+Join = Callable[..., Client]
+HERE = ((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
+
+
+def has_state(client: Client) -> bool:
+    return client.state is not None
+
+
+def test_joins_and_sees_the_session(session: LiveSession, join: Join) -> None:
+    ann = join(devices=(Device.CONTROLLER_RIGHT,))
+    bob = join("bob", role="observer")
+    assert ann.ready
+    assert ann.participant_id != bob.participant_id
+    assert ann.wait_for(lambda c: bob.participant_id in c.mirror.participants)
+    assert set(ann.mirror.robots) == {"left", "right"}
+    assert [body.name for body in ann.mirror.bodies] == list(BODIES)
+    assert ann.mirror.leases["left"].holder == ""
+
+
+def test_session_time_is_that_of_the_session_within_the_stated_error(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ann.wait_for(lambda c: c.counters()["control"]["received"] > 8)
+    before = session.now_ns
+    mine = ann.session_now_ns()
+    after = session.now_ns
+    assert before - ann.clock_error_ns() <= mine <= after + ann.clock_error_ns()
+    assert ann.clock_error_ns() < 20_000_000
+
+
+def test_state_is_fresh_decoded_and_aged_where_it_is_handed_over(session: LiveSession, join: Join) -> None:
+    states: list[SceneState] = []
+    ann = join(on_state=states.append)
+    assert ann.wait_for(lambda c: len(states) >= 10)
+    for state in states:
+        assert state.poses.shape == (len(BODIES), 7)
+        moved = 0.1 * state.header.session_time / 1e9
+        assert np.abs(state.poses[:, 0] - moved).max() < 2e-3
+        assert 0 < state.age_ns < 2_000_000_000
+    assert all(a.header.state_seq < b.header.state_seq for a, b in itertools.pairwise(states))
+    tip, body = ann.tip_pose("left"), ann.body_pose("left/hand")
+    assert tip is not None
+    assert body is not None
+    assert tip[0][2] == pytest.approx(body[0][2] + 0.1)
+    assert ann.tip_pose("nobody") is None
+    assert ann.body_pose("nothing") is None
+
+
+def test_leases_pass_between_two_people(session: LiveSession, join: Join) -> None:
+    events: list[Event] = []
+    ann, bob = join(on_event=events.append), join("bob")
+    (lease,) = ann.acquire(["left"])
+    assert lease.holder == ann.participant_id
+    assert ann.lease_version("left") == lease.lease_version  # at once, whether or not the event has come
+    with pytest.raises(DeniedError, match="ann") as denied:
+        bob.acquire(["left", "right"])
+    assert denied.value.denial.reason == DenialReason.HELD
+    assert denied.value.denial.holder == ann.participant_id
+    assert bob.lease_version("right") is None  # all or none
+    ann.release("left")
+    assert ann.wait_for(lambda c: c.lease_version("left") is None)
+    assert bob.acquire(["left"])[0].holder == bob.participant_id
+    assert ann.wait_for(lambda c: c.mirror.leases["left"].holder == bob.participant_id)
+    assert any(isinstance(event.body, LeaseChanged) for event in events)
+
+
+def test_samples_engage_the_robot_and_estop_stops_it(session: LiveSession, join: Join) -> None:
+    ann = join(role="agent", devices=(Device.TARGET,))
+    ann.acquire(["left"])
+
+    def stream(clutch: bool) -> None:
+        assert ann.send_sample(Device.TARGET, HERE, robots=["left"], clutch=clutch)
+        ann.poll(0.01)
+
+    def until(kind: str) -> None:
+        deadline = time.monotonic() + 5.0
+        while session.commands.get("left") != kind:
+            assert time.monotonic() < deadline, session.commands
+            stream(True)
+
+    stream(False)
+    until("pose")
+    assert ann.wait_for(lambda c: "left" in c.feedback)
+    ann.estop("test")
+    until("hold")
+    assert ann.wait_for(lambda c: c.mirror.estop)
+    assert ann.wait_for(lambda c: c.feedback["left"].hold_reason == HoldReason.ESTOP)
+
+
+def test_samples_name_epochs_versions_and_tokens(session: LiveSession, join: Join) -> None:
+    ann = join(devices=(Device.HEAD, Device.CONTROLLER_RIGHT))
+    first = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left"], clutch=True)
+    assert first.targets == ()  # not ours: presence only
+    (lease,) = ann.acquire(["left"])
+    second = ann.make_sample(Device.CONTROLLER_RIGHT, HERE, robots=["left", "right"], gripper=0.5)
+    assert [(t.name, t.lease_version) for t in second.targets] == [("left", lease.lease_version)]
+    assert second.seq == first.seq + 1
+    assert second.scene_epoch == ann.mirror.scene_epoch
+    assert ann.new_tracking_frame() == 1
+    assert ann.make_sample(Device.HEAD, HERE).tracking_epoch == 1
+
+
+def test_reset_changes_the_epoch_and_state_goes_on(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ann.wait_for(has_state)
+    session.reset()
+    assert ann.wait_for(lambda c: c.mirror.scene_epoch == 2)
+    assert ann.wait_for(lambda c: c.state is not None and c.state.header.scene_epoch == 2)
+    assert ann.counters()["control"]["snapshots"] == 1
+
+
+def test_late_joiner_has_the_same_mirror(session: LiveSession, join: Join) -> None:
+    early = join()
+    early.acquire(["left"])
+    gone = join("gone")
+    gone.close()
+    early.acquire(objects=["hammer"]) if early.mirror.leases.get("hammer") else None
+    late = join("late", role="observer")
+    same = [False]
+
+    def equal(_: Client) -> bool:
+        poll_all([early, late])
+        same[0] = early.mirror.event_seq == late.mirror.event_seq
+        return same[0]
+
+    assert early.wait_for(equal)
+    assert early.mirror.mirror_hash() == late.mirror.mirror_hash()
+
+
+def test_killed_front_comes_back_with_everything_kept(session: LiveSession, join: Join) -> None:
+    ann = join()
+    (lease,) = ann.acquire(["left"])
+    participant = ann.participant_id
+    os.kill(session.front.pid, signal.SIGKILL)
+    assert ann.wait_for(lambda c: not c.ready)
+    assert not ann.send_sample(Device.HEAD, HERE)
+    assert ann.counters()["control"]["samples_not_sent"] == 1
+    assert ann.wait_for(lambda c: c.ready, 10.0)
+    assert ann.participant_id == participant
+    assert ann.connection.welcome is not None
+    assert ann.connection.welcome.resumed
+    assert (ann.lease_version("left") or 0) > lease.lease_version  # same holder, new fencing token
+    seen = ann.state
+    assert ann.wait_for(lambda c: c.state is not seen)
+
+
+def test_restarted_process_resumes_with_its_identity_file(session: LiveSession, join: Join, tmp_path: Path) -> None:
+    path = tmp_path / "identity"
+    killed = join(identity=path)
+    killed.acquire(["left"])
+    participant = killed.participant_id
+    killed._sockets.close()  # as if killed: no bye
+    again = join(identity=path)
+    assert again.participant_id == participant
+    assert again.wait_for(lambda c: c.lease_version("left") is not None)
+    killed.connection.phase = killed.connection.phase.CLOSED
+
+
+def test_a_second_client_with_the_same_identity_takes_over_for_good(
+    session: LiveSession, join: Join, tmp_path: Path
+) -> None:
+    first = join(identity=tmp_path / "identity")
+    second = join(identity=tmp_path / "identity")
+    with pytest.raises(RefusedError, match="identity of its own"):
+        first.wait_for(lambda c: False, 5.0)
+    assert second.participant_id == first.participant_id
+    assert second.poll(0.0) in (True, False)
+
+
+def test_a_stalled_session_is_noticed_and_comes_back(session: LiveSession, join: Join) -> None:
+    ann = join()
+    session.pause_steps(True)
+    assert ann.wait_for(lambda c: c.connection.stalled)
+    with pytest.raises(RequestTimeoutError):
+        ann.request(Acquire(0, ("left",)), timeout_s=0.2)
+    session.pause_steps(False)
+    assert ann.wait_for(lambda c: not c.connection.stalled)
+    assert ann.ready
+
+
+def test_bye_frees_at_once(session: LiveSession, join: Join) -> None:
+    ann, bob = join(), join("bob")
+    ann.acquire(["left"])
+    ann.close()
+    assert bob.wait_for(lambda c: c.mirror.leases["left"].holder == "")
+    assert bob.wait_for(lambda c: ann.participant_id not in c.mirror.participants)
+    with pytest.raises(NotConnectedError):
+        ann.connect()
+
+
+def test_refused_and_unreachable_say_what_to_do(session: LiveSession, join: Join) -> None:
+    with pytest.raises(RefusedError, match="operator") as refused:
+        join(role="chef")
+    assert refused.value.code == DenialReason.UNKNOWN_VALUE
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nobody = Client(f"127.0.0.1:{free.getsockname()[1]}")
+        with pytest.raises(NotConnectedError, match="iris-session serve"):
+            nobody.connect(0.2)
+        nobody.close()
+    client = Client(session.address)
+    with pytest.raises(NotConnectedError, match="connect"):
+        client.request(Acquire(0))
+    client.close()
+
+
+def test_a_thread_can_poll_instead(session: LiveSession, join: Join) -> None:
+    with join() as ann:
+        ann.start()
+        with pytest.raises(ClientError, match="thread"):
+            ann.poll()
+        assert ann.acquire(["right"])[0].target == "right"
+        with pytest.raises(DeniedError):
+            ann.acquire(["nothing"])
+        assert ann.wait_for(has_state)
+        assert ann.send_sample(Device.HEAD, HERE)
+        deadline = time.monotonic() + 5.0
+        while not session.kinds(Sample):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ann.start()
+    started = time.monotonic()
+    ann.close()
+    assert time.monotonic() - started < 5.0
+    assert ann._thread is not None
+    assert not ann._thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("127.0.0.1:7000", ("127.0.0.1", 7000)),
+        ("lab.local", ("lab.local", 7721)),
+        ("tcp://lab:1/", ("lab", 1)),
+        ("[::1]:7000", ("::1", 7000)),
+        ("::1", ("::1", 7721)),
+        ("[::1]", ("::1", 7721)),
+    ],
+)
+def test_addresses(text: str, expected: tuple[str, int]) -> None:
+    assert parse_address(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", ":7721", "host:", "host:x", "host:70000", "[]:1"])
+def test_bad_addresses_say_what_is_right(text: str) -> None:
+    with pytest.raises(ClientError, match="HOST:PORT"):
+        parse_address(text)
