@@ -102,7 +102,10 @@ class World:
         self._tables = ContactTables(model, robots, objects, tree)
         self._view = LiveView(model, self._shown, robots, objects, self._tables)
         self.bodies = _body_infos(model, tree, objects)
-        self._body_ids: NDArray[np.int64] = np.array([b.id for b in self.bodies], np.int64)
+        ids = [b.id for b in self.bodies]
+        whole = bool(ids) and ids == list(range(ids[0], ids[0] + len(ids)))
+        #: Rows of `xpos` to stream: a slice unless flexes lie between the bodies, which is much cheaper to copy.
+        self._rows: Any = slice(ids[0], ids[0] + len(ids)) if whole else np.array(ids, np.int64)
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
         self.tick_period_ns = round(float(model.opt.timestep) * 1e9)
         #: BLAKE2b of the model bytes, 32 hex characters.
@@ -212,8 +215,8 @@ class World:
 
     def poses(self, out: NDArray[np.float64]) -> None:
         """Writes world poses of `bodies`, `x y z qw qx qy qz`, into `out`, shape (len(bodies), 7)."""
-        out[:, :3] = self._shown.xpos[self._body_ids]
-        out[:, 3:] = self._shown.xquat[self._body_ids]
+        out[:, :3] = self._shown.xpos[self._rows]
+        out[:, 3:] = self._shown.xquat[self._rows]
 
     @property
     def trouble(self) -> dict[str, int]:
