@@ -27,13 +27,11 @@ def _struct(struct: Struct) -> str:
     lines = [f"#### {struct.name}", "", f"MessagePack {form}{tag}."]
     if struct.doc:
         lines[-1] += f" {struct.doc}"
-    if struct.fields:
-        first = "#" if struct.array_like else ""
-        lines += ["", f"| {first + ' | ' if first else ''}field | type | default |"]
-        lines.append("|" + "---|" * (4 if first else 3))
-        for k, field in enumerate(struct.fields):
-            index = f"{k} | " if first else ""
-            lines.append(f"| {index}`{field.name}` | {_type(field)} | {_default(field)} |")
+    index = "| # " if struct.array_like else ""
+    lines += ["", f"{index}| field | type | default |", "|" + "---|" * (3 + struct.array_like)]
+    for k, field in enumerate(struct.fields):
+        index = f"| {k} " if struct.array_like else ""
+        lines.append(f"{index}| `{field.name}` | {_type(field)} | {_default(field)} |")
     return "\n".join(lines)
 
 
