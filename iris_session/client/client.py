@@ -154,7 +154,8 @@ class Client(SceneView, Requests):
     def poll(self, timeout_s: float = 0.0) -> bool:
         """Receives, answers, keeps the connection alive. Waits up to `timeout_s` for something to come.
 
-        True when anything came or the connection's phase changed. Raises `RefusedError` after the session refused us for good.
+        True when anything came or the connection's phase changed. Raises `RefusedError` after the session refused us
+        for good.
         """
         if self._thread is not None and threading.current_thread() is not self._thread:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")

@@ -380,9 +380,12 @@ class Connection:
     def _queue(self, message: ClientMessage) -> bool:
         droppable = isinstance(message, Sample)
         if len(self._outgoing) >= MAX_OUTGOING:
-            self.counters.samples_not_sent += droppable
-            self.counters.outgoing_dropped += not droppable
-            return False
+            urgent = isinstance(message, EStop | Release | Bye)
+            lost_sample = self._outgoing.pop()[0] if urgent else droppable
+            self.counters.samples_not_sent += lost_sample
+            self.counters.outgoing_dropped += not lost_sample
+            if not urgent:
+                return False
         item = (droppable, encode_client(envelope(message, self.connection_epoch)))
         if isinstance(message, EStop | Release):
             self._outgoing.appendleft(item)

@@ -32,7 +32,12 @@ class Server:
         self.poses[:, 3] = 1.0
 
     def frame(self, now_ns: int, epoch: int = 1) -> list[bytes]:
+        """A frame in which everybody has moved."""
         self.poses[:, 0] += 0.001
+        return self.rest(now_ns, epoch)
+
+    def rest(self, now_ns: int, epoch: int = 1) -> list[bytes]:
+        """A frame as things stand."""
         encoded = self.encoder.encode(self.poses, epoch)
         header = StateHeader(epoch, 0, 0, 0.0, now_ns - MS, now_ns, encoded.state_seq, encoded.base_seq)
         return [TOPIC_RIGID, encode_state_header(header), encoded.payload]
@@ -75,11 +80,15 @@ def test_losing_more_than_the_window_asks_for_a_snapshot(server: Server) -> None
     for i in range(40):
         server.frame(i)
     server.join(stream)
-    rest = server.encoder
-    for _ in range(2 * WINDOW):  # only body 0 moves: the others rest on what was lost
-        server.poses[0, 0] += 0.01
-        rest.encode(server.poses, 1)
-    assert stream.drain([server.frame(MS)], MS) is not None or stream.wants_snapshot
+    server.poses[:, 1] += 1.0  # everybody moves, unseen by this client, and rests from then on
+    for _ in range(WINDOW + 2):
+        server.rest(0)
+    assert stream.drain([server.rest(MS)], MS) is None
+    assert stream.counters.undecodable == 1
+    assert stream.wants_snapshot
+    server.join(stream)
+    assert not stream.wants_snapshot
+    assert stream.drain([server.rest(2 * MS)], 2 * MS) is not None
 
 
 def test_a_new_epoch_is_handed_out_once_the_session_has_told_of_it(server: Server) -> None:

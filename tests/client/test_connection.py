@@ -1,0 +1,317 @@
+"""The sans-I/O core: every path through joining, losing and resuming, as plain bytes and numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.client.connection import (
+    BACKOFF_MAX_NS,
+    HELLO_TIMEOUT_NS,
+    MAX_INBOX,
+    MAX_OUTGOING,
+    Connection,
+)
+from iris_session.client.errors import NotConnectedError, VersionError
+from iris_session.client.identity import Identity
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Bye,
+    ClientMessage,
+    ClockPing,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Marker,
+    Sample,
+    TrackingEpoch,
+)
+from iris_session.protocol.codec import decode_client, encode_server
+from iris_session.protocol.common import Lease
+from iris_session.protocol.names import PROTOCOL_VERSION, DenialReason, RefusalCode
+from iris_session.protocol.server_messages import (
+    BodyInfo,
+    ClockPong,
+    Endpoints,
+    Event,
+    Notice,
+    ProtocolFault,
+    Refused,
+    Reply,
+    ServerEnvelope,
+    ServerMessage,
+    Snapshot,
+    Welcome,
+)
+
+MS = 1_000_000
+SECOND = 1000 * MS
+SAMPLE = Sample("head", "pose", 1, 0, 1, 0, 0)
+
+
+class Wire:
+    """A connection and what it sent."""
+
+    def __init__(self) -> None:
+        self.connection = Connection(Hello("operator", "ann"), Identity(b"s" * 16))
+        self.epoch = 0
+
+    def sent(self) -> list[ClientMessage]:
+        """Everything queued since the last call."""
+        messages = []
+        while (item := self.connection.peek_outgoing()) is not None:
+            self.connection.pop_outgoing(sent=True)
+            messages.append(decode_client(item[1]).message)
+        return messages
+
+    def get(self, message: ServerMessage, now_ns: int, *bulk: bytes, epoch: int | None = None) -> None:
+        envelope = ServerEnvelope(PROTOCOL_VERSION, self.epoch if epoch is None else epoch, message)
+        self.connection.receive([encode_server(envelope), *bulk], now_ns)
+
+    def welcome(self, now_ns: int, token: bytes = b"token", session: str = "s1") -> None:
+        self.epoch += 1
+        ports = Endpoints(state=1)
+        self.get(
+            Welcome(session, "lab", "live", "p1", self.epoch, "operator", token, False, 0, SECOND, MS, MS, ports),
+            now_ns,
+        )
+
+    def snapshot(self, now_ns: int, event_seq: int = 0, bodies: int = 2, data: bytes | None = None) -> None:
+        infos = tuple(BodyInfo(i, f"b{i}", True) for i in range(bodies))
+        poses = np.zeros((bodies, 7))
+        poses[:, 3] = 1.0
+        snapshot = Snapshot(0, event_seq, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=infos)
+        self.get(snapshot, now_ns, poses.tobytes() if data is None else data)
+
+    def join(self, now_ns: int = 0) -> None:
+        self.connection.open(now_ns)
+        self.welcome(now_ns)
+        self.get(ClockPong(now_ns, now_ns, now_ns), now_ns)
+        self.snapshot(now_ns)
+        self.sent()
+        assert self.connection.phase is Phase.READY
+
+
+@pytest.fixture
+def wire() -> Wire:
+    return Wire()
+
+
+def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
+    assert wire.connection.phase is Phase.IDLE
+    wire.connection.open(0)
+    (hello,) = wire.sent()
+    assert isinstance(hello, Hello)
+    assert hello.secret == b"s" * 16
+    wire.welcome(10 * MS)
+    assert wire.connection.identity.resume_token == b"token"
+    assert {type(m) for m in wire.sent()} == {ClockPing, GetSnapshot}
+    wire.snapshot(20 * MS)
+    assert wire.connection.phase is Phase.SYNCING  # no clock yet
+    wire.get(ClockPong(10 * MS, 0, 0), 20 * MS)
+    assert wire.connection.phase is Phase.READY
+
+
+def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    hellos, now = [0], 0
+    while now < 60 * SECOND:
+        generation = wire.connection.generation
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        if wire.connection.generation != generation:
+            hellos.append(now)
+            assert [type(m) for m in wire.sent()] == [Hello]
+    gaps = np.diff(hellos)
+    assert (np.diff(gaps) >= 0).all()
+    assert gaps[0] < HELLO_TIMEOUT_NS + 200 * MS
+    assert gaps[-1] == HELLO_TIMEOUT_NS + BACKOFF_MAX_NS
+
+
+def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
+    wire.join()
+    kinds: list[type] = []
+    now = 0
+    while now < 10 * SECOND:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        for message in wire.sent():
+            kinds.append(type(message))
+            if isinstance(message, ClockPing):
+                wire.get(ClockPong(message.t0_ns, now, now), now)
+    assert wire.connection.phase is Phase.READY
+    assert kinds.count(Heartbeat) >= 19
+    assert 15 <= kinds.count(ClockPing) <= 35
+
+
+def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> None:
+    wire.join()
+    now = 0
+    while wire.connection.joined:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+    assert 3 * SECOND <= now <= 5 * SECOND
+    assert wire.connection.counters.reconnects == 1
+    wire.sent()
+    wire.connection.tick(wire.connection.next_deadline_ns(now))
+    (hello,) = wire.sent()
+    assert isinstance(hello, Hello)
+    assert hello.resume_token == b"token"
+
+
+def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
+    wire.connection.identity.resume_token = b"old"
+    wire.connection.open(0)
+    wire.sent()
+    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), MS, epoch=0)
+    (hello,) = wire.sent()
+    assert isinstance(hello, Hello)
+    assert hello.resume_token == b""
+    assert wire.connection.generation == 2
+
+
+def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
+    wire.join()
+    wire.connection.lost(SECOND)
+    wire.connection.tick(2 * SECOND)
+    wire.get(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
+    assert wire.connection.phase is Phase.WAITING
+    wire.connection.tick(5 * SECOND)
+    wire.get(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
+    assert wire.connection.phase is Phase.REFUSED
+    assert isinstance(wire.connection.failure, VersionError)
+    assert wire.connection.failure.supported_versions == (7, 8)
+    wire.connection.open(6 * SECOND)
+    assert wire.connection.phase is Phase.JOINING
+    assert wire.connection.failure is None
+
+
+@pytest.mark.parametrize("code", ["session_ended", "dropped", "hello"])
+def test_faults_that_end_the_connection(wire: Wire, code: str) -> None:
+    wire.join()
+    wire.get(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
+    assert wire.connection.phase is Phase.WAITING
+    assert wire.connection.counters.faults == {code: 1}
+
+
+def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire: Wire) -> None:
+    wire.join()
+    wire.connection.tracking_epoch = 3
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    assert wire.connection.mirror.event_seq == 1
+    wire.connection.lost(SECOND)
+    wire.connection.tick(2 * SECOND)
+    wire.sent()
+    wire.welcome(2 * SECOND, session="s2")
+    assert not wire.connection.clock.synced
+    assert wire.connection.mirror.event_seq == 0
+    assert TrackingEpoch(3) in wire.sent()
+
+
+def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -> None:
+    assert not wire.connection.send(SAMPLE)
+    with pytest.raises(NotConnectedError):
+        wire.connection.send(EStop())
+    with pytest.raises(NotConnectedError):
+        wire.connection.request(Acquire(0))
+    wire.join()
+    wire.connection.send(SAMPLE)
+    wire.connection.lost(SECOND)
+    assert wire.sent() == []
+    assert wire.connection.counters.samples_not_sent == 1
+
+
+def test_urgent_messages_overtake_and_the_queue_is_bounded(wire: Wire) -> None:
+    wire.join()
+    for _ in range(2 * MAX_OUTGOING):
+        wire.connection.send(SAMPLE)
+    wire.connection.send(EStop("now"))
+    sent = wire.sent()
+    assert sent[0] == EStop("now")
+    assert len(sent) == MAX_OUTGOING
+    assert wire.connection.counters.samples_not_sent == MAX_OUTGOING + 1
+
+
+def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
+    wire.join()
+    number = wire.connection.request(Acquire(0, ("left",)))
+    assert wire.sent() == [Acquire(number, ("left",))]
+    lease = Lease("left", "robot", "exclusive", "p1", 4)
+    wire.get(Reply(number, True, leases=(lease,)), MS)
+    wire.get(Reply(number, True), MS)
+    assert wire.connection.counters.unexpected_replies == 1
+    reply = wire.connection.take_reply(number)
+    assert reply is not None
+    assert reply.ok
+    assert wire.connection.take_reply(number) is None
+    assert wire.connection.lease_version("left") == 4
+    wire.connection.lost(SECOND)
+    wire.connection.tick(2 * SECOND)
+    assert wire.connection.lease_version("left") is None
+
+
+def test_messages_for_an_earlier_connection_are_counted_not_applied(wire: Wire) -> None:
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS, epoch=99)
+    assert wire.connection.mirror.event_seq == 0
+    assert wire.connection.counters.other_connection == 1
+
+
+def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> None:
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.get(Event(3, 0, 0, Notice("info", "y")), MS)
+    now, asked = MS, 0
+    while now < 3 * SECOND:
+        now = max(now + MS, wire.connection.next_deadline_ns(now))
+        wire.connection.tick(now)
+        for message in wire.sent():
+            asked += isinstance(message, GetSnapshot)
+            if isinstance(message, ClockPing):
+                wire.get(ClockPong(message.t0_ns, now, now), now)
+    assert 4 <= asked <= 7
+    wire.snapshot(now, event_seq=2)
+    assert wire.connection.mirror.event_seq == 3
+    assert [e.event_seq for e in wire.connection.inbox if isinstance(e, Event)] == [1, 3]
+
+
+def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
+    wire.join()
+    for i in range(MAX_INBOX + 10):
+        wire.get(Event(i + 1, 0, 0, Notice("info", "x")), MS)
+    assert len(wire.connection.inbox) == MAX_INBOX
+    assert wire.connection.counters.inbox_dropped == 10
+
+
+@pytest.mark.parametrize("data", [b"", b"12345678", b"\0" * (3 * 56)])
+def test_snapshot_with_poses_of_another_size_is_malformed(wire: Wire, data: bytes) -> None:
+    wire.connection.open(0)
+    wire.welcome(0)
+    wire.snapshot(MS, data=data)
+    assert wire.connection.counters.malformed == 1
+    assert not wire.connection.mirror.synced
+
+
+def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
+    wire.join()
+    wire.connection.send(Marker(0, "note"))
+    wire.connection.close()
+    assert isinstance(wire.sent()[-1], Bye)
+    assert wire.connection.identity.resume_token == b""
+    with pytest.raises(NotConnectedError, match="closed"):
+        wire.connection.send(EStop())
+
+
+@given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))
+@settings(max_examples=150, deadline=None)
+def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> None:
+    wire = Wire()
+    wire.join()
+    for frames in messages:
+        wire.connection.receive(frames, MS)
+    assert wire.connection.phase is Phase.READY
+    assert wire.connection.counters.malformed == len(messages)
