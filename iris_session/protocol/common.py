@@ -8,8 +8,10 @@ import msgspec
 
 #: A name typed by a person: robot, object, participant, anchor.
 Name = Annotated[str, msgspec.Meta(max_length=64)]
+#: Characters of a `Text`.
+MAX_TEXT = 512
 #: Free text shown to a person.
-Text = Annotated[str, msgspec.Meta(max_length=512)]
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 #: Any counter, epoch, version or nanosecond count. Fits an int64 in every client language.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
@@ -56,7 +58,10 @@ class Lease(msgspec.Struct, frozen=True):
 
 
 class Denial(msgspec.Struct, frozen=True):
-    """A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do."""
+    """A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do.
+
+    Texts that list what would have been right are cut to the length of a `Text`.
+    """
 
     reason: Name
     message: Text
@@ -64,6 +69,13 @@ class Denial(msgspec.Struct, frozen=True):
     target: Name = ""
     holder: Name = ""
     holder_name: Name = ""
+
+    def __post_init__(self) -> None:
+        # A scene may have hundreds of names: a longer text would make the client refuse the whole reply.
+        for field in ("message", "advice"):
+            text = getattr(self, field)
+            if len(text) > MAX_TEXT:
+                msgspec.structs.force_setattr(self, field, text[: MAX_TEXT - 3] + "...")
 
 
 class Alignment(msgspec.Struct, frozen=True):

@@ -9,10 +9,11 @@ import pytest
 
 from iris_session.protocol import entries, specs, steps
 from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sample
-from iris_session.protocol.common import IDENTITY, Applied, Pose, Target
+from iris_session.protocol.codec import decode_server, encode_server
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Applied, Denial, Pose, Target
 from iris_session.protocol.entries import Entry, decode_entries, decode_entry, encode_entries, encode_entry
 from iris_session.protocol.generate.examples import extreme, full, least
-from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem
+from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
 
 WIRE = set(get_args(ClientMessage))
 INTERNAL = [kind for kind in get_args(entries.EntryMessage) if kind not in WIRE]
@@ -131,3 +132,14 @@ def test_status_and_specs_are_values() -> None:
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(robot), type=specs.RobotSpec) == robot
     assert hash(specs.ObjectSpec("board", "board")) == hash(specs.ObjectSpec("board", "board"))
     assert Target("left", 1).kind == "robot"
+
+
+def test_denial_of_a_large_scene_fits_the_wire() -> None:
+    names = ", ".join(f"free_body_{i}" for i in range(300))
+    denial = Denial("unknown_target", f"no object x among {names}", f"objects: {names}", "x")
+    assert denial.advice.startswith("objects: free_body_0, ")
+    assert denial.advice.endswith("...")
+    assert len(denial.message) == len(denial.advice) == MAX_TEXT
+    answer = ServerEnvelope(1, 1, Reply(1, False, denial))
+    assert decode_server(encode_server(answer)) == answer
+    assert Denial("held", "short", "wait").advice == "wait"

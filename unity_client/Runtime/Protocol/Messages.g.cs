@@ -900,6 +900,8 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// A typed no: the reason (DenialReason), who holds what was asked for, and what to do.
+    ///
+    /// Texts that list what would have been right are cut to the length of a Text.
     /// </summary>
     public sealed class Denial : WireValue
     {

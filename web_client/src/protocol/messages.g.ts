@@ -248,7 +248,11 @@ export interface Lease {
   weights?: number[];
 }
 
-/** A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do. */
+/**
+ * A typed no: the reason (`DenialReason`), who holds what was asked for, and what to do.
+ *
+ * Texts that list what would have been right are cut to the length of a `Text`.
+ */
 export interface Denial {
   reason: DenialReason;
   message: string;
