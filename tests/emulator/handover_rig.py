@@ -115,9 +115,11 @@ class Referee:
 
 def _is_handover(flight: Sequence[tuple[float, tuple[str, ...]]], giver: str, receiver: str) -> bool:
     held = [set(holders) for _, holders in flight]
-    free_s = sum(after - since for (since, holders), (after, _) in itertools.pairwise(flight) if not holders)
+    free_s = max(
+        (after - since for (since, holders), (after, _) in itertools.pairwise(flight) if not holders), default=0.0
+    )
     return (
-        free_s < 0.02  # a contact may flicker for a few ticks
+        free_s < 0.012  # a pad may lose contact for a few ticks
         and next((h for h in held if h), set()) == {giver}
         and {giver, receiver} in held
         and next((h for h in reversed(held) if h), set()) == {receiver}

@@ -86,7 +86,7 @@ def test_without_a_lease_the_operator_waits() -> None:
     assert verdict(rig, "left", "right") == ""
 
 
-@pytest.mark.parametrize("phase", ["approach", "lift", "offer", "release"])
+@pytest.mark.parametrize("phase", ["approach", "release"])
 def test_lost_engagement_of_the_giver_is_noticed(phase: str) -> None:
     """The session ended the engagement (a gap in the samples): the giver sees it and clutches again."""
     rig = handover(6)
@@ -98,7 +98,7 @@ def test_lost_engagement_of_the_giver_is_noticed(phase: str) -> None:
     assert rig.behaviours["left"].hand.reclutches >= 1  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("phase", ["descend", "carry", "put"])
+@pytest.mark.parametrize("phase", ["carry", "put"])
 def test_lost_engagement_of_the_receiver_is_noticed(phase: str) -> None:
     rig = handover(7)
     rig.run(30.0, until=_until("right", phase))
@@ -160,6 +160,14 @@ def test_receiver_gives_up_when_nothing_is_offered() -> None:
     assert rig.behaviours["right"].failed == "nobody offered the hammer within 1 s"
 
 
+def test_operator_says_what_is_not_in_the_scene() -> None:
+    rig = Rig({"left": Giver("left", "object1", "third")}, seed=11)
+    rig.run(12.0)
+    assert rig.behaviours["left"].failed == (
+        "not to be seen in the scene: object1, third/finger_left, third/finger_right, third/base, tip third"
+    )
+
+
 def test_wander_stays_near_and_cycles_the_clutch() -> None:
     rig = Rig({"left": Wander("left", seed=3), "right": Wander("right", seed=4)}, seed=12)
     home = rig.world.view().tip_pose("left").p
@@ -196,12 +204,3 @@ def test_make_behaviour() -> None:
         make_behaviour("juggler", "left")
     with pytest.raises(ValueError, match="Known things: hammer, board"):
         make_behaviour("giver", "left", "teapot")
-
-
-def test_hand_turns_with_the_tip() -> None:
-    """Rotation is relative too: the hand turns about the world's axes by what the tip shall turn."""
-    rig = handover(14, shift=False)
-    rig.run(30.0, until=_until("left", "descend"))
-    tip, hand = rig.world.view().tip_pose("left"), rig.views["left"].hand
-    assert math.isclose(sum(c * c for c in hand[1]), 1.0, abs_tol=1e-9)
-    assert tip.q != hand[1]

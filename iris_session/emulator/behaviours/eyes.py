@@ -40,7 +40,7 @@ class Seen:
 
 
 class Eyes:
-    """Watches bodies and robot tips by name. `ready` once every one of them was seen.
+    """Watches bodies and robot tips by name. `missing`: which of them were never seen so far.
 
     `perhaps`: bodies that need not be there.
     """
@@ -52,7 +52,7 @@ class Eyes:
         self._perhaps = perhaps
         self._seen: dict[str, Seen] = {}
         self._others: list[Vec3] = []
-        self.ready = False
+        self.missing: tuple[str, ...] = self._bodies
 
     def look(self, view: OperatorView) -> None:
         """Takes in the present picture. What is not in it stays as it was last seen."""
@@ -66,8 +66,13 @@ class Eyes:
                 self._seen[name].update(pose, now_s)
             else:
                 self._seen[name] = Seen(pose, now_s)
-        self.ready = len(self._seen) == len(poses)
+        self.missing = tuple(name for name, _ in poses if name not in self._seen)
         self._others = [pose[0] for pose in map(view.body_pose, self._perhaps) if pose is not None]
+
+    @property
+    def ready(self) -> bool:
+        """Whether everything was seen."""
+        return not self.missing
 
     def others(self) -> list[Vec3]:
         """Where those of `perhaps` are [m] that are there."""

@@ -16,6 +16,8 @@ EXCHANGE_HEIGHT = 0.34
 CLEAR_ABOVE = 0.11
 #: Speed of the last centimetres before a grasp [m/s].
 CAREFUL_SPEED = 0.16
+#: How long an operator looks for a robot or thing that is not in the picture [s].
+SEARCH_S = 10.0
 #: So often taking the thing is tried before the operator gives up.
 ATTEMPTS = 4
 
@@ -37,6 +39,7 @@ class Operator:
         self.eyes = Eyes((object,), (robot, partner), tuple(name for name in COMMON_THINGS if name != object))
         self._entering, self._entering_now = True, False
         self._entered_s = 0.0
+        self._search_since_ns: int | None = None
         self._home: PoseTuple | None = None
         self._steps: dict[str, Callable[[], None]] = {
             "wait": self._wait,
@@ -55,6 +58,8 @@ class Operator:
     def update(self, view: OperatorView) -> tuple[HandInput, ...]:
         """One look and one hand input; see `Behaviour.update`."""
         self.eyes.look(view)
+        if not self.eyes.ready:
+            self._search(view)
         if self.done:
             return (self.hand.rest(view),)
         can_act = self.hand.update(view, self.eyes.tip(self.robot) if self.eyes.ready else None)
@@ -62,6 +67,13 @@ class Operator:
             self._entering_now, self._entering = self._entering, False
             self._steps[self.phase]()
         return (self.hand.input(),)
+
+    def _search(self, view: OperatorView) -> None:
+        """Not everything that is needed was ever in the picture: gives up after a while."""
+        if self._search_since_ns is None:
+            self._search_since_ns = view.session_time_ns
+        if view.session_time_ns - self._search_since_ns > SEARCH_S * 1e9:
+            self._give_up(f"not to be seen in the scene: {', '.join(self.eyes.missing)}")
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 

@@ -1,0 +1,336 @@
+"""The parts of the operators one by one: reaches, the clutched hand, eyes, and what they know of the things."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anchors.pose import (
+    IDENTITY_POSE,
+    IDENTITY_QUAT,
+    PoseTuple,
+    compose,
+    distance,
+    inverse,
+    quat_angle,
+    quat_conj,
+    quat_from_rotvec,
+    quat_from_yaw,
+    quat_mul,
+)
+from iris_session.emulator.behaviours.eyes import Eyes, Seen
+from iris_session.emulator.behaviours.hand import LONGEST_STEP_S, REARM_S, TRIGGER_S, ClutchedHand
+from iris_session.emulator.behaviours.reach import Reach, min_jerk
+from iris_session.emulator.behaviours.things import (
+    COMMON_THINGS,
+    Thing,
+    face_up,
+    grasp,
+    level,
+    thing_named,
+    tilt,
+)
+from iris_session.physics.scenes import n_arms_scene, scene_path
+
+STEP_NS = 13_888_889  # 72 Hz
+_metres = st.floats(-1.0, 1.0)
+_poses = st.tuples(st.tuples(_metres, _metres, _metres), st.tuples(_metres, _metres, _metres).map(quat_from_rotvec))
+
+
+class PerfectRobot:
+    """`OperatorView` of a robot that follows the hand at once, unless `holds`; the hand starts anywhere."""
+
+    def __init__(self, tip: PoseTuple, hand: PoseTuple) -> None:
+        self.session_time_ns = 1
+        self.estop = False
+        self.lease: int | None = 1
+        self.tip, self.hand = tip, hand
+        self.holds = False
+        self._latch: tuple[PoseTuple, PoseTuple] | None = None
+
+    def body_pose(self, name: str) -> PoseTuple | None:
+        return None
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        return self.tip
+
+    def lease_version(self, robot: str) -> int | None:
+        return self.lease
+
+    def device_pose(self, device: str) -> PoseTuple:
+        return self.hand
+
+    def run(self, hand: ClutchedHand, seconds: float) -> list[bool]:
+        """Lets the hand act for a while; returns the clutch over time."""
+        clutches = []
+        for _ in range(round(seconds * 1e9 / STEP_NS)):
+            self.session_time_ns += STEP_NS
+            hand.update(self, self.tip)
+            given_input = hand.input()
+            self.hand = given_input.pose_world
+            clutches.append(given_input.clutch)
+            if not given_input.clutch:
+                self.holds, self._latch = False, None  # an opened clutch arms the session again
+            elif self._latch is None:
+                self._latch = (self.hand, self.tip)
+            elif not self.holds:
+                (h0, t0), (p, q) = self._latch, self.hand
+                moved = (t0[0][0] + p[0] - h0[0][0], t0[0][1] + p[1] - h0[0][1], t0[0][2] + p[2] - h0[0][2])
+                self.tip = (moved, quat_mul(quat_mul(q, quat_conj(h0[1])), t0[1]))
+        return clutches
+
+
+def test_min_jerk_begins_and_ends_at_rest() -> None:
+    assert min_jerk(-1.0) == min_jerk(0.0) == 0.0
+    assert min_jerk(1.0) == min_jerk(2.0) == 1.0
+    assert min_jerk(0.5) == pytest.approx(0.5)
+    h = 1e-4
+    for s in (0.0, 1.0):
+        assert abs(min_jerk(s + h) - min_jerk(s - h)) / (2 * h) < 1e-6
+
+
+@settings(max_examples=60, deadline=None)
+@given(_poses, _poses)
+def test_reach_keeps_its_speed_limits(start: PoseTuple, goal: PoseTuple) -> None:
+    reach = Reach.plan(start, goal, 5.0, speed=0.4, turn=1.5)
+    assert distance(reach.pose(5.0)[0], start[0]) < 1e-12
+    assert distance(reach.pose(100.0)[0], goal[0]) < 1e-12
+    assert quat_angle(reach.pose(100.0)[1], goal[1]) < 1e-7
+    n, last = 200, reach.pose(5.0)
+    step_s = reach.duration_s / n
+    for i in range(1, n + 1):
+        pose = reach.pose(5.0 + i * step_s)
+        assert distance(last[0], pose[0]) <= 0.4 * step_s * 1.001
+        assert quat_angle(last[1], pose[1]) <= 1.5 * step_s * 1.001 + 1e-9
+        last = pose
+    assert reach.finished(5.0 + reach.duration_s)
+    assert not reach.finished(5.0 + 0.99 * reach.duration_s)
+
+
+@settings(max_examples=12, deadline=None)
+@given(_poses, _poses, _poses)
+def test_hand_brings_the_tip_to_the_goal_from_anywhere(tip: PoseTuple, hand_at: PoseTuple, goal: PoseTuple) -> None:
+    """Wherever the hand is and however it is turned: relative motion takes the tip there."""
+    robot, hand = PerfectRobot(tip, hand_at), ClutchedHand("controller/right", "left")
+    hand.move_to(goal)
+    robot.run(hand, 16.0)
+    assert distance(robot.tip[0], goal[0]) < 1e-3
+    assert quat_angle(robot.tip[1], goal[1]) < 5e-3
+    assert not hand.arrived()  # seen there for the first time
+    robot.run(hand, 0.2)
+    assert hand.arrived()
+    assert hand.reclutches == 0
+
+
+def test_engaging_moves_nothing() -> None:
+    robot, hand = (
+        PerfectRobot(((0.1, 0.2, 0.3), IDENTITY_QUAT), ((1.0, 1.0, 1.0), quat_from_yaw(1.0))),
+        ClutchedHand("controller/right", "left"),
+    )
+    before = robot.hand
+    clutches = robot.run(hand, 0.5)
+    assert clutches[-1]
+    assert robot.hand == before
+
+
+def test_hand_closes_the_clutch_again_when_the_robot_does_not_follow() -> None:
+    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
+    hand.move_to(((0.3, 0.0, 0.0), IDENTITY_QUAT))
+    robot.run(hand, 0.2)
+    robot.holds = True
+    clutches = robot.run(hand, 6.0)
+    open_s = clutches.count(False) * STEP_NS * 1e-9
+    assert hand.reclutches == 1
+    assert open_s == pytest.approx(REARM_S, abs=0.05)
+    assert distance(robot.tip[0], (0.3, 0.0, 0.0)) < 1e-3
+
+
+def test_short_moves_that_are_not_followed_are_noticed_too() -> None:
+    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
+    robot.run(hand, 0.2)
+    robot.holds = True
+    hand.move_to(((0.03, 0.0, 0.0), IDENTITY_QUAT), correct=False)
+    robot.run(hand, 6.0)
+    assert hand.reclutches == 1
+    assert distance(robot.tip[0], (0.03, 0.0, 0.0)) < 1e-3
+
+
+def test_estop_and_lost_lease_open_the_clutch() -> None:
+    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
+    hand.move_to(((0.2, 0.0, 0.0), IDENTITY_QUAT))
+    robot.run(hand, 0.3)
+    robot.estop = True
+    before = robot.tip
+    assert not any(robot.run(hand, 1.0))
+    assert robot.tip == before
+    robot.estop, robot.lease = False, None
+    assert not any(robot.run(hand, 1.0))
+    robot.lease = 2
+    robot.run(hand, 3.0)
+    assert distance(robot.tip[0], (0.2, 0.0, 0.0)) < 1e-3
+
+
+def test_the_hand_does_not_jump_after_a_stall() -> None:
+    """The computer stood still for 2 s in the middle of a movement: the operator goes on where he was."""
+    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
+    hand.move_to(((0.4, 0.0, 0.0), IDENTITY_QUAT))
+    robot.run(hand, 0.8)
+    before = robot.hand
+    robot.session_time_ns += 2_000_000_000
+    robot.run(hand, 0.02)
+    assert distance(before[0], robot.hand[0]) <= 0.4 * LONGEST_STEP_S + 0.4 * STEP_NS * 1e-9
+
+
+def test_trigger_takes_its_time() -> None:
+    robot, hand = PerfectRobot(IDENTITY_POSE, IDENTITY_POSE), ClutchedHand("controller/right", "left")
+    robot.run(hand, 0.1)
+    hand.trigger_goal = 1.0
+    robot.run(hand, TRIGGER_S / 2)
+    assert hand.input().gripper == pytest.approx(0.5, abs=0.1)
+    assert not hand.trigger_done()
+    robot.run(hand, TRIGGER_S)
+    assert hand.input().gripper == 1.0
+    assert hand.trigger_done()
+
+
+def test_seen_smooths_noise_and_follows() -> None:
+    seen, rng = Seen(IDENTITY_POSE, 0.0), np.random.default_rng(1)
+    errors = []
+    for i in range(1, 720):
+        noisy = (tuple(map(float, rng.normal(0, 1e-3, 3))), quat_from_rotvec(tuple(map(float, rng.normal(0, 5e-3, 3)))))
+        seen.update(noisy, i / 72)  # type: ignore[arg-type]
+        errors.append(distance(seen.pose[0], (0.0, 0.0, 0.0)))
+    assert np.mean(errors) < 0.75e-3
+    assert seen.still_s > 5.0
+    for i in range(720, 760):
+        seen.update(((0.1, 0.0, 0.0), quat_from_yaw(0.5)), i / 72)
+    assert seen.pose[0][0] == pytest.approx(0.1, abs=1e-3)
+    assert quat_angle(seen.pose[1], quat_from_yaw(0.5)) < 5e-3
+    assert seen.still_s < 0.6
+
+
+class Picture:
+    """`OperatorView` that shows fixed poses."""
+
+    session_time_ns = 0
+    estop = False
+
+    def __init__(self, poses: dict[str, PoseTuple]) -> None:
+        self.poses = poses
+
+    def body_pose(self, name: str) -> PoseTuple | None:
+        return self.poses.get(name)
+
+    def tip_pose(self, robot: str) -> PoseTuple | None:
+        return self.poses.get(f"tip:{robot}")
+
+    def lease_version(self, robot: str) -> int | None:
+        return 1
+
+    def device_pose(self, device: str) -> PoseTuple:
+        return IDENTITY_POSE
+
+
+def _gripper_at(x: float, y: float, half_gap: float) -> dict[str, PoseTuple]:
+    """Fingers of `left` that point down from 45 mm above height 0.3, closing along y."""
+    down = (0.0, 1.0, 0.0, 0.0)
+    return {
+        "left/finger_left": ((x, y - half_gap, 0.345), down),
+        "left/finger_right": ((x, y + half_gap, 0.345), quat_mul(quat_from_yaw(math.pi), down)),
+        "left/base": IDENTITY_POSE,
+        "tip:left": ((x, y, 0.3), down),
+        "hammer": ((0.0, 0.0, 0.3), IDENTITY_QUAT),
+    }
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "half_gap", "holds"),
+    [
+        (0.08, 0.0, 0.0123, True),
+        (-0.08, 0.002, 0.0120, True),
+        (0.08, 0.0, 0.030, False),  # open around it
+        (0.08, 0.03, 0.0123, False),  # closed beside it
+        (0.20, 0.0, 0.0123, False),  # closed beyond its end
+        (0.08, 0.0, 0.0, False),  # closed on nothing
+    ],
+)
+def test_eyes_see_who_holds_a_thing(x: float, y: float, half_gap: float, holds: bool) -> None:
+    eyes = Eyes(("hammer",), ("left",))
+    eyes.look(Picture(_gripper_at(x, y, half_gap)))
+    assert eyes.ready
+    assert eyes.gap("left") == pytest.approx(2 * half_gap)
+    assert eyes.holds("left", "hammer", thing_named("hammer").half_width) is holds
+
+
+def test_eyes_say_what_is_missing() -> None:
+    eyes = Eyes(("hammer",), ("left",), perhaps=("board",))
+    poses = _gripper_at(0.0, 0.0, 0.04)
+    base = poses.pop("left/base")
+    eyes.look(Picture(poses))
+    assert eyes.missing == ("left/base",)
+    assert eyes.others() == []
+    eyes.look(Picture(poses | {"left/base": base, "board": ((1.0, 2.0, 3.0), IDENTITY_QUAT)}))
+    assert eyes.ready
+    assert eyes.others() == [(1.0, 2.0, 3.0)]
+
+
+def _outline(model: mujoco.MjModel, body: str) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of all geoms of `body`, body frame [m]."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for g in range(model.ngeom):
+        if int(model.geom_bodyid[g]) == model.body(body).id:
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, model.geom_quat[g])
+            centre, half = model.geom_aabb[g][:3], model.geom_aabb[g][3:]
+            middle = model.geom_pos[g] + turn.reshape(3, 3) @ centre
+            extent = np.abs(turn.reshape(3, 3)) @ half
+            low, high = np.minimum(low, middle - extent), np.maximum(high, middle + extent)
+    return low, high
+
+
+@pytest.mark.parametrize("body", ["hammer", "board", "object1", "object2"])
+def test_what_people_know_of_the_things_is_true(body: str) -> None:
+    """The operators' outlines and grasp places fit the geoms of the scenes."""
+    if body.startswith("object"):
+        model = n_arms_scene(4).compile()
+    else:
+        model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    thing: Thing = thing_named(body)
+    low, high = _outline(model, body)
+    corners = np.array(thing.corners)
+    np.testing.assert_allclose(corners.max(axis=0)[[0, 2]], high[[0, 2]], atol=1.5e-3)
+    np.testing.assert_allclose(corners.min(axis=0)[[0, 2]], low[[0, 2]], atol=1.5e-3)
+    assert thing.half_thickness == pytest.approx(high[2], abs=1e-3)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    T_world_thing = (tuple(data.body(body).xpos.tolist()), tuple(data.body(body).xquat.tolist()))
+    assert abs(thing.lowest(T_world_thing)) < 2e-3  # it lies on the table
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-3.1, 3.1), st.booleans(), st.floats(-3.1, 3.1))
+def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, gripper_yaw: float) -> None:
+    thing = level((0.1, 0.2, 0.016), yaw, -1.0 if flipped else 1.0)
+    assert face_up(thing) == (-1.0 if flipped else 1.0)
+    assert tilt(thing) < 1e-6
+    like = quat_mul(quat_from_yaw(gripper_yaw), (0.0, 1.0, 0.0, 0.0))
+    pose = grasp(thing, 0.08, like)
+    approach = compose((((0.0, 0.0, 0.0)), pose[1]), ((0.0, 0.0, 1.0), IDENTITY_QUAT))[0]
+    closing = compose((((0.0, 0.0, 0.0)), compose(inverse(thing), pose)[1]), ((0.0, 1.0, 0.0), IDENTITY_QUAT))[0]
+    assert approach[2] == pytest.approx(-1.0)
+    assert abs(closing[1]) == pytest.approx(1.0)  # across the handle
+    assert quat_angle(pose[1], like) <= math.pi / 2 + 1e-9
+    assert pose[0][2] == pytest.approx(0.019)
+
+
+def test_known_things() -> None:
+    assert set(COMMON_THINGS) >= {"hammer", "board", "object1"}
+    assert thing_named("object3") is thing_named("hammer")
+    with pytest.raises(ValueError, match="Known things"):
+        thing_named("objective")
