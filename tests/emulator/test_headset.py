@@ -1,0 +1,191 @@
+"""The emulated headset: its noise is what it says, its frame is its own, and it is reproducible."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentEstimator
+from anchors.pose import (
+    PoseTuple,
+    apply,
+    compose,
+    distance,
+    inverse,
+    quat_angle,
+    quat_conj,
+    quat_from_rotvec,
+    quat_mul,
+    quat_rotate,
+    quat_to_rotvec,
+)
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR, Headset, HeadsetModel, look_at
+from iris_session.emulator.link import DelayLine, LinkModel
+from iris_session.emulator.specs import HeadsetSpec
+from iris_session.emulator.viewpoints import between, viewpoint_pose
+
+SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+SHEET = DEFAULT_T_WORLD_ANCHOR
+STILL = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0)
+
+
+def above(d: float, aside: float = 0.2) -> PoseTuple:
+    """A head at distance `d` from the sheet, looking at it from above and a little aside."""
+    x, y, z = SHEET[0]
+    return look_at((x, y - d * math.sin(aside), z + d * math.cos(aside)), SHEET[0])
+
+
+def errors(headset: Headset, head: PoseTuple, n: int, viewpoint: int | None = None) -> np.ndarray:
+    """(n, 4): position error along and across (2) the view, angle about one axis; each from another viewpoint."""
+    rows = []
+    e1 = np.subtract(SHEET[0], head[0]) / distance(SHEET[0], head[0])
+    e2 = np.cross(e1, (1.0, 0.0, 0.0))
+    e2 /= np.linalg.norm(e2)
+    e3 = np.cross(e1, e2)
+    for i in range(n):
+        seen = headset.observe(head, SHEET, 0, i if viewpoint is None else viewpoint)
+        assert seen is not None
+        world = compose(headset.T_world_tracking(0), seen)
+        off = np.subtract(world[0], SHEET[0])
+        turn = quat_to_rotvec(quat_mul(quat_conj(SHEET[1]), world[1]))
+        rows.append((off @ e1, off @ e2, off @ e3, turn[2]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("d", "along_mm", "degrees"), [(0.5, 1.5, 0.3), (1.0, 4.8, 0.6)])
+def test_sheet_noise_is_that_of_the_model(d: float, along_mm: float, degrees: float) -> None:
+    spread = errors(Headset(STILL, seed=1), above(d), 3000).std(axis=0)
+    assert spread[0] == pytest.approx(along_mm * 1e-3, rel=0.06)
+    assert spread[1] == pytest.approx(along_mm * 1e-3 / 3.0, rel=0.06)
+    assert spread[2] == pytest.approx(along_mm * 1e-3 / 3.0, rel=0.06)
+    assert spread[3] == pytest.approx(math.radians(degrees), rel=0.06)
+
+
+def test_half_of_the_variance_is_the_same_for_one_viewpoint() -> None:
+    headset = Headset(STILL, seed=2)
+    within = np.mean([errors(headset, above(0.5), 40, viewpoint)[:, 0].var(ddof=1) for viewpoint in range(60)])
+    assert within == pytest.approx(0.5 * 0.0015**2, rel=0.1)
+
+
+def test_same_seed_same_readings() -> None:
+    a, b, c = (Headset(HeadsetModel(), seed) for seed in (3, 3, 4))
+    for headset in (a, b, c):
+        headset.recentre(SECOND)
+    readings = [[h.observe(above(0.5), SHEET, i * SECOND, 0) for i in range(5)] for h in (a, b, c)]
+    assert readings[0] == readings[1]
+    assert readings[0] != readings[2]
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        above(2.0),
+        above(0.5, aside=1.3),
+        compose(above(0.5), ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, 0.0, 1.0)))),
+        look_at((0.0, -0.55, -0.5), SHEET[0]),
+    ],
+    ids=["far", "from the side", "looking away", "from below"],
+)
+def test_the_sheet_is_not_always_seen(head: PoseTuple) -> None:
+    assert Headset(HeadsetModel(), 0).observe(head, SHEET, 0, 0) is None
+
+
+def test_drift_and_tilt_are_small_and_stated() -> None:
+    headset = Headset(HeadsetModel(), seed=5)
+    start, later = headset.T_world_tracking(0), headset.T_world_tracking(10 * MINUTE)
+    assert distance(start[0], later[0]) == pytest.approx(0.010)
+    assert quat_angle(start[1], later[1]) == pytest.approx(math.radians(0.2))
+    tilts = []
+    for seed in range(200):
+        up = quat_rotate(Headset(HeadsetModel(), seed).T_world_tracking(0)[1], (0.0, 0.0, 1.0))
+        tilts.append(math.acos(min(1.0, up[2])))
+    assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(math.radians(0.2) * math.sqrt(2.0), rel=0.15)
+
+
+def test_recentring_is_another_frame_and_epoch() -> None:
+    headset = Headset(HeadsetModel(), seed=6)
+    before = headset.T_world_tracking(SECOND)
+    headset.recentre(SECOND)
+    assert headset.tracking_epoch == 1
+    assert distance(before[0], headset.T_world_tracking(SECOND)[0]) > 0.01
+
+
+def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
+    headset = Headset(HeadsetModel(), seed=7)
+    seen = [headset.track(above(0.5), SECOND) for _ in range(500)]
+    back = [compose(headset.T_world_tracking(SECOND), pose) for pose in seen]
+    offsets = np.array([np.subtract(pose[0], above(0.5)[0]) for pose in back])
+    assert offsets.std() == pytest.approx(headset.model.position_sigma_m, rel=0.1)
+
+
+def test_samples_come_at_the_rate_and_missed_ones_are_counted() -> None:
+    headset = Headset(HeadsetModel(rate_hz=90.0), seed=8)
+    assert sum(headset.sample_due(t) for t in range(0, 10 * SECOND, SECOND // 1000)) == pytest.approx(900, abs=1)
+    assert headset.late_samples == 0
+    assert headset.sample_due(11 * SECOND)
+    assert headset.late_samples == pytest.approx(89, abs=1)
+
+
+def aligned_error(seed: int, model: HeadsetModel) -> float:
+    """Error [m] at the sheet after looking at it from six viewpoints."""
+    headset = Headset(model, seed)
+    estimator = AlignmentEstimator({DEFAULT_ANCHOR_ID: SHEET})
+    spec = HeadsetSpec(name="ann")
+    for viewpoint in range(spec.viewpoints):
+        for _ in range(6):
+            seen = headset.observe(viewpoint_pose(spec, viewpoint), SHEET, 0, viewpoint)
+            assert seen is not None
+            estimator.add(DEFAULT_ANCHOR_ID, seen, 0, 0, viewpoint)
+    estimate = estimator.estimate()
+    wrong = compose(estimate.T_world_tracking, inverse(headset.T_world_tracking(0)))
+    return distance(apply(wrong, SHEET[0]), SHEET[0])
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.15])
+def test_what_it_sees_aligns_it(wrong: float) -> None:
+    worst = sorted(aligned_error(seed, HeadsetModel(wrong_detections=wrong)) for seed in range(20))
+    assert worst[18] < 0.005
+
+
+def test_heads_look_where_they_should_and_move_smoothly() -> None:
+    spec = HeadsetSpec(name="ann")
+    poses = [viewpoint_pose(spec, i) for i in range(spec.viewpoints)]
+    for pose in poses:
+        forward = quat_rotate(pose[1], (1.0, 0.0, 0.0))
+        towards = np.subtract(SHEET[0], pose[0])
+        assert np.dot(forward, towards) == pytest.approx(float(np.linalg.norm(towards)))
+        assert Headset(HeadsetModel(), 0).sees(pose, SHEET)
+    half = between(poses[0], poses[1], 0.5)
+    assert quat_angle(half[1], poses[0][1]) == pytest.approx(quat_angle(half[1], poses[1][1]))
+    assert between(poses[0], poses[1], 1.0)[0] == pytest.approx(poses[1][0])
+
+
+def test_link_keeps_order_and_delays() -> None:
+    line: DelayLine[int] = DelayLine(LinkModel(latency_s=0.01, jitter_s=0.005), np.random.default_rng(0))
+    arrivals: dict[int, int] = {}
+    for now in range(0, 5 * SECOND, SECOND // 1000):
+        if now % (SECOND // 50) == 0:
+            line.push(now, now)
+        for sent in line.pop(now):
+            arrivals[sent] = now
+    assert list(arrivals) == sorted(arrivals)
+    delays = np.array([b - a for a, b in arrivals.items()]) / 1e9
+    assert delays.min() >= 0.01
+    assert delays.mean() == pytest.approx(0.0155, abs=0.002)
+
+
+def test_stalls_hold_everything_and_let_go_at_once() -> None:
+    model = LinkModel(latency_s=0.001, jitter_s=0.0, stall_every_s=0.5, stall_s=0.1)
+    line: DelayLine[int] = DelayLine(model, np.random.default_rng(1))
+    bursts = []
+    for now in range(0, 20 * SECOND, SECOND // 1000):
+        if now % (SECOND // 100) == 0:
+            line.push(now, now)
+        bursts.append(len(line.pop(now)))
+    assert line.stalls > 10
+    assert max(bursts) == pytest.approx(10, abs=2)
+    assert line.next_ns is None or line.next_ns >= 20 * SECOND - SECOND // 5
+    assert len(line) <= 12

@@ -1,0 +1,147 @@
+"""Emulated people in a live session: they align, drive, jump and come back, and say how it went."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
+from iris_session.emulator.runner import run_headsets
+from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
+from iris_session.protocol.client_messages import Observation, Sample, TrackingEpoch
+from iris_session.protocol.common import Pose
+from iris_session.protocol.names import Device
+from tests.client.harness import LiveSession
+
+QUICK = {"viewpoints": 4, "observations_per_viewpoint": 4}
+
+
+@pytest.fixture
+def session() -> Iterator[LiveSession]:
+    live = LiveSession(anchors={DEFAULT_ANCHOR_ID: Pose(*DEFAULT_T_WORLD_ANCHOR)}, forward_observations=True)
+    yield live
+    live.close()
+
+
+def run_until(
+    session: LiveSession, specs: list[HeadsetSpec], *phases: str, timeout_s: float = 40.0
+) -> list[HeadsetReport]:
+    """Runs the people until each has reached the phase of the same place."""
+    reached: dict[str, set[str]] = {spec.name: set() for spec in specs}
+    wanted = {spec.name: phase for spec, phase in zip(specs, phases, strict=True)}
+    deadline = time.monotonic() + timeout_s
+
+    def note(report: HeadsetReport) -> None:
+        reached[report.name] |= {report.phase}
+
+    def stop() -> bool:
+        assert time.monotonic() < deadline, reached
+        return all(phase in reached[name] for name, phase in wanted.items())
+
+    return run_headsets(session.address, specs, report=note, stop=stop)
+
+
+def test_two_people_align_and_drive_while_one_watches(session: LiveSession) -> None:
+    specs = [
+        HeadsetSpec(name="ann", behaviour="wander", robot="left", seed=1, **QUICK),
+        HeadsetSpec(name="bob", behaviour="wander", robot="right", seed=2, **QUICK),
+        HeadsetSpec(name="eve", seed=3, **QUICK),
+    ]
+    reports = run_until(session, specs, "work", "work", "watch")
+    for report in reports:
+        assert report.failed == ""
+        assert report.alignment_error_mm < 5.0
+        assert report.alignment_error_mm < report.stated_error_mm * 1.5
+        assert report.observations >= 12
+        assert report.samples > 100
+        assert report.frames > 50
+        assert set(report.rejected) <= {"alignment_version"}
+    heads = {e.connection for e in session.kinds(Sample) if e.message.device == Device.HEAD}  # type: ignore[union-attr]
+    assert len(heads) == 3
+
+
+def test_a_jump_of_the_tracking_frame_is_told_and_measured_anew(session: LiveSession) -> None:
+    spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", recentre_at_s=(4.5,), **QUICK)
+    began: list[str] = []
+
+    def note(report: HeadsetReport) -> None:
+        if not began or began[-1] != report.phase:
+            began.append(report.phase)
+
+    deadline = time.monotonic() + 40.0
+    (report,) = run_headsets(
+        session.address, [spec], report=note, stop=lambda: began.count("work") == 2 or time.monotonic() > deadline
+    )
+    assert [p for p in began if p in ("look", "work")] == ["look", "work", "look", "work"]
+    assert report.alignment_error_mm < 5.0
+    assert [e.message.tracking_epoch for e in session.kinds(TrackingEpoch)] == [1]  # type: ignore[union-attr]
+    epochs = [e.message.tracking_epoch for e in session.kinds(Observation)]  # type: ignore[union-attr]
+    assert epochs == sorted(epochs)
+    assert set(epochs) == {0, 1}
+
+
+def test_a_killed_front_costs_a_reconnect_and_nothing_else(session: LiveSession) -> None:
+    spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", **QUICK)
+    phase = [""]
+    killed: list[int] = []
+
+    def note(report: HeadsetReport) -> None:
+        phase[0] = report.phase
+        if report.phase == "work" and not killed:
+            killed.append(session.front.pid)
+            os.kill(session.front.pid, signal.SIGKILL)
+        elif killed and report.reconnects and report.phase == "work" and session.commands["left"] == "pose":
+            done.set()
+
+    done = threading.Event()
+    deadline = time.monotonic() + 40.0
+    (report,) = run_headsets(
+        session.address, [spec], report=note, stop=lambda: done.is_set() or time.monotonic() > deadline
+    )
+    assert done.is_set(), report
+    assert report.reconnects == 1
+    assert report.failed == ""
+
+
+def test_who_gets_no_robot_says_why(session: LiveSession) -> None:
+    specs = [HeadsetSpec(name="ann", behaviour="wander", robot="nothing", phase_timeout_s=6.0, **QUICK)]
+    (report,) = run_headsets(session.address, specs, seconds=30.0)
+    assert "nothing" in report.failed
+    assert report.phase == "failed"
+
+
+def test_nobody_there_is_a_failure_not_an_exception() -> None:
+    (report,) = run_headsets("127.0.0.1:1", [HeadsetSpec(name="ann")], seconds=0.3)
+    assert report.phase == "join"
+    assert report.participant == ""
+
+
+def test_json_lines_for_a_parent(session: LiveSession) -> None:
+    specs = msgspec.json.encode([HeadsetSpec(name="eve", **QUICK), HeadsetSpec(name="ann", seed=1, **QUICK)])
+    command = [sys.executable, "-m", "iris_session.emulator", "--address", session.address, "--specs", "-", "--json"]
+    result = subprocess.run([*command, "--seconds", "4"], input=specs, capture_output=True, check=False, timeout=60)
+    assert result.returncode == 0, result.stderr
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert {line["name"] for line in lines if line["final"]} == {"eve", "ann"}
+    assert lines[-1]["frames"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [([], "no headset"), (["--headset", "name=a,colour=red"], "colour"), (["--specs", "missing.json"], "missing.json")],
+)
+def test_wrong_command_lines_say_what_is_wrong(arguments: list[str], text: str) -> None:
+    command = [sys.executable, "-m", "iris_session.emulator", *arguments]
+    result = subprocess.run(command, capture_output=True, check=False, timeout=60, text=True)
+    assert result.returncode == 2
+    assert text in result.stderr
+    assert "Traceback" not in result.stderr
