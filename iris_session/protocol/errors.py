@@ -14,16 +14,16 @@ from typing import ClassVar
 from iris_session.protocol.names import PROTOCOL_VERSION, RefusalCode
 
 #: Characters of an error text: fits the `Text` of the message that carries it to the peer.
-MAX_TEXT = 400
+MAX_ERROR_TEXT = 400
 
 
 class ProtocolError(Exception):
-    """Base of all errors of this module. `str(error)` is at most `MAX_TEXT` characters, fit to be sent to the peer."""
+    """Base of all errors of this module. `str(error)` is at most `MAX_ERROR_TEXT` characters, fit to be sent to the peer."""
 
     code: ClassVar[str]
 
     def __init__(self, text: str) -> None:
-        super().__init__(text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "...")
+        super().__init__(text if len(text) <= MAX_ERROR_TEXT else text[: MAX_ERROR_TEXT - 3] + "...")
 
 
 class MalformedError(ProtocolError):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, envelope
 from iris_session.protocol.common import Pose, Target
-from iris_session.protocol.errors import MAX_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
+from iris_session.protocol.errors import MAX_ERROR_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.generate.examples import extreme, full, least
 from iris_session.protocol.limits import LIMITS, MAX_CLIENT_BYTES, MAX_SERVER_BYTES
 from iris_session.protocol.server_messages import Beacon, Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
@@ -204,7 +204,7 @@ def decode_all(data: bytes) -> None:
         except ProtocolError as error:
             refused.append(error)
     for error in refused:
-        assert len(str(error)) <= MAX_TEXT
+        assert len(str(error)) <= MAX_ERROR_TEXT
         answer = ServerEnvelope(1, 0, ProtocolFault(error.code, str(error)))
         assert codec.decode_server(codec.encode_server(answer)) == answer
 
