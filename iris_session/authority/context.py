@@ -48,6 +48,7 @@ class Context:
     def adopt(self, state: State) -> None:
         """Takes over `state` and rebuilds everything derived from it."""
         self.state = state
+        # For look-ups only: its order is not that of the state, so nothing may iterate over it.
         self.by_connection = {p.connection: p for p in state.participants.values() if p.connection != NO_CONNECTION}
         self.refresh_held()
 

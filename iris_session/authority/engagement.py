@@ -8,7 +8,7 @@ before the person has let go and taken hold again.
 from __future__ import annotations
 
 from iris_session.authority.context import HUMAN, Context
-from iris_session.authority.state import Grant, LeaseState, Participant
+from iris_session.authority.state import NO_CONNECTION, Grant, LeaseState, Participant
 from iris_session.protocol.names import HoldReason, LeaseMode, TargetKind
 from iris_session.protocol.server_messages import EngagementChanged, Intervention, ObjectGrasped
 
@@ -79,6 +79,7 @@ def give_back(ctx: Context, lease: LeaseState) -> None:
     """Ends an intervention: the agent is in charge again, and must clutch again."""
     human, agent = lease.override, lease.grants[0]
     lease.override = ""
-    rearm(ctx, lease, agent, HoldReason.REARM)
+    lost = ctx.state.participants[agent.participant].connection == NO_CONNECTION
+    rearm(ctx, lease, agent, HoldReason.DISCONNECTED if lost else HoldReason.REARM)
     ctx.publish(lease, "priority", human)
     ctx.emit(Intervention(lease.target, human, agent.participant, False))

@@ -251,7 +251,8 @@ def grasp(ctx: Context, p: Participant, m: Grasp) -> None:
         denial = Denial(DenialReason.UNALIGNED, "your headset is not aligned", "look at an anchor sheet", m.object)
     if denial is not None or lease is None:
         return ctx.deny(p, m.request_id, denial) if denial is not None else None
-    if find_grant(lease, p.id, m.device) is None and len(lease.grants) >= ctx.config.max_sub_holders:
+    own = any(g.participant == p.id and g.hand == m.device for g in lease.grants)
+    if not own and len(lease.grants) >= ctx.config.max_sub_holders:
         return ctx.deny(p, m.request_id, held_by_other(ctx, lease))
     leases.grant(ctx, lease, p, "acquired", hand=m.device)
     return ctx.accept(p, m.request_id, (lease,))

@@ -130,8 +130,9 @@ def leave(ctx: Context, p: Participant, reason: str) -> None:
 
 def _lose_clients(ctx: Context, gateway: int, reason: str) -> None:
     """Everyone for whom the gateway at that connection spoke is lost with it."""
-    for p in [p for p in ctx.by_connection.values() if p.gateway == gateway and gateway != HOST]:
-        lose(ctx, p, reason)
+    for p in tuple(ctx.state.participants.values()):
+        if p.gateway == gateway and gateway != HOST:
+            lose(ctx, p, reason)
 
 
 def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
@@ -145,7 +146,7 @@ def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
 
 def lose_everyone(ctx: Context, reason: str) -> None:
     """The front was replaced: every connection is lost."""
-    for p in tuple(ctx.by_connection.values()):
+    for p in tuple(ctx.state.participants.values()):
         lose(ctx, p, reason)
 
 

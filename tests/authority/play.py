@@ -1,0 +1,431 @@
+"""Random sessions of honest, careless and forging participants, checked in every step against independent books.
+
+`Play` keeps the journal of what everyone sent and knows nothing of how the authority decides. A second authority runs
+beside the first and is replaced by `restore(snapshot())` at random moments: both must agree byte for byte.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from random import Random
+from typing import Any, Final
+
+import msgspec
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.authority.state import Pending, State
+from iris_session.client.session_state import SessionMirror
+from iris_session.protocol import client_messages as cm
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, decode_entries, encode_entries
+from iris_session.protocol.server_messages import ConsentRequested, Snapshot
+from iris_session.protocol.specs import ObjectSpec
+from iris_session.protocol.steps import Command, Decision
+
+from .table import MS, SECOND, make_view, proposal, robot
+
+ROBOTS: Final = (robot("left"), robot("right", "priority"), robot("third", "shared"))
+OBJECTS: Final = (ObjectSpec("hammer", "hammer"), ObjectSpec("board", "board"))
+NAMES: Final = tuple(r.name for r in ROBOTS)
+DEVICES: Final = ("head", "controller/left", "controller/right", "hand/left", "target", "joints", "foot")
+CONFIG: Final = AuthorityConfig(
+    heartbeat_timeout_ns=SECOND, grace_ns=2 * SECOND, max_participants=6, max_queue=3, max_consents=2, quota=8
+)
+#: Holds after which the clutch must be seen open before the robot may move again.
+REARMED: Final = (
+    "estop",
+    "gap",
+    "scene_changed",
+    "rejected",
+    "disconnected",
+    "rearm",
+    "stale",
+    "not_worn",
+    "untracked",
+)
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class Client:
+    """What one participant believes of itself."""
+
+    def __init__(self, connection: int, role: str, key: str) -> None:
+        self.connection, self.role, self.key = connection, role, key
+        self.id = ""
+        self.seq = 0
+        self.tracking_epoch = 0
+
+    @property
+    def device(self) -> str:
+        return {"leader": "joints", "agent": "target"}.get(self.role, "controller/right")
+
+
+class Play:
+    """One session under random play. Every choice comes from `rng`."""
+
+    def __init__(self, rng: Random, policy: str = "join-order") -> None:
+        self.config = msgspec.structs.replace(CONFIG, policy=policy, assignments={"anna": ("left",)})
+        self.authority, self.twin = self.fresh(), self.fresh()
+        self.journal: list[tuple[int, bytes, int]] = []
+        self.results: list[bytes] = []
+        self.now_ns = SECOND
+        self.entries: list[Entry] = []
+        self.connections = 0
+        self.people: list[Client] = []
+        self.mirror = SessionMirror()
+        self.decision = Decision(())
+        self.consents = [1]
+        self.view = make_view()
+        self.opened: set[tuple[str, str, str]] = set()
+        self.engagements: dict[tuple[str, str], int] = {}
+        self.newest_engagement = 0
+        self.moved = 0
+        self.flush()
+        self.host(cm.GetSnapshot(1))
+        self.flush()
+        for role in ("operator", "operator", "agent"):
+            self.enter(role)
+        self.rng = rng
+
+    def fresh(self) -> Authority:
+        return Authority(self.config, ROBOTS, OBJECTS)
+
+    @property
+    def state(self) -> State:
+        """For the books only: who holds what, and the counters that honest clients learn from events."""
+        return self.authority._ctx.state
+
+    def host(self, message: Any) -> None:
+        self.entries.append(Entry(0, 0, self.now_ns, message))
+
+    def say(self, client: Client, message: Any) -> None:
+        self.entries.append(Entry(client.connection, client.connection, self.now_ns, message))
+
+    # --- steps ---
+
+    def flush(self, n_ticks: int = 1) -> None:
+        """One step of both authorities with everything said since the last one, and every check."""
+        blob = encode_entries(self.entries)
+        entries = decode_entries(blob)
+        self.entries = []
+        self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view)
+        self.journal.append((self.now_ns, blob, n_ticks))
+        self.results.append(_encode(self.decision))
+        assert _encode(self.twin.step(self.now_ns, entries, n_ticks, self.view)) == self.results[-1]
+        for admitted in self.decision.admitted:
+            next(c for c in self.people if c.connection == admitted.connection).id = admitted.participant_id
+        self.consents += [e.body.consent_id for e in self.decision.events if isinstance(e.body, ConsentRequested)]
+        self.follow_events()
+        self.check_commands(entries)
+        self.check_urgent(entries)
+        self.check_bounds()
+        self.check_queue()
+
+    def swap(self) -> None:
+        """A crash between two steps: a new process continues from the snapshot."""
+        snapshot = self.twin.snapshot()
+        assert snapshot == self.authority.snapshot()
+        self.twin = self.fresh()
+        self.twin.restore(snapshot)
+        assert self.twin.snapshot() == snapshot
+        self.check_late_joiner()
+
+    def replay(self) -> None:
+        """The journal alone gives the same effects and the same state."""
+        again = self.fresh()
+        for (now_ns, blob, n_ticks), result in zip(self.journal, self.results, strict=True):
+            assert _encode(again.step(now_ns, decode_entries(blob), n_ticks, self.view)) == result
+        assert again.snapshot() == self.authority.snapshot()
+
+    # --- what people do ---
+
+    def act(self) -> None:
+        """One random action, by its weight."""
+        weights = [weight for weight, _ in ACTIONS]
+        action: Callable[[Play], None] = self.rng.choices([a for _, a in ACTIONS], weights)[0]
+        action(self)
+
+    def who(self) -> Client:
+        """Mostly one of those present, sometimes one who is gone."""
+        present = [c for c in self.people if self.still_here(c)]
+        return self.rng.choice(present if present and self.rng.random() < 0.9 else self.people[-8:])
+
+    def some(self) -> tuple[str, ...]:
+        return tuple(self.rng.choices(NAMES, k=self.rng.choice([0, 1, 1, 1, 2, 3])))
+
+    def wait(self) -> None:
+        self.now_ns += self.rng.choice([0, 2, 2, 20, 20, 100, 140, 149, 151, 600, 1100]) * MS
+        self.flush(self.rng.choice([0, 1, 1, 2]))
+
+    def enter(self, role: str, old: Client | None = None) -> None:
+        self.connections += 1
+        client = Client(self.connections, role, old.key if old is not None else f"key{self.connections}")
+        self.people.append(client)
+        need = "not_needed" if role in ("agent", "leader") else "measured"
+        self.say(client, Join(client.key, role, "anna", alignment=need, resume_of=old.id if old is not None else ""))
+        self.flush()
+        if role == "operator":
+            self.say(client, proposal())
+
+    def join(self) -> None:
+        self.enter(self.rng.choice(["operator", "operator", "agent", "director", "observer", "leader"]))
+
+    def resume(self) -> None:
+        old = self.who()
+        self.enter(old.role, old)
+
+    def trouble(self) -> None:
+        messages = [Lost(), cm.Bye(), cm.EStop(), cm.Release(), cm.Release(), cm.Heartbeat(worn=False)]
+        self.say(self.who(), self.rng.choice(messages))
+
+    def recover(self) -> None:
+        self.host(cm.ClearEStop(1))
+        self.host(cm.Control(1, "resume"))
+        for client in [c for c in self.people if self.still_here(c)]:
+            self.say(client, cm.Heartbeat())
+        self.flush()
+
+    def request(self) -> None:
+        client, names, rng = self.who(), self.some(), self.rng
+        message = rng.choice(
+            [
+                cm.Acquire(1, names, wait=rng.random() < 0.7, weight=rng.choice([1.0, 2.0, math.nan])),
+                cm.Acquire(1, names, ("hammer",)),
+                cm.Grasp(1, "hammer", rng.choice(DEVICES)),
+                cm.Release(1, tuple(Target(n, rng.randrange(4)) for n in names)),
+                cm.Release(1, tuple(Target(n, self.state.robots[n].version) for n in names[:1])),
+                cm.Consent(1, rng.choice(self.consents[-2:]), rng.random() < 0.7),
+            ]
+        )
+        self.say(client, message)
+
+    def direct(self) -> None:
+        rng = self.rng
+        person = rng.choice(["", "nobody", *(c.id for c in self.people[-6:])])
+        pose = Pose((0.0, 1.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        message = rng.choice(
+            [
+                cm.Assign(1, self.some(), person),
+                cm.SetMode(
+                    1, rng.choice(NAMES), rng.choice(["exclusive", "request", "takeover", "priority", "shared"])
+                ),
+                cm.Control(1, rng.choice(["pause", "step", "reset"])),
+                cm.Episode(1, rng.choice(["start", "success", "rerecord", "reset"])),
+                cm.PlaceAlignment(1, person, pose, rng.random() < 0.5),
+                FrontRestarted() if rng.random() < 0.2 else cm.ClearEStop(1),
+            ]
+        )
+        self.host(message)
+
+    def align(self) -> None:
+        client = self.who()
+        if self.rng.random() < 0.3:
+            client.tracking_epoch += 1
+            self.say(client, cm.TrackingEpoch(client.tracking_epoch))
+        refused, x = self.rng.random() < 0.2, self.rng.choice([1.0, 1.1])
+        T = Pose((x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        self.say(client, proposal(tracking_epoch=client.tracking_epoch, refused=refused, T_world_tracking=T))
+
+    # --- samples ---
+
+    def sample(self, client: Client, names: tuple[str, ...], device: str, clutch: bool, **forged: Any) -> cm.Sample:
+        client.seq += 1
+        p = self.state.participants.get(client.id)
+        leases = {**self.state.robots, **self.state.objects}
+        fields: dict[str, Any] = {
+            "device": device,
+            "kind": "joints" if device == "joints" else "pose",
+            "seq": client.seq,
+            "capture_ns": self.now_ns,
+            "scene_epoch": self.state.scene_epoch,
+            "tracking_epoch": client.tracking_epoch,
+            "alignment_version": p.alignment.version if p is not None and p.alignment is not None else 0,
+            "targets": tuple(Target(n, leases[n].version, leases[n].kind) for n in names),
+            "clutch": clutch,
+            "pose": Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),
+            "q": (0.0,) * 7 if device == "joints" else (),
+            "gripper": 0.25,
+        }
+        return cm.Sample(**{**fields, **forged})
+
+    def held(self, client: Client) -> tuple[str, ...]:
+        leases = (*self.state.robots.values(), *self.state.objects.values())
+        return tuple(lease.target for lease in leases if any(g.participant == client.id for g in lease.grants))
+
+    def drive(self) -> None:
+        """Acquires and aligns if needed, then opens and closes the clutch on everything held."""
+        client = self.who()
+        if not self.held(client):
+            self.say(client, self.rng.choice([cm.Grasp(1, "hammer", client.device), cm.Acquire(1, self.some())]))
+            if client.role == "operator":
+                self.say(client, proposal(tracking_epoch=client.tracking_epoch))
+            self.flush()
+        for clutch in (False, True):
+            self.say(client, self.sample(client, self.held(client), client.device, clutch))
+            self.now_ns += 2 * MS
+            self.flush()
+
+    def keep_going(self) -> None:
+        """Everyone sends one more sample, mostly with the clutch closed."""
+        for client in [c for c in self.people if self.still_here(c)]:
+            self.say(client, self.sample(client, self.held(client), client.device, self.rng.random() < 0.9))
+        self.now_ns += 14 * MS
+        self.flush()
+
+    def odd_sample(self) -> None:
+        client = self.who()
+        fields = {"worn": self.rng.random() < 0.7, "tracked": self.rng.random() < 0.7}
+        device, clutch = self.rng.choice(DEVICES), self.rng.random() < 0.5
+        self.say(client, self.sample(client, self.some(), device, clutch, **fields))
+
+    def forge(self) -> None:
+        client, rng = self.who(), self.rng
+        wrong, x = rng.randrange(7), rng.choice([1e-3, math.nan, math.inf, 1e300, -1e300])
+        forged = rng.choice(
+            [
+                {"scene_epoch": wrong},
+                {"tracking_epoch": wrong},
+                {"alignment_version": wrong},
+                {"seq": wrong},
+                {"capture_ns": self.now_ns + rng.choice([-151, -100, 4, 6]) * MS},
+                {"targets": tuple(Target(n, wrong) for n in self.some())},
+                {"pose": Pose((x, 0.0, 1.0), (1.0, x, 0.0, 0.0))},
+                {"gripper": x},
+                {"q": (x,) * 7},
+            ]
+        )
+        s = self.sample(client, self.some(), client.device, True, **forged)
+        claimed = client if rng.random() < 0.7 else self.who()
+        self.entries.append(Entry(client.connection, claimed.connection, self.now_ns, s))
+
+    # --- what must hold ---
+
+    def follow_events(self) -> None:
+        for out in self.decision.outgoing:
+            if isinstance(out.message, Snapshot) and not self.mirror.synced:
+                self.mirror.apply_snapshot(out.message)
+        for event in self.decision.events:
+            if self.mirror.synced and event.event_seq > self.mirror.event_seq:
+                assert self.mirror.apply_event(event), "a gap in event_seq"
+
+    def check_late_joiner(self) -> None:
+        """Events alone give the same picture as a snapshot."""
+        probe = self.fresh()
+        probe.restore(self.authority.snapshot())
+        out = probe.step(self.now_ns, [Entry(0, 0, self.now_ns, cm.GetSnapshot(1))], 0, self.view)
+        (snapshot,) = [o.message for o in out.outgoing if isinstance(o.message, Snapshot)]
+        late = SessionMirror()
+        late.apply_snapshot(snapshot)
+        if not out.events:
+            assert late.mirror_hash() == self.mirror.mirror_hash()
+
+    def check_commands(self, entries: list[Entry]) -> None:
+        assert tuple(c.robot for c in self.decision.commands) == NAMES
+        sent = {(e.connection, e.message.device, e.message.seq): e for e in entries if isinstance(e.message, cm.Sample)}
+        for e in sent.values():
+            self.note_open(e)
+        for c in self.decision.commands:
+            assert (c.kind == "hold") == (c.hold_reason != "") == (not c.sources)
+            assert len(c.sources) <= 1 or self.state.robots[c.robot].mode == "shared"
+            assert not c.sources or math.isclose(sum(s.weight for s in c.sources), 1.0)
+            self.check_sources(c, sent)
+            # With several holders the reason is that of one of them; the others' latches are their own.
+            if c.hold_reason in REARMED and len(self.state.robots[c.robot].grants) == 1:
+                self.opened = {o for o in self.opened if o[2] != c.robot}
+
+    def note_open(self, e: Entry) -> None:
+        s = e.message
+        client = next((c for c in self.people if c.connection == e.connection), None)
+        if isinstance(s, cm.Sample) and client is not None and not s.clutch:
+            self.opened |= {(client.id, s.device, t.name) for t in s.targets}
+
+    def check_sources(self, c: Command, sent: dict[tuple[int, str, int], Entry]) -> None:
+        lease = self.state.robots[c.robot]
+        grants = {g.participant: g for g in lease.grants}
+        for s in c.sources:
+            self.moved += 1
+            assert s.participant in grants, "moved by one who does not hold it"
+            p = self.state.participants[s.participant]
+            assert p.connection > 0
+            assert p.worn
+            assert p.role in ("operator", "director", "agent", "leader")
+            assert p.alignment is not None or s.device == "joints"
+            assert not self.state.estop
+            assert not self.state.paused
+            assert s.pose_world is None or all(map(math.isfinite, (*s.pose_world.p, *s.pose_world.q)))
+            if self.engagements.get((c.robot, s.participant)) != s.engagement:
+                assert s.engagement > self.engagements.get((c.robot, s.participant), 0)
+                assert (s.participant, s.device, c.robot) in self.opened, "engaged without an open clutch"
+                self.engagements[(c.robot, s.participant)] = s.engagement
+                self.opened.discard((s.participant, s.device, c.robot))
+            if not s.new:
+                assert self.now_ns - s.receive_ns <= 2 * CONFIG.freshness_ns
+                continue
+            e = sent[(p.connection, s.device, s.seq)]
+            m = e.message
+            assert isinstance(m, cm.Sample)
+            assert e.connection_epoch == e.connection
+            assert m.clutch
+            assert (m.scene_epoch, m.tracking_epoch) == (self.decision.scene_epoch, p.tracking_epoch)
+            (version, *_) = [t.lease_version for t in m.targets if t.name == c.robot]
+            assert grants[s.participant].version <= version <= lease.version
+            assert -CONFIG.future_ns <= self.now_ns - m.capture_ns <= CONFIG.freshness_ns
+
+    def check_urgent(self, entries: list[Entry]) -> None:
+        moving = {s.participant for c in self.decision.commands for s in c.sources}
+        for e in entries:
+            client = next((c for c in self.people if c.connection == e.connection and c.id), None)
+            if client is None:
+                continue
+            if isinstance(e.message, Lost | cm.Bye):
+                p = self.state.participants.get(client.id)
+                assert p is None or p.connection != client.connection
+                assert client.id not in moving or (p is not None and p.connection > 0)
+            if isinstance(e.message, cm.EStop) and self.still_here(client):
+                assert self.decision.estop
+            if isinstance(e.message, cm.Release) and not e.message.targets and self.still_here(client):
+                assert client.id not in moving
+
+    def still_here(self, client: Client) -> bool:
+        p = self.state.participants.get(client.id)
+        return p is not None and p.connection == client.connection
+
+    def check_bounds(self) -> None:
+        state = self.state
+        assert len(state.participants) <= CONFIG.max_participants + 1
+        assert len(state.queue) <= CONFIG.max_queue
+        assert len(state.consents) <= CONFIG.max_consents
+        for lease in (*state.robots.values(), *state.objects.values()):
+            assert len(lease.grants) <= CONFIG.max_sub_holders
+            assert len(lease.grants) <= 1 or lease.mode in ("shared", "priority")
+            assert all(1 <= g.version <= lease.version for g in lease.grants)
+            assert not lease.override or lease.override in [g.participant for g in lease.grants[1:]]
+
+    def check_queue(self) -> None:
+        """No deadlock: nobody waits while holding, and every wait has a robot that is held or promised before it."""
+        holding = {g.participant for name in NAMES for g in self.state.robots[name].grants}
+        for i, w in enumerate(self.state.queue):
+            assert w.participant not in holding
+            assert w.any_robot or any(self.state.robots[n].grants or self.promised(i, n) for n in w.robots)
+
+    def promised(self, place: int, name: str) -> bool:
+        ahead: list[Pending] = self.state.queue[:place]
+        return any(name in other.robots for other in ahead)
+
+
+ACTIONS: Final[list[tuple[float, Callable[[Play], None]]]] = [
+    (6.0, Play.keep_going),
+    (5.0, Play.drive),
+    (3.0, Play.request),
+    (2.0, Play.wait),
+    (1.5, Play.recover),
+    (1.5, Play.forge),
+    (1.0, Play.odd_sample),
+    (1.0, Play.direct),
+    (0.7, Play.trouble),
+    (0.7, Play.align),
+    (0.5, Play.join),
+    (0.4, Play.resume),
+    (0.4, Play.swap),
+]
