@@ -18,7 +18,7 @@ MAX_ERROR_TEXT = 400
 
 
 class ProtocolError(Exception):
-    """Base of all errors of this module. `str(error)` is at most `MAX_ERROR_TEXT` characters, fit to be sent to the peer."""
+    """Base of all errors of this module. `str(error)` has at most `MAX_ERROR_TEXT` characters: fit for the peer."""
 
     code: ClassVar[str]
 
