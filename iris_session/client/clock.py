@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 WINDOW = 32  # exchanges; a quarter of a minute at two per second
 MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
+SETTLED = 4  # exchanges before the estimate is used: a single one may have met a busy machine
 SLEW = 0.01  # the estimate moves at most 10 ms per second: invisible in 150 ms freshness, monotonic
 DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
 BURST = 8  # exchanges at the start and after a reset ...
-BURST_PERIOD_NS = 25_000_000  # ... at this period, then
+BURST_PERIOD_NS = 5_000_000  # ... at this period, then
 PERIOD_NS = 500_000_000  # at this one; pongs also tell that the front lives
 
 
@@ -55,6 +56,11 @@ class ClockSync:
     def synced(self) -> bool:
         """At least one exchange has been counted."""
         return bool(self._window)
+
+    @property
+    def settled(self) -> bool:
+        """Enough exchanges to stamp samples by."""
+        return len(self._window) >= SETTLED
 
     @property
     def rtt_ns(self) -> int:

@@ -1,7 +1,7 @@
 """Sans-I/O core of the client: bytes and times in, bytes out. It owns no socket, clock or thread.
 
     IDLE --open()--> JOINING --Welcome--> SYNCING --snapshot and clock--> READY
-    JOINING, SYNCING, READY --silence, lost(), session_ended--> WAITING --back-off--> JOINING
+    JOINING, SYNCING, READY --silence, lost(), session_ended--> WAITING (back-off, none at first) --> JOINING
     JOINING --Refused--> REFUSED (`failure` says why)          any --close()--> CLOSED
 
 The shell opens a fresh control socket whenever `generation` changes, passes received frames to `receive`, calls `tick`
@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from iris_session.client.clock import ClockSync
 from iris_session.client.errors import NotConnectedError, RefusedError, VersionError
 from iris_session.client.identity import Identity
 from iris_session.client.session_state import SessionMirror
-from iris_session.client.state_stream import Poses, StateStream
+from iris_session.client.state_stream import StateStream, poses_from_bytes
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.protocol.client_messages import (
     Bye,
@@ -55,6 +54,7 @@ from iris_session.protocol.server_messages import (
 HELLO_TIMEOUT_NS: Final = 1_000_000_000
 BACKOFF_MIN_NS: Final = 100_000_000
 BACKOFF_MAX_NS: Final = 2_000_000_000
+STEADY_NS: Final = 1_000_000_000
 SNAPSHOT_RETRY_NS: Final = 500_000_000
 SILENT_HEARTBEATS: Final = 4  # this many heartbeat periods without a word from the front: the connection is gone
 MAX_OUTGOING: Final = 256
@@ -64,8 +64,6 @@ MAX_PENDING: Final = 64
 #: Refusals that pass: somebody who was in before keeps trying.
 TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
 
-#: Faults after which the front no longer knows this connection: hello is needed again.
-CONNECTION_ENDED: Final = frozenset({"session_ended", "dropped", "hello"})
 
 #: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
 REPLACED: Final = "replaced"
@@ -100,6 +98,8 @@ class Connection:
         self._heard_at = 0
         self._heartbeat_at = 0
         self._snapshot_at = 0
+        self._joined_at = 0
+        self._ticked_at = 0
 
     # --- life ---------------------------------------------------------------------------------------------------------
 
@@ -117,11 +117,15 @@ class Connection:
         self.phase = Phase.CLOSED
 
     def lost(self, now_ns: int) -> None:
-        """The socket lost its peer, or the session fell silent: join again, soon."""
-        if self.phase in (Phase.SYNCING, Phase.READY):
-            self.counters.reconnects += 1
-            self._backoff_ns = BACKOFF_MIN_NS
+        """The socket lost its peer, or the front its memory of us: join again, at once if this one stood for long."""
+        if not self.joined:
+            return
+        self.counters.reconnects += 1
+        if now_ns - self._joined_at < STEADY_NS:
             self._wait(now_ns)
+        else:
+            self._backoff_ns = BACKOFF_MIN_NS
+            self._say_hello(now_ns)
 
     @property
     def joined(self) -> bool:
@@ -138,6 +142,9 @@ class Connection:
 
     def tick(self, now_ns: int) -> None:
         """Everything that depends on time: hello, back-off, clock, heartbeat, snapshot, silence."""
+        if now_ns - self._ticked_at > STEADY_NS:
+            self._heard_at = now_ns  # it was us who stood still: what was said meanwhile is still to be read
+        self._ticked_at = now_ns
         if self.phase is Phase.WAITING and now_ns >= self._retry_at:
             self._say_hello(now_ns)
         elif self.phase is Phase.JOINING and now_ns >= self._hello_at + HELLO_TIMEOUT_NS:
@@ -151,10 +158,10 @@ class Connection:
             return self._retry_at
         if self.phase is Phase.JOINING:
             return self._hello_at + HELLO_TIMEOUT_NS
-        if self.joined:
-            due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)
-            return due if not self._snapshot_wanted else min(due, self._snapshot_at)
-        return now_ns + 1_000_000_000
+        if not self.joined:
+            return now_ns + STEADY_NS
+        due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)
+        return min(due, self._snapshot_at) if self._snapshot_wanted else due
 
     # --- sending ------------------------------------------------------------------------------------------------------
 
@@ -210,17 +217,10 @@ class Connection:
 
     def describe(self) -> str:
         """One line for people: why there is no connection now."""
-        match self.phase:
-            case Phase.IDLE:
-                return "not connected: call connect() first"
-            case Phase.CLOSED:
-                return "this client was closed"
-            case Phase.REFUSED:
-                return str(self.failure)
-            case Phase.WAITING | Phase.JOINING:
-                return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
-            case _:
-                return "connected"
+        if self.phase in (Phase.WAITING, Phase.JOINING):
+            return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
+        texts = {Phase.IDLE: "not connected: call connect() first", Phase.CLOSED: "this client was closed"}
+        return texts.get(self.phase, str(self.failure) if self.failure else "connected")
 
     # --- receiving ----------------------------------------------------------------------------------------------------
 
@@ -263,12 +263,12 @@ class Connection:
         if self.welcome is None or welcome.session_id != self.welcome.session_id:
             self.mirror.reset()
             self.clock.reset()
+            self.stream.reset()  # else state goes on: a restarted front numbers its frames above the old one's
         self.mirror.synced = False
-        self.stream.reset()
         self.welcome = welcome
         self.identity.resume_token = welcome.resume_token
         self.phase = Phase.SYNCING
-        self._backoff_ns = BACKOFF_MIN_NS
+        self._joined_at = now_ns
         self._heartbeat_at = now_ns + welcome.heartbeat_ns // 2
         self._snapshot_at = now_ns
         if self.tracking_epoch:
@@ -296,7 +296,10 @@ class Connection:
             advice = "give every client that runs at the same time an identity of its own"
             self.failure = RefusedError(Refused(REPLACED, "another client took over with this identity", advice))
             self.phase = Phase.REFUSED
-        elif fault.code in CONNECTION_ENDED:
+        elif fault.code == "session_ended" and self.joined:
+            self.counters.reconnects += 1
+            self._wait(now_ns)
+        elif fault.code in ("dropped", "hello"):
             self.lost(now_ns)
 
     def _reply(self, reply: Reply) -> None:
@@ -308,7 +311,7 @@ class Connection:
             self.counters.unexpected_replies += 1
 
     def _snapshot(self, snapshot: Snapshot, bulk: Sequence[bytes]) -> None:
-        poses = _poses(bulk[0] if bulk else b"", len(snapshot.bodies))
+        poses = poses_from_bytes(bulk[0] if bulk else b"", len(snapshot.bodies))
         if poses is None:
             self.counters.malformed += 1
             return
@@ -320,7 +323,7 @@ class Connection:
         self._maybe_ready()
 
     def _maybe_ready(self) -> None:
-        if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.synced:
+        if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.settled:
             self.phase = Phase.READY
 
     def _deliver(self, message: Event | Feedback | ProtocolFault) -> None:
@@ -392,10 +395,3 @@ class Connection:
         else:
             self._outgoing.append(item)
         return True
-
-
-def _poses(data: bytes, n_bodies: int) -> Poses | None:
-    """Bulk frame of a snapshot as (n, 7) float64; `None` when it is not that."""
-    if len(data) != n_bodies * 7 * 8:
-        return None
-    return np.frombuffer(data, dtype="<f8").reshape(n_bodies, 7).astype(np.float64)

@@ -168,3 +168,10 @@ class StateStream:
         self.counters.presence += 1
         self.presence_ns = presence.session_time
         self.presence.update(((item.participant, item.device), item) for item in presence.items)
+
+
+def poses_from_bytes(data: bytes, n_bodies: int) -> Poses | None:
+    """Bulk frame of a snapshot as (n, 7) float64; `None` when it is not that."""
+    if len(data) != n_bodies * 7 * 8:
+        return None
+    return np.frombuffer(data, dtype="<f8").reshape(n_bodies, 7).astype(np.float64)

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
 
 import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import HOST, Entry
+from iris_session.protocol.entries import HOST, Entry, Lost
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo, StateHeader
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import FixedView
@@ -73,7 +72,14 @@ class LiveSession:
         """The whole authority stands still, as a user's script in a debugger."""
         (self._paused.set if paused else self._paused.clear)()
 
-    def kinds(self, kind: type) -> Iterable[Entry]:
+    def wait_lost(self, participant: str, timeout_s: float = 10.0) -> None:
+        """Until the session has given up on a silent participant."""
+        deadline = time.monotonic() + timeout_s
+        while not self.kinds(Lost):
+            assert time.monotonic() < deadline, f"{participant} was not lost within {timeout_s} s"
+            time.sleep(0.05)
+
+    def kinds(self, kind: type) -> list[Entry]:
         return [entry for entry in self.entries if isinstance(entry.message, kind)]
 
     def _run(self) -> None:

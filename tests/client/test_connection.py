@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iris_session.client.clock import SETTLED
 from iris_session.client.connection import (
     BACKOFF_MAX_NS,
     HELLO_TIMEOUT_NS,
@@ -87,10 +88,14 @@ class Wire:
         snapshot = Snapshot(0, event_seq, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=infos)
         self.get(snapshot, now_ns, poses.tobytes() if data is None else data)
 
+    def clock(self, now_ns: int) -> None:
+        for _ in range(SETTLED):
+            self.get(ClockPong(now_ns, now_ns, now_ns), now_ns)
+
     def join(self, now_ns: int = 0) -> None:
         self.connection.open(now_ns)
         self.welcome(now_ns)
-        self.get(ClockPong(now_ns, now_ns, now_ns), now_ns)
+        self.clock(now_ns)
         self.snapshot(now_ns)
         self.sent()
         assert self.connection.phase is Phase.READY
@@ -112,7 +117,7 @@ def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
     assert {type(m) for m in wire.sent()} == {ClockPing, GetSnapshot}
     wire.snapshot(20 * MS)
     assert wire.connection.phase is Phase.SYNCING  # no clock yet
-    wire.get(ClockPong(10 * MS, 0, 0), 20 * MS)
+    wire.clock(20 * MS)
     assert wire.connection.phase is Phase.READY
 
 
@@ -156,11 +161,33 @@ def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> Non
         wire.connection.tick(now)
     assert 3 * SECOND <= now <= 5 * SECOND
     assert wire.connection.counters.reconnects == 1
-    wire.sent()
-    wire.connection.tick(wire.connection.next_deadline_ns(now))
-    (hello,) = wire.sent()
+    hello = wire.sent()[-1]
     assert isinstance(hello, Hello)
     assert hello.resume_token == b"token"
+
+
+def test_who_stood_still_first_reads_what_was_said_meanwhile(wire: Wire) -> None:
+    wire.join()
+    wire.connection.tick(60 * SECOND)
+    assert wire.connection.phase is Phase.READY
+    assert {type(message) for message in wire.sent()} == {ClockPing, Heartbeat}
+    wire.connection.tick(60 * SECOND + 500 * MS)
+    wire.get(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
+    assert [type(message) for message in wire.sent()][-1] is Hello
+
+
+def test_a_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    now, waits = 0, []
+    for _ in range(6):
+        wire.welcome(now)
+        wire.connection.lost(now + MS)
+        assert wire.connection.phase is Phase.WAITING
+        waits.append(wire.connection.next_deadline_ns(now) - now)
+        now = wire.connection.next_deadline_ns(now)
+        wire.connection.tick(now)
+    assert waits == sorted(waits)
+    assert waits[-1] > 1.9 * SECOND
 
 
 def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
@@ -177,7 +204,6 @@ def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
 def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
     wire.join()
     wire.connection.lost(SECOND)
-    wire.connection.tick(2 * SECOND)
     wire.get(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
     assert wire.connection.phase is Phase.WAITING
     wire.connection.tick(5 * SECOND)
@@ -190,11 +216,13 @@ def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
     assert wire.connection.failure is None
 
 
-@pytest.mark.parametrize("code", ["session_ended", "dropped", "hello"])
-def test_faults_that_end_the_connection(wire: Wire, code: str) -> None:
+@pytest.mark.parametrize(
+    ("code", "phase"), [("session_ended", Phase.WAITING), ("dropped", Phase.JOINING), ("hello", Phase.JOINING)]
+)
+def test_faults_that_end_the_connection(wire: Wire, code: str, phase: Phase) -> None:
     wire.join()
     wire.get(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
-    assert wire.connection.phase is Phase.WAITING
+    assert wire.connection.phase is phase
     assert wire.connection.counters.faults == {code: 1}
 
 
@@ -204,7 +232,6 @@ def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire
     wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
     assert wire.connection.mirror.event_seq == 1
     wire.connection.lost(SECOND)
-    wire.connection.tick(2 * SECOND)
     wire.sent()
     wire.welcome(2 * SECOND, session="s2")
     assert not wire.connection.clock.synced
@@ -221,8 +248,9 @@ def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -
     wire.join()
     wire.connection.send(SAMPLE)
     wire.connection.lost(SECOND)
-    assert wire.sent() == []
-    assert wire.connection.counters.samples_not_sent == 1
+    assert [type(message) for message in wire.sent()] == [Hello]
+    assert not wire.connection.send(SAMPLE)
+    assert wire.connection.counters.samples_not_sent == 2
 
 
 def test_urgent_messages_overtake_and_the_queue_is_bounded(wire: Wire) -> None:
@@ -250,7 +278,6 @@ def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
     assert wire.connection.take_reply(number) is None
     assert wire.connection.lease_version("left") == 4
     wire.connection.lost(SECOND)
-    wire.connection.tick(2 * SECOND)
     assert wire.connection.lease_version("left") is None
 
 
