@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.limits import RateLimiter
 from iris_session.protocol.names import RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
@@ -43,6 +44,7 @@ class Admission:
         self._drops = drops
         self._tokens = tokens
         self._hellos = TokenBucket(config.limits.hellos_per_second, config.limits.hello_burst)
+        self._knocks: dict[int, RateLimiter] = {}
 
     def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
         """Answers a refusal itself, and gives no entry then."""
@@ -57,7 +59,7 @@ class Admission:
         return Entry(connection.number, connection.number, now_ns, join)
 
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
-        if not self._hellos.take(now_ns):
+        if not self._may_knock(route, peer, now_ns):
             raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
         if len(self._clients) >= self._config.limits.connections:
             raise _RefusedError(
@@ -82,6 +84,18 @@ class Admission:
             connection.gateway,
         )
         return connection, join
+
+    def _may_knock(self, route: Route, peer: Peer, now_ns: int) -> bool:
+        """Bounds the hellos of one TCP connection (a gateway's are those of many people), and of all together."""
+        if not route.on_behalf_of:
+            knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
+            if not knocks.allow(Hello, now_ns):
+                return False
+        return self._hellos.take(now_ns)
+
+    def forget_peer(self, descriptor: int) -> None:
+        """A TCP connection was closed: its descriptor may become another's."""
+        self._knocks.pop(descriptor, None)
 
     def _gateway(self, route: Route, peer: Peer) -> Connection | None:
         """The gateway that speaks, `None` for a client of its own."""

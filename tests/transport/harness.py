@@ -102,9 +102,11 @@ class FrontSession:
         self.clients.append(client)
         return client
 
-    def subscriber(self) -> zmq.Socket[bytes]:
+    def subscriber(self, curve: tuple[bytes, bytes, bytes] | None = None) -> zmq.Socket[bytes]:
         sub = self.context.socket(zmq.SUB)
         sub.linger = 0
+        if curve:
+            sub.curve_serverkey, sub.curve_publickey, sub.curve_secretkey = curve
         sub.connect(f"tcp://127.0.0.1:{self.ports.state}")
         sub.subscribe(b"")
         self.subscribers.append(sub)

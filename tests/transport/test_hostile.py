@@ -99,6 +99,15 @@ def test_a_full_house_and_hellos_too_fast_are_refused_with_advice(open_session: 
     assert third.wait_for(Refused, 3).code == "rate"
 
 
+def test_hellos_of_one_peer_use_up_nobody_elses(session: FrontSession) -> None:
+    knocking = session.client()
+    for _ in range(200):
+        knocking.send(Hello("operator", "Knock"))
+    session.pump(lambda: any(r.code == "rate" for r in knocking.got(Refused)), "refusal by rate")
+    knocking.wait_for(Refused, 200)
+    session.client().join()
+
+
 def test_a_flood_of_one_does_not_delay_the_estop_of_another(session: FrontSession) -> None:
     flooder, other = session.client(), session.client()
     flooder.join("operator", "Flood")

@@ -234,6 +234,15 @@ def test_curve_lets_in_listed_keys_only_and_names_clients_by_key(open_session: O
     assert isinstance(first, Join)
     assert isinstance(second, Join)
     assert first.key_id == second.key_id
+    subs = [session.subscriber(curve=(server_public, *keys)) for keys in (ann, eve)]
+    poses = np.zeros((3, 7))
+
+    def state_comes() -> bool:
+        session.send_state(poses)
+        return bool(subs[0].poll(0))
+
+    session.pump(state_comes, "encrypted state")
+    assert not subs[1].poll(0)
     unknown = session.client(curve=(server_public, *eve))
     unknown.send(Hello("operator", "Eve"))
     assert session.wait_drops("unknown_key") >= 1
