@@ -119,7 +119,7 @@ class Controller:
             if self._proximity.active and self._tick % self._proximity_ticks == 0:
                 self._slow_near_contact(data)
             self._joints.advance()
-            self._laws.write(data, self._joints.q, self._joints.v)
+            self._laws.write(data, self._joints.q, self._joints.v, self._joints.velocity)
             self._grippers.tick(data)
         else:
             self._move_targets()

@@ -101,8 +101,11 @@ class ActuatorLaws:
         self._acceleration = np.zeros(model.nv)
         self._force = np.zeros(model.nv)
 
-    def write(self, data: mujoco.MjData, q: Floats, v: Floats) -> None:
-        """`ctrl` for commanded positions `q` and velocities `v` of all joints, shape (n,)."""
+    def write(self, data: mujoco.MjData, q: Floats, v: Floats, speed: Floats) -> None:
+        """`ctrl` for commanded positions `q` and velocities `v` of all joints; velocity commands stay within `speed`.
+
+        All shape (n,). `data` must hold what MuJoCo computes from the present positions and velocities.
+        """
         ctrl = data.ctrl
         g = self._position
         if g.columns.size:
@@ -112,7 +115,8 @@ class ActuatorLaws:
             error = q[g.columns] - data.qpos[g.qpos]
             dead = self._config.velocity_deadband
             correction = error - np.minimum(np.maximum(error, -dead), dead)
-            ctrl[g.actuators] = (v[g.columns] + self._config.velocity_gain * correction) * g.scale
+            wanted, limit = v[g.columns] + self._config.velocity_gain * correction, speed[g.columns]
+            ctrl[g.actuators] = np.minimum(np.maximum(wanted, -limit), limit) * g.scale
         if self._torque.columns.size:
             self._write_torque(data, q, v)
 

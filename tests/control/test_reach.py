@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from anchors.pose import Vec3, quat_from_rotvec
 from iris_session.control import ControlConfig
 from tests.control.rigs import (
     IIWA_HOME,
@@ -112,18 +113,33 @@ def test_out_of_reach_is_reported_and_solving_ends_until_the_hand_comes_back() -
     assert made.controller.status()[0].limits == ()
 
 
-def test_joint_limits_hold_and_are_named() -> None:
+@pytest.mark.parametrize(
+    ("aim", "turn", "expected"),
+    [
+        ((-0.3, 0.0, -0.9), (0.0, 0.0, 3.0), {"joint2", "joint4"}),
+        ((-0.5, 0.0, 0.1), (0.0, 2.0, 0.0), {"joint4", "joint6"}),
+        ((-0.9, -0.4, 0.3), (0.0, 0.0, 0.0), {"joint3", "joint6"}),
+    ],
+)
+def test_joint_limits_hold_and_are_named(aim: Vec3, turn: Vec3, expected: set[str]) -> None:
     made = rig()
-    first = made.source((0.0, 0.0, 0.0))
-    down = made.source((-0.3, 0.0, -0.9))
-    made.step(decision([pose_command("iiwa", first)]))
-    made.step(decision([pose_command("iiwa", down)]))
-    for _ in range(1000):
-        made.step(decision([pose_command("iiwa", old(down))]))
+    made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
+    far, named = made.source(aim, quat_from_rotvec(turn)), set()
+    for k in range(1000):
+        made.step(decision([pose_command("iiwa", far if k == 0 else old(far))]))
+        named |= {name for name in made.controller.status()[0].limits if name.startswith("joint")}
         q = made.controller._joints.q
         assert (q >= made.model.jnt_range[:, 0] - 1e-9).all()
         assert (q <= made.model.jnt_range[:, 1] + 1e-9).all()
-    assert any(name.startswith("joint") for name in made.controller.status()[0].limits)
+    assert named >= expected
+
+
+def test_while_samples_flow_there_is_one_solve_for_each() -> None:
+    made = rig()
+    solves = count_solves(made)
+    for k in range(700):
+        made.step(decision([pose_command("iiwa", made.source((0.0, 0.001 * (k // 7), 0.0), new=k % 7 == 0))]))
+    assert len(solves) == 99  # the first of 100 samples latches
 
 
 def test_a_robot_that_starts_outside_its_range_is_not_thrown_back() -> None:

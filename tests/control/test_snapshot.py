@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anchors.pose import quat_from_rotvec
-from iris_session.control import Controller
+from iris_session.control import ControlConfig, Controller
 from iris_session.protocol.common import Pose
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, Decision, ObjectCommand
 from tests.control.rigs import Rig, aloha_robots, data_folder, hold_command, pose_command
 
+ONE_A_TICK = ControlConfig(max_solves_per_tick=1)  # so that whose turn it is matters
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -34,7 +35,7 @@ HOME = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
 
 
 def make(model: mujoco.MjModel) -> Rig:
-    return Rig(model, aloha_robots(), objects=[ObjectSpec("box", "box")], home=HOME)
+    return Rig(model, aloha_robots(), ONE_A_TICK, objects=[ObjectSpec("box", "box")], home=HOME)
 
 
 def vector(rng: np.random.Generator, size: float, n: int) -> tuple[float, ...]:
@@ -86,7 +87,7 @@ def play(rig: Rig, journal: list[tuple[Decision, int]], restart_every: int = 0) 
     for step, (decision, n_ticks) in enumerate(journal):
         if restart_every and step % restart_every == restart_every - 1:
             snapshot = rig.controller.snapshot()
-            rig.controller = Controller(rig.model, rig.robots, [ObjectSpec("box", "box")])
+            rig.controller = Controller(rig.model, rig.robots, [ObjectSpec("box", "box")], ONE_A_TICK)
             rig.controller.restore(snapshot)
             assert rig.controller.snapshot() == snapshot
         rig.step(decision, n_ticks)
