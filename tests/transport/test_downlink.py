@@ -1,0 +1,119 @@
+"""From the authority to clients: order, and only the newest state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.protocol.server_messages import BodyInfo, StateHeader
+from iris_session.transport import link_messages as link
+from iris_session.transport.clients import ClientTable
+from iris_session.transport.config import SceneInfo
+from iris_session.transport.downlink import Downlink
+from iris_session.transport.limiter import Drops
+from iris_session.transport.state_publisher import StatePublisher
+
+
+class Far:
+    """The authority's end of the link; keeps what is published."""
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self.socket = context.socket(zmq.PAIR)
+        self.socket.bind("inproc://link")
+        near = context.socket(zmq.PAIR)
+        near.connect("inproc://link")
+        self.published: list[tuple[bytes, ...]] = []
+        self.drops = Drops()
+        self.publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
+        unused = None
+        self.downlink = Downlink(
+            near,
+            ClientTable(),
+            unused,  # type: ignore[arg-type]
+            unused,  # type: ignore[arg-type]
+            self.publisher,
+            self.drops,
+            lambda: 77,
+            lambda connection: None,
+        )
+
+    def send_multipart(self, frames: tuple[bytes, ...]) -> None:
+        self.published.append(frames)
+
+    def state(self, tick: int, n: int = 1) -> None:
+        header = StateHeader(1, 0, tick, 0.0, tick, 0, 0, 0)
+        self.socket.send_multipart((link.STATE, msgspec.msgpack.encode(header), np.zeros((n, 7)).tobytes()))
+
+    def scene(self, n: int) -> None:
+        self.socket.send_multipart((link.SCENE, msgspec.msgpack.encode(scene(n))))
+
+    def headers(self) -> list[StateHeader]:
+        return [msgspec.msgpack.decode(frames[1], type=StateHeader) for frames in self.published]
+
+
+def scene(n: int) -> SceneInfo:
+    return SceneInfo(f"scene{n}", (), tuple(BodyInfo(i, f"b{i}", True) for i in range(n)), np.ones((n, 7)).tobytes())
+
+
+@pytest.fixture
+def far() -> Iterator[Far]:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    yield Far(context)
+    context.destroy(linger=0)
+
+
+def test_only_the_newest_waiting_state_is_published_stamped(far: Far) -> None:
+    for tick in (1, 2, 3):
+        far.state(tick)
+    far.downlink.drain()
+    (header,) = far.headers()
+    assert (header.tick, header.state_seq, header.published_ns) == (3, 1, 77)
+    assert far.drops.by_reason == {"state_superseded": 2}
+    far.state(4)
+    far.downlink.drain()
+    assert [h.state_seq for h in far.headers()] == [1, 2]
+
+
+def test_state_goes_before_everything_else_that_waits(far: Far) -> None:
+    order: list[str] = []
+    far.publisher.publish_presence = lambda *_: order.append("presence")  # type: ignore[method-assign]
+    far.publisher.publish = lambda *_: order.append("state") or True  # type: ignore[method-assign, func-returns-value]
+    far.socket.send_multipart((link.PRESENCE, msgspec.msgpack.encode([])))
+    far.state(1)
+    far.downlink.drain()
+    assert order == ["state", "presence"]
+
+
+def test_a_state_of_the_next_scene_waits_for_it(far: Far) -> None:
+    far.state(1)
+    far.scene(2)
+    far.state(2, n=2)
+    far.downlink.drain()
+    assert far.publisher.scene.scene_hash == "scene2"
+    assert [h.tick for h in far.headers()] == [2]
+    assert "state_of_other_scene" not in far.drops.by_reason
+
+
+def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(far: Far) -> None:
+    far.state(1)
+    far.downlink.drain()
+    assert far.publisher.keyframe()[0] == 1
+    far.scene(2)
+    far.downlink.drain()
+    assert far.publisher.keyframe() == (0, np.ones((2, 7)).tobytes())
+    far.state(3, n=2)
+    far.downlink.drain()
+    assert far.publisher.keyframe()[0] == 2
+
+
+def test_acknowledgements_and_the_end_are_noticed(far: Far) -> None:
+    assert far.downlink.heard_ns == 0
+    far.socket.send_multipart((link.ACK, b"\x04"))
+    far.socket.send_multipart((link.ACK, b"\x03"))
+    far.socket.send_multipart((link.END, b""))
+    far.downlink.drain()
+    assert (far.downlink.acknowledged, far.downlink.ended, far.downlink.heard_ns) == (7, True, 77)
