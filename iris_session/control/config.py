@@ -29,6 +29,7 @@ _POSITIVE: Final = (
     "velocity_gain",
     "torque_frequency",
     "proximity_period_s",
+    "tracking_error",
     "grasp_frequency",
     "grasp_max_force",
     "grasp_max_torque",
@@ -50,7 +51,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     position_cost: float = 1.0  # [1/m]
     orientation_cost: float = 0.3  # [1/rad]: 1 mm counts as much as 3.3 mrad
     posture_cost: float = 1e-2  # [1/rad]: also the damping near singularities
-    posture_gain: float = 0.02  # share of the null-space error to the rest posture that one solve may correct
+    posture_gain: float = 0.005  # share of the way to the rest posture per solve: an elbow 1 rad off moves at 0.4 rad/s
     lm_damping: float = 1e-2
     position_tolerance: float = 2e-5  # [m]: below both, a target counts as reached and solving stops
     rotation_tolerance: float = 1e-4  # [rad]
@@ -88,6 +89,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     proximity_stop: float = 0.02  # [m]: at this distance it is zero
     proximity_gain: float = 4.0  # [1/s]: closing speed <= gain * (distance - stop)
     proximity_period_s: float = 0.01
+    tracking_error: float = 0.3  # [rad or m]: joints further than this from where they are commanded are reported
     # --- objects held by hands without a robot
     grasp_frequency: float = 25.0  # [rad/s]
     grasp_max_force: float = 40.0  # [N], gravity compensation not counted

@@ -61,7 +61,7 @@ class Controller:
         self._grippers = Grippers(model, self._robots, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
         self._proximity = Proximity(model, self._robots, self._config)
-        self._proximity_ticks = max(1, round(self._config.proximity_period_s / self._dt))
+        self._check_ticks = max(1, round(self._config.proximity_period_s / self._dt))
         self._states = [RobotState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
         self._now_ns = 0
@@ -116,8 +116,10 @@ class Controller:
             raise ControlError("control does not know where the robots stand: call reset(data) or restore(bytes) first")
         if self._writes_ctrl:
             self._solve_due(data)
-            if self._proximity.active and self._tick % self._proximity_ticks == 0:
-                self._slow_near_contact(data)
+            if self._tick % self._check_ticks == 0:
+                self._check_tracking(data)
+                if self._proximity.active:
+                    self._slow_near_contact(data)
             self._joints.advance()
             self._laws.write(data, self._joints.q, self._joints.v, self._joints.velocity)
             self._grippers.tick(data)
@@ -210,7 +212,6 @@ class Controller:
         else:
             clutch.follow(r.latch, command.sources, self._box(i))
             r.want_solve = True
-        r.stalls = 0
         r.pending = _newest(command)
 
     def _engage(self, i: int, command: Command, scale: float) -> None:
@@ -260,7 +261,14 @@ class Controller:
         if clutch.integrate(state, self._dt, config.tip_speed, config.tip_angular_speed, self._box(i)):
             tip = self._reach.tip(i, r) if self._writes_ctrl else r.commanded
             state.target = clutch.toward(tip, state.target, config.twist_lead_m, config.twist_lead_rad)
-            r.want_solve, r.stalls = True, 0
+            r.want_solve = True
+
+    def _check_tracking(self, data: mujoco.MjData) -> None:
+        """Notices robots whose joints are not where they are commanded: blocked, overloaded, or far too slow."""
+        far = np.abs(data.qpos[self._qpos] - self._joints.q) > self._config.tracking_error
+        some = bool(far.any())
+        for r, columns in zip(self._states, self._columns, strict=True):
+            r.lagging = some and bool(far[columns].any())
 
     def _slow_near_contact(self, data: mujoco.MjData) -> None:
         """Bounds the speed of robots that close in on each other, until the next check."""
@@ -314,6 +322,8 @@ class Controller:
             extra += ("proximity",)
         if r.ramping:
             extra += ("leader_apart",)
+        if r.lagging:
+            extra += ("tracking",)
         return r.solver_limits + extra
 
 

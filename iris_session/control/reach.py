@@ -23,7 +23,8 @@ from iris_session.control.state import RobotState
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import RobotSpec
 
-_MAX_STALLS = 5  # solves without progress after which a target counts as out of reach
+_MAX_STALLS = 5  # solves in a row without progress after which a target counts as out of reach
+_PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 
 
 class Reach:
@@ -68,8 +69,9 @@ class Reach:
         columns, joints, config = self._columns[i], self._joints, self._config
         interval = self.interval(r, tick)
         goal, commanded, speed = joints.goal[columns], joints.q[columns], joints.velocity[columns]
+        T_world_now = self.tip(i, r)
         r.commanded = clutch.toward(
-            self.tip(i, r), state.target, config.tip_speed * interval, config.tip_angular_speed * interval
+            T_world_now, state.target, config.tip_speed * interval, config.tip_angular_speed * interval
         )
         lead, step = speed * config.lead_s, speed * interval
         lower = np.maximum(self._lower[columns], commanded - lead) - goal
@@ -82,25 +84,36 @@ class Reach:
         bounded = (q - goal <= lower + 1e-9) | (q - goal >= upper - 1e-9)
         joints.aim(columns, q, interval)
         r.last_solve = tick
-        self._judge(i, r, state.target, bounded, singular)
+        self._judge(i, r, T_world_now, state.target, bounded, singular)
 
     def _judge(
-        self, i: int, r: RobotState, T_world_target: PoseTuple, bounded: NDArray[np.bool_], singular: bool
+        self,
+        i: int,
+        r: RobotState,
+        T_world_before: PoseTuple,
+        T_world_target: PoseTuple,
+        bounded: NDArray[np.bool_],
+        singular: bool,
     ) -> None:
         """Decides whether solving goes on without new samples, and names what is limiting."""
-        config, goal = self._config, self._joints.goal[self._columns[i]]
-        distance, angle = clutch.separation(self.tip(i, r), T_world_target)
-        error = max(distance / config.position_tolerance, angle / config.rotation_tolerance)
-        r.stalls = r.stalls + 1 if error > 0.99 * r.error else 0
-        r.error = error
-        reached, stuck = error <= 1.0, r.stalls >= _MAX_STALLS
+        goal, T_world_now = self._joints.goal[self._columns[i]], self.tip(i, r)
+        error = self._in_tolerances(T_world_now, T_world_target)
+        progress = self._in_tolerances(T_world_before, T_world_now)
+        reached = error <= 1.0
+        r.stalls = 0 if reached or progress > _PROGRESS * error else min(r.stalls + 1, _MAX_STALLS)
+        stuck = r.stalls == _MAX_STALLS
         r.want_solve = not (reached or stuck)
         at_range = (goal <= self._lower[self._columns[i]] + 1e-6) | (goal >= self._upper[self._columns[i]] - 1e-6)
         limits = [name for name, at in zip(self._robots[i].joints, at_range.tolist(), strict=True) if at]
         if not reached and bool((bounded & ~at_range).any()):
             limits.append("speed")
-        if stuck and not reached:
+        if stuck:
             limits.append("reach")
         if singular:
             limits.append("singular")
         r.solver_limits = tuple(limits)
+
+    def _in_tolerances(self, T_a: PoseTuple, T_b: PoseTuple) -> float:
+        """How far apart two poses are, 1 = just within the tolerances that count as reached."""
+        distance, angle = clutch.separation(T_a, T_b)
+        return max(distance / self._config.position_tolerance, angle / self._config.rotation_tolerance)

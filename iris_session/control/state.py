@@ -17,7 +17,7 @@ class RobotState(msgspec.Struct, array_like=True):
 
     `fresh`: latched in this step, whose sample has not moved the target yet. `want_solve`: the target has moved, or is
     not reached yet. `pending`: newest sample in the target, not yet behind `ctrl`. `commanded`: end-effector target in
-    force. `error`: left by the last solve [position tolerance = 1].
+    force. `stalls`: solves in a row without progress. `lagging`: the measured joints are far from the commanded ones.
     """
 
     T_world_root: PoseTuple = IDENTITY_POSE
@@ -28,10 +28,10 @@ class RobotState(msgspec.Struct, array_like=True):
     pending: Applied | None = None
     applied: Applied | None = None
     last_solve: int = LONG_AGO
-    error: float = 0.0
     stalls: int = 0
     ramping: bool = False
     proximity: float = 1.0
+    lagging: bool = False
     solver_limits: tuple[str, ...] = ()
 
 

@@ -244,6 +244,18 @@ def test_the_workspace_is_kept_and_reported() -> None:
     assert rig.controller.status()[0].limits == ("workspace",)
 
 
+def test_a_robot_that_cannot_get_where_it_is_commanded_is_reported() -> None:
+    rig = iiwa()
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    rig.data.qpos[:] += 0.4  # as if something held it
+    mujoco.mj_forward(rig.model, rig.data)
+    for _ in range(5):
+        rig.controller.tick(rig.data)
+    assert rig.controller.status()[0].limits == ("tracking",)
+    rig.hold(2000)
+    assert rig.controller.status()[0].limits == ()
+
+
 def test_reset_forgets_everything() -> None:
     box = """<body name="box" pos="3 0 1"><freejoint/><geom size=".1"/></body>"""
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{box}</worldbody></mujoco>")
