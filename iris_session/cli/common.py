@@ -46,6 +46,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
     )
+    group.add_argument("--curve-clients", default="", metavar="DIR", help="public certificates of clients to let in")
     group.add_argument("--no-record", action="store_true", help="record nothing")
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")

@@ -78,10 +78,11 @@ def run(arguments: argparse.Namespace) -> int:
     path = scene_file(arguments.scene)
     model = load_model(path)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, model)
-    with Session(model, config=session_config(arguments, path.stem), robots=robots) as session:
+    session = Session(model, config=session_config(arguments, path.stem), robots=robots)
+    with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         names = ", ".join(r.name for r in session.robots) or "none"
-        print(f"session '{session.config.name}' on {session.address}, robots: {names}", file=out)
+        print(f"session '{session.config.name}' on {session.address}, robots: {names}", file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
         view = LiveView(session, out, f"iris-session {session.config.name} on {session.address}")

@@ -124,7 +124,8 @@ def run_handover(
     emulators: list[EmulatorProcess] = []
     next_read_ns = 0
 
-    with Session(scene_path("handover"), config=config) as session:
+    session = Session(scene_path("handover"), config=config)
+    with session.signals(), session:
         update = on_session(session) if on_session is not None else (lambda: None)
 
         def finished() -> bool:

@@ -111,7 +111,7 @@ class Session:
 
     # --- our loop ----------------------------------------------------------------------------------------------------
 
-    def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> None:
+    def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
         """Advances physics in real time until `stop()`, Ctrl-C or SIGTERM, `seconds` of session time, or `until()`.
 
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
@@ -119,7 +119,7 @@ class Session:
         stepper = self._make_stepper(user_owned=False)
         end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
         pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
-        with self._signals(), tick_priority(self.config.realtime) as self._scheduling:
+        with self.signals(), tick_priority(self.config.realtime) as self._scheduling:
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
@@ -152,8 +152,8 @@ class Session:
         self._stop.set()
 
     @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM end `run()` in order; only possible, and only done, in the main thread."""
+    def signals(self) -> Iterator[None]:
+        """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return

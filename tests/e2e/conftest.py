@@ -1,0 +1,246 @@
+"""Real processes on free ports: `iris-session serve`, clients in this process, emulated people in others.
+
+Everything waits on conditions with a deadline; everything that was started is ended again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import psutil
+import pytest
+
+from anchors.pose import PoseTuple
+from iris_session.client import Client
+from iris_session.protocol.server_messages import Event
+
+DEADLINE_S = 20.0
+_COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
+
+
+def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
+    """Polls `condition` until it is true; fails naming `what`."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"not within {timeout_s:g} s: {what}")
+        time.sleep(0.005)
+
+
+class Server:
+    """One `iris-session serve` process and its recording."""
+
+    def __init__(self, folder: Path, scene: str, arguments: Sequence[str]) -> None:
+        self.recording = folder / "session.rrd"
+        self._out = folder / "serve.out"
+        options = ["--control-port", "0", "--state-port", "0", "--record", str(self.recording), *arguments]
+        with self._out.open("wb") as out:
+            self.process = subprocess.Popen(
+                [*_COMMAND, "serve", scene, *options], stdout=out, stderr=subprocess.STDOUT, cwd=folder
+            )
+        wait(lambda: "recording to" in self.output or self.process.poll() is not None, "the session listens")
+        match = re.search(r"on (\S+:\d+),", self.output)
+        assert match, self.output
+        self.address = match.group(1)
+
+    @property
+    def output(self) -> str:
+        return self._out.read_text(errors="replace")
+
+    def children(self) -> dict[str, psutil.Process]:
+        """Front and recorder by name."""
+        found = {}
+        for child in psutil.Process(self.process.pid).children():
+            line = " ".join(child.cmdline())
+            for name in ("transport.front", "recording.process"):
+                if name in line:
+                    found[name] = child
+        return found
+
+    def stop(self) -> None:
+        """Ctrl-C; the process must end in order."""
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(DEADLINE_S) == 0, self.output
+
+    def verify(self) -> dict[str, object]:
+        """`iris-session verify --json` of the recording; it must be identical."""
+        done = subprocess.run(
+            [*_COMMAND, "verify", "--json", str(self.recording)], capture_output=True, text=True, check=False
+        )
+        report: dict[str, object] = json.loads(done.stdout)
+        assert done.returncode == 0, report
+        return report
+
+    def finish(self) -> dict[str, object]:
+        """Stops and verifies; nothing may stay behind."""
+        children = list(self.children().values())
+        self.stop()
+        _, alive = psutil.wait_procs(children, timeout=5.0)
+        assert not alive, alive
+        return self.verify()
+
+
+class Hand:
+    """One person's right hand, or a policy's: sends samples of one device that drives `robot`.
+
+    The pose is in the tracking frame, which is the world for clients that need no alignment.
+    """
+
+    def __init__(self, client: Client, robot: str, device: str = "controller/right") -> None:
+        self.client = client
+        self.robot = robot
+        self.device = device
+        self.pose: PoseTuple = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+        self.clutch = False
+        self.velocity = (0.0, 0.0, 0.0)
+        self.sending = True
+        self._next = 0.0
+
+    def step(self) -> None:
+        now = time.monotonic()
+        if not self.sending or now < self._next:
+            return
+        dt = 1.0 / 72.0
+        self._next = now + dt
+        p = self.pose[0]
+        v = self.velocity
+        self.pose = ((p[0] + v[0] * dt, p[1] + v[1] * dt, p[2] + v[2] * dt), self.pose[1])
+        self.client.send_sample(self.device, self.pose, robots=[self.robot], clutch=self.clutch)
+
+    @property
+    def tip(self) -> PoseTuple:
+        tip = self.client.tip_pose(self.robot)
+        assert tip is not None
+        return tip
+
+
+class Stage:
+    """The people of one test; `run` keeps all of them alive until a condition holds."""
+
+    def __init__(self, server: Server) -> None:
+        self.server = server
+        self.clients: list[Client] = []
+        self.hands: list[Hand] = []
+        self.events: dict[str, list[Event]] = {}
+
+    def join(self, name: str, role: str = "operator", identity: str | None = None) -> Client:
+        """A client that needs no alignment (remote VR, policy, desktop)."""
+        log = self.events[name] = []
+        client = Client(
+            self.server.address,
+            role=role,
+            name=name,
+            devices=("controller/right", "head", "joints", "target"),
+            alignment="not_needed",
+            identity=identity,
+            on_event=log.append,
+        )
+        self.clients.append(client)
+        client.connect(DEADLINE_S)
+        return client
+
+    def hand(self, client: Client, robot: str) -> Hand:
+        hand = Hand(client, robot)
+        self.hands.append(hand)
+        return hand
+
+    def engage(self, hand: Hand) -> None:
+        """Opens, then closes the clutch, and waits until the robot follows."""
+        hand.clutch = False
+        self.seconds(0.1)
+        hand.clutch = True
+        self.run(lambda: self.following(hand), f"{hand.robot} follows {hand.client.name}")
+
+    def following(self, hand: Hand) -> bool:
+        state = hand.client.state
+        mine = hand.client.connection.participant_id
+        return state is not None and any(
+            a.robot == hand.robot and a.participant == mine and state.header.session_time - a.step_ns < 100_000_000
+            for a in state.header.applied
+        )
+
+    def step(self) -> None:
+        for hand in self.hands:
+            hand.step()
+        for client in self.clients:
+            client.poll(0.0)
+        time.sleep(0.002)
+
+    def run(self, condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                pytest.fail(f"not within {timeout_s:g} s: {what}\n{self.server.output[-2000:]}")
+            self.step()
+
+    def seconds(self, seconds: float) -> None:
+        """Lets the session go on for a stretch of its own time."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.step()
+
+    def bodies(self, name: str) -> list[str]:
+        """Tags of the events that `name` has seen."""
+        return [type(event.body).__name__ for event in self.events[name]]
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.close()
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Server]]:
+    servers: list[Server] = []
+
+    def start(scene: str = "handover", *arguments: str) -> Server:
+        folder = tmp_path / f"server{len(servers)}"
+        folder.mkdir()
+        server = Server(folder, scene, arguments)
+        servers.append(server)
+        return server
+
+    yield start
+    for server in servers:
+        children = list(server.children().values()) if server.process.poll() is None else []
+        if server.process.poll() is None:
+            server.process.kill()
+            server.process.wait()
+        psutil.wait_procs(children, timeout=5.0)
+
+
+@pytest.fixture
+def stage(serve: Callable[..., Server]) -> Iterator[Stage]:
+    """The demo scene with nobody in it."""
+    stage = Stage(serve())
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def emulate() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts emulated people in a process of their own."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(address: str, *headsets: str, seconds: float = 60.0) -> subprocess.Popen[bytes]:
+        options = [x for headset in headsets for x in ("--headset", headset)]
+        process = subprocess.Popen(
+            [*_COMMAND, "emulate", address, *options, "--seconds", str(seconds), "--json"],
+            stdout=subprocess.DEVNULL,
+            env={**os.environ},
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
