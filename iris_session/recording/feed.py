@@ -70,7 +70,7 @@ class RecorderFeed:
         spill_bytes: int = SPILL_BYTES,
     ) -> None:
         self.stats = FeedStats()
-        self.wants_keyframe = False
+        self._lost = False
         self._window_limit = window_bytes
         self._spill = SpillFile(Path(spill_dir) / f"feed-{os.getpid()}.spill", spill_bytes)
         self._context = zmq.Context(io_threads=1)
@@ -91,6 +91,11 @@ class RecorderFeed:
         self._now = (0, 0)  # step and session time of the newest row
         self._presence: tuple[PresenceItem, ...] = ()
 
+    @property
+    def wants_keyframe(self) -> bool:
+        """True once there is room again after a loss: verification can go on from the next keyframe."""
+        return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
+
     def header(self, header: SessionHeader) -> None:
         """Names the session: once, before the first row."""
         self._header = messages.encode_header(header)
@@ -109,7 +114,7 @@ class RecorderFeed:
 
     def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         """Snapshots after the step of the newest row, whose `chain` is given (`header_root` before the first row)."""
-        self.wants_keyframe = False
+        self._lost = False
         self._batch.keyframes.append(seal(keyframe, chain))
         self.flush()
 
@@ -189,7 +194,7 @@ class RecorderFeed:
             self.stats.dropped_rows += rows
             self.stats.spill_fault = self._spill.fault
             self._gap_rows += rows
-            self.wants_keyframe = True
+            self._lost = True
             self._batch.dropped_rows = self.stats.dropped_rows
 
     def _send_batch(self, body: bytes) -> None:

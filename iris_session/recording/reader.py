@@ -24,11 +24,13 @@ from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, open_blob
 from iris_session.recording.messages import DenialRecord, decode_header
+from iris_session.recording.probe import Prober
 
 _decode_event = msgspec.msgpack.Decoder(Event).decode
 _decode_denial = msgspec.msgpack.Decoder(DenialRecord).decode
 _decode_keyframe = msgspec.msgpack.Decoder(Keyframe).decode
 _decode_end = msgspec.msgpack.Decoder(tuple[int, bytes]).decode
+_decode_mark = msgspec.msgpack.Decoder(rrd_file.Mark).decode
 _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 _decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
 
@@ -61,7 +63,7 @@ class State(NamedTuple):
 class Recording:
     """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
 
-    `damage`: one line per thing that could not be read; it grows while reading. `end`: last step and its chain value
+    `damage`: one line per thing that could not be read. `end`: last step and its chain value
     as the recorder noted when it closed the last part, None when it was killed.
     """
 
@@ -70,8 +72,9 @@ class Recording:
         self.files: list[str] = []
         self._readable: list[str] = []
         self.damage: list[str] = []
-        for path in files:
-            self._add_part(path)
+        with Prober() as prober:
+            for path in files:
+                self._add_part(path, prober)
         self.header = self._header(files[0])
         self.end = self._end()
 
@@ -143,6 +146,17 @@ class Recording:
             values += _values(batch, "Scalars:scalars")
         return {name: (np.array(t, np.int64), np.array(v, np.float64)) for name, (t, v) in found.items()}
 
+    def changed_spans(self) -> list[str]:
+        """Spans of bytes that were changed since the recorder wrote them, wherever in the file; a line each."""
+        marks: dict[int, list[rrd_file.Mark]] = {}
+        for part, batch in self._batches(paths.MARKS):
+            marks.setdefault(part, []).extend(map(_decode_mark, _values(batch, "mark")))
+        return [
+            f"{os.path.basename(self.files[part])}: {line}"
+            for part, noted in marks.items()
+            for line in rrd_file.changed_spans(self.files[part], noted)
+        ]
+
     def close(self) -> None:
         """Removes temporary copies."""
         if self._folder is not None:
@@ -174,47 +188,28 @@ class Recording:
                     yield item
 
     def _batches(self, entity: str) -> Iterator[tuple[int, Any]]:
-        """Part number (from 0) and record batch of an entity, over all parts in order.
+        """Part number (from 0) and record batch of an entity, over all parts in order."""
+        for i, path in enumerate(self._readable):
+            for chunk in rrd_file.chunks(path, entity):
+                yield i, chunk.to_record_batch()
 
-        A damaged part is read on from a copy without the damage, at the same place.
-        """
-        for i in range(len(self.files)):
-            done = 0
-            while True:
-                try:
-                    for k, chunk in enumerate(rrd_file.chunks(self._readable[i], entity)):
-                        if k < done:
-                            continue
-                        done = k + 1
-                        yield i, chunk.to_record_batch()
-                except RuntimeError:
-                    if self._readable[i] != self.files[i]:
-                        raise
-                    self._salvage(i)
-                    continue
-                break
-
-    def _add_part(self, path: str) -> None:
+    def _add_part(self, path: str, prober: Prober) -> None:
         """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
         try:
             found = rrd_file.scan(path)
+            whole = found.good_bytes == found.size and prober.readable(path)
+            self._readable.append(path if whole else self._salvaged(path, prober))
             self.files.append(path)
-            self._readable.append(path)
-            if found.good_bytes < found.size:
-                self._salvage(len(self.files) - 1)
         except NotARecordingError as error:
             self.damage.append(str(error))
-            if self.files and self.files[-1] == path:
-                self.files.pop()
-                self._readable.pop()
 
-    def _salvage(self, i: int) -> None:
+    def _salvaged(self, path: str, prober: Prober) -> str:
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="iris-recording-")
-        copy = os.path.join(self._folder.name, f"part{i + 1}.rrd")
-        name = os.path.basename(self.files[i])
-        self.damage += [f"{name}: {line}" for line in rrd_file.salvage(self.files[i], copy)]
-        self._readable[i] = copy
+        name = os.path.basename(path)
+        copy = os.path.join(self._folder.name, name)
+        self.damage += [f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)]
+        return copy
 
     def _end(self) -> tuple[int, bytes] | None:
         for part, batch in self._batches(paths.END):

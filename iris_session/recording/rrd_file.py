@@ -1,7 +1,7 @@
 """Damaged Rerun files: finds what can be read in a file that was cut short or changed, without altering it.
 
 An RRD file is a 12-byte header and messages of a 16-byte head (kind, length; little-endian uint64) and a body. Rerun's
-reader stops at the first body it cannot decode; this module makes a temporary copy of the messages that it can.
+reader stops at the first body it cannot decode, or aborts; this module makes a temporary copy of those that it can.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import os
 import struct
 import tempfile
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 from iris_session.recording.errors import NotARecordingError
+from iris_session.recording.probe import Prober
 
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
@@ -43,6 +45,14 @@ class Scan(NamedTuple):
     size: int
 
 
+class Mark(NamedTuple):
+    """The recorder's note about a span of its file: CRC-32 of the bytes from `begin` up to `end`."""
+
+    begin: int
+    end: int
+    crc: int
+
+
 def scan(path: str | Path) -> Scan:
     """Walks over the messages of a file without decoding them. Raises `NotARecordingError`."""
     size = os.path.getsize(path)
@@ -64,34 +74,35 @@ def scan(path: str | Path) -> Scan:
     return Scan(found, size if has_footer else at, size)
 
 
+def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
+    """The spans of the file whose bytes are not those that the recorder noted, a line each.
+
+    None of a file that another tool has rewritten: there the marks end nowhere between messages.
+    """
+    found = scan(path)
+    ends = {m.offset for m in found.messages} | {found.size}
+    if not any(mark.end in ends for mark in marks):
+        return []
+    out = []
+    with open(path, "rb") as file:
+        for mark in marks:
+            file.seek(mark.begin)
+            if zlib.crc32(file.read(mark.end - mark.begin)) != mark.crc:
+                out.append(f"bytes {mark.begin} to {mark.end} are not as they were written")
+    return out
+
+
 def chunks(path: str | Path, entity: str) -> Iterator[Any]:
-    """Chunks of one entity in the order of writing. Raises `RuntimeError` where the file is damaged."""
-    try:
-        iterator = iter(_open(path).filter(content=entity))
-    except BaseException as error:
-        raise _plain(error) from error
-    while True:
-        try:
-            chunk = next(iterator)
-        except StopIteration:
-            return
-        except BaseException as error:
-            raise _plain(error) from error
-        yield chunk
+    """Chunks of one entity in the order of writing. The file must be readable, see `Prober`."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a file without a footer is normal here: the recorder may have been killed
+        stream = RrdReader(str(path)).stream().filter(content=entity)
+    return iter(stream)
 
 
-def is_readable(path: str | Path) -> bool:
-    """True when Rerun decodes every message of the file."""
-    try:
-        for _ in _open(path):
-            pass
-    except BaseException as error:
-        _plain(error)
-        return False
-    return True
-
-
-def salvage(path: str | Path, copy: str | Path) -> list[str]:
+def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
     """Writes the readable messages of `path` to `copy`. Returns what was left out, a line each.
 
     Raises `NotARecordingError` when nothing is readable.
@@ -102,50 +113,46 @@ def salvage(path: str | Path, copy: str | Path) -> list[str]:
         damage.append(f"cut or changed at byte {found.good_bytes} of {found.size}: nothing after it is readable")
     messages = [m for m in found.messages if m.kind != KIND_END]
     infos = [m for m in messages if m.kind == KIND_STORE_INFO]
-    if not infos:
-        raise NotARecordingError(f"{path} holds no recording that can be read")
     with open(path, "rb") as file, tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / "trial.rrd"
+        trial = _Trial(file, infos, Path(folder) / "trial.rrd", prober)
+        if not infos or not trial.passes([]):
+            raise NotARecordingError(f"{path} holds no recording that can be read")
         bad: list[Message] = []
         others = [m for m in messages if m.kind != KIND_STORE_INFO]
         for i in range(0, len(others), GROUP):
-            bad += _bad_ones(file, infos, others[i : i + GROUP], trial)
+            bad += trial.bad_ones(others[i : i + GROUP])
         damage += [f"message of {m.length} bytes at byte {m.offset} is damaged and left out" for m in bad]
         refused = {m.offset for m in bad}
         _write(file, [m for m in messages if m.offset not in refused], Path(copy))
-    return damage
+    return damage or ["the footer is damaged: read without it"]
 
 
-def _open(path: str | Path) -> Any:
-    """Rerun's stream of the chunks of the recording in `path`."""
-    from rerun.chunk import RrdReader
+class _Trial:
+    """Finds the messages of `file` that do not decode, by halving groups of them."""
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a file without a footer is normal here: the session was killed
-        return RrdReader(str(path)).stream()
+    def __init__(self, file: BinaryIO, infos: Sequence[Message], path: Path, prober: Prober) -> None:
+        self._file = file
+        self._infos = infos
+        self._path = path
+        self._prober = prober
+
+    def passes(self, group: Sequence[Message]) -> bool:
+        _write(self._file, [*self._infos, *group], self._path)
+        return self._prober.readable(self._path)
+
+    def bad_ones(self, group: Sequence[Message]) -> list[Message]:
+        if self.passes(group):
+            return []
+        if len(group) == 1:
+            return list(group)
+        half = len(group) // 2
+        return self.bad_ones(group[:half]) + self.bad_ones(group[half:])
 
 
-def _bad_ones(file: Any, infos: Sequence[Message], group: Sequence[Message], trial: Path) -> list[Message]:
-    _write(file, [*infos, *group], trial)
-    if is_readable(trial):
-        return []
-    if len(group) == 1:
-        return list(group)
-    half = len(group) // 2
-    return _bad_ones(file, infos, group[:half], trial) + _bad_ones(file, infos, group[half:], trial)
-
-
-def _write(file: Any, messages: Sequence[Message], path: Path) -> None:
+def _write(file: BinaryIO, messages: Sequence[Message], path: Path) -> None:
     file.seek(0)
     with open(path, "wb") as out:
         out.write(file.read(FILE_HEAD))
         for message in messages:
             file.seek(message.offset)
             out.write(file.read(_HEAD.size + message.length))
-
-
-def _plain(error: BaseException) -> RuntimeError:
-    """Rerun's errors and its panics (which are no `Exception`) as `RuntimeError`; everything else goes on."""
-    if isinstance(error, Exception) or type(error).__name__ == "PanicException":
-        return RuntimeError(" ".join(str(error).split()))
-    raise error

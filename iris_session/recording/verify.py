@@ -141,9 +141,12 @@ def verify(
         if progress is not None:
             progress(total, total)
         run.end(recording.end)
-        report.damage = list(recording.damage)
         report.finished = recording.finished
-        report.problems += [Problem(run.last_step, "unreadable", "file", line) for line in recording.damage]
+        report.damage = list(recording.damage)
+        for line in recording.damage:
+            run.found(Problem(run.last_step, "unreadable", "file", line))
+        for line in recording.changed_spans():
+            run.found(Problem(run.last_step, "changed", "file", line))
     report.wall_s = round(time.perf_counter() - began, 3)
     report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
     return report
@@ -173,7 +176,7 @@ class _Run:
         elif problem is None and self._now_ns is not None and row.now_ns < self._now_ns:
             problem = RowProblem(row.step, "now_ns", "session time goes back")
         if problem is not None:
-            self._problem(Problem(expected, "changed", problem.field, problem.text, problem.entry))
+            self.found(Problem(expected, "changed", problem.field, problem.text, problem.entry))
         # A changed chain value is known from the one before it; after any other change the stored one is right.
         is_chain = problem is not None and problem.field == "chain" and self._chain is not None
         self._chain = chain_of(self._chain, row) if is_chain and self._chain is not None else row.chain
@@ -189,15 +192,15 @@ class _Run:
             self._gap(self.last_step + 1, mark[0])
         elif self._chain is not None and mark != (self.last_step, self._chain):
             text = f"the end mark names step {mark[0]}, the journal ends at step {self.last_step} or with another chain"
-            self._problem(Problem(self.last_step, "changed", "end", text))
+            self.found(Problem(self.last_step, "changed", "end", text))
 
     def _gap(self, first: int, last: int) -> None:
         if last < first:  # the same or an earlier step again: not a gap, but never what was written
-            self._problem(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
+            self.found(Problem(last + 1, "changed", "step", f"step {last + 1} comes after step {first - 1}"))
         else:
             self.report.gaps.append((first, last))
             text = f"{last - first + 1} rows are missing, steps {first} to {last}"
-            self._problem(Problem(first, "missing", "step", text))
+            self.found(Problem(first, "missing", "step", text))
         self.simulating = False
         self._chain = None
         self._meet_keyframe(last)
@@ -222,7 +225,7 @@ class _Run:
             self._diverged("digest", "the simulation gives another result than the recording")
 
     def _diverged(self, field: str, text: str) -> None:
-        self._problem(Problem(self.last_step, "divergence", field, text))
+        self.found(Problem(self.last_step, "divergence", field, text))
         self.simulating = False
 
     def _meet_keyframe(self, step: int) -> None:
@@ -234,13 +237,13 @@ class _Run:
             self._next_keyframe = next(self._keyframes, None)
             if changed:
                 text = f"keyframe: {changed} was changed"
-                self._problem(Problem(step, "changed", changed, text))
+                self.found(Problem(step, "changed", changed, text))
             elif keyframe.step == step:
                 self._use_keyframe(keyframe)
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         if self._chain is not None and keyframe.chain != self._chain:
-            self._problem(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
+            self.found(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
             return
         self._chain = keyframe.chain
         if self._core is None:
@@ -253,11 +256,12 @@ class _Run:
             other = [name for name in SNAPSHOTS if getattr(mine, name) != getattr(keyframe, name)]
             if other:
                 text = f"keyframe: {', '.join(other)} is not what the simulation gives"
-                self._problem(Problem(keyframe.step, "divergence", other[0], text))
+                self.found(Problem(keyframe.step, "divergence", other[0], text))
                 return
         self.report.keyframes += 1
 
-    def _problem(self, problem: Problem) -> None:
+    def found(self, problem: Problem) -> None:
+        """Adds to the report."""
         if len(self.report.problems) < MAX_PROBLEMS:
             self.report.problems.append(problem)
         else:

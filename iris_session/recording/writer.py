@@ -49,6 +49,7 @@ class RrdWriter:
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
         self._last_poses: NDArray[np.float64] | None = None
+        self._marked = 0  # bytes of the file that marks cover
         self._newest_row = (-1, b"")
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._people: dict[str, tuple[int, int, int]] = {}
@@ -102,16 +103,29 @@ class RrdWriter:
             self._metrics(batch.metrics)
             self._raw_samples(samples)
             self._rec.flush(timeout_sec=timeout_s)
+            if batch.keyframes:
+                self._mark()
         except (RuntimeError, ValueError, OSError) as error:
             raise WriteError(f"{self.path} cannot be written: {' '.join(str(error).split())}") from error
 
     def close(self) -> None:
         """Writes the rest and the end mark, and closes the file."""
         self.flush()
+        self._mark()
         step, chain = self._newest_row
         self._static(paths.END, rr.AnyValues(end=pa.array([_encode((step, chain))], pa.binary())))
         self.flush()
         self._rec.disconnect()
+
+    def _mark(self) -> None:
+        """Notes the CRC of all bytes since the last mark, so that any later change of the file is found."""
+        with open(self.path, "rb") as file:
+            file.seek(self._marked)
+            data = file.read()
+        mark = (self._marked, self._marked + len(data), zlib.crc32(data))
+        self._marked = mark[1]
+        times = [sequence(paths.STEP, [self._newest_row[0]])]
+        self._send(paths.MARKS, times, [blobs("mark", [_encode(mark)])])
 
     def _static(self, entity: str, *values: Any) -> None:
         self._rec.log(entity, *values, static=True, strict=True)

@@ -19,6 +19,7 @@ from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded
 from iris_session.protocol.steps import Decision, PresenceItem
 from iris_session.recording import (
     CLOSED,
+    OPEN,
     Keyframe,
     RecorderFeed,
     RecorderProcess,
@@ -27,6 +28,9 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
+from iris_session.recording.journal import seal
+from iris_session.recording.messages import Batch
+from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000
 XML = """<mujoco><option timestep="0.002"/><worldbody><light pos="0 0 3"/>
@@ -178,3 +182,35 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < until, "the condition did not come true"
         time.sleep(0.01)
+
+
+def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50) -> tuple[SessionHeader, Batch]:
+    """Header, rows and keyframes of a session that was never written."""
+    core, header = SmallCore(), make_header(recording_class)
+    chain = header_root(header)
+    batch = Batch(keyframes=[seal(core.keyframe(-1), chain)])
+    for step in range(steps):
+        if recording_class == OPEN:
+            core.data.qvel[0] = np.sin(step)  # what only the user's loop knows
+        plant = core.state() if recording_class == OPEN else b""
+        now_ns, entries = (step + 1) * TICK_NS, make_entries(step)
+        digest = core.step(now_ns, entries, 1, plant)
+        batch.rows.append(make_row(chain, step, now_ns, 1, entries, digest, plant))
+        chain = batch.rows[-1].chain
+        if step % keyframe_steps == keyframe_steps - 1:
+            batch.keyframes.append(seal(core.keyframe(step), chain))
+    return header, batch
+
+
+def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
+    """A finished file with this content."""
+    writer = RrdWriter(path, "id")
+    writer.header(header)
+    for i in range(0, len(batch.rows), rows_per_chunk):
+        last = i + rows_per_chunk >= len(batch.rows)
+        keyframes = [k for k in batch.keyframes if k.step < i + rows_per_chunk or last]
+        batch.keyframes = [k for k in batch.keyframes if k not in keyframes]
+        writer.add(Batch(rows=batch.rows[i : i + rows_per_chunk], keyframes=keyframes))
+        writer.flush()
+    writer.close()
+    return path

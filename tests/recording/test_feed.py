@@ -1,0 +1,194 @@
+"""The feed against a recorder played by the test: order, repetition, spill, and what is lost when nothing helps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.server_messages import PresenceItem, Reply
+from iris_session.protocol.steps import Decision, Outgoing
+from iris_session.recording import Keyframe, RecorderFeed, make_row
+from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS
+from iris_session.recording.journal import check_keyframe
+from iris_session.recording.messages import (
+    BATCH,
+    FRAME,
+    HEADER,
+    Batch,
+    RecorderStatus,
+    decode_batch,
+    decode_header,
+    encode_status,
+)
+from tests.recording.support import make_header
+
+ROOT = b"r" * 16
+
+
+class PlayedRecorder:
+    """The other end of the socket: what it got, and statuses as the test likes."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.context = zmq.Context()
+        self.socket = self.context.socket(zmq.DEALER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.bind(endpoint)
+
+    def say(self, feed: RecorderFeed, instance: int, expecting: int, written: int) -> None:
+        self.socket.send(encode_status(RecorderStatus(instance, expecting, written)))
+        assert feed._socket.poll(5000), "the status does not arrive"
+        feed.flush()
+
+    def take(self, n: int) -> list[tuple[bytes, int, bytes]]:
+        """The next `n` messages as (kind, number, body)."""
+        out = []
+        for _ in range(n):
+            assert self.socket.poll(5000), f"only {len(out)} of {n} messages came"
+            head, body = self.socket.recv_multipart()
+            out.append((*FRAME.unpack(head), body))
+        return out
+
+    def is_quiet(self) -> bool:
+        return not self.socket.poll(50)
+
+
+@pytest.fixture
+def played(tmp_path: Path) -> Iterator[tuple[PlayedRecorder, str, Path]]:
+    endpoint = f"ipc://{tmp_path}/f"
+    recorder = PlayedRecorder(endpoint)
+    yield recorder, endpoint, tmp_path
+    recorder.context.destroy(linger=0)
+
+
+@pytest.fixture
+def feed(played: tuple[PlayedRecorder, str, Path]) -> Iterator[RecorderFeed]:
+    feed = RecorderFeed(played[1], played[2])
+    feed.header(make_header())
+    yield feed
+    feed.close(0.0)
+
+
+def steps(feed: RecorderFeed, first: int, n: int) -> None:
+    for step in range(first, first + n):
+        feed.row(make_row(ROOT, step, step * 2_000_000, 1, [], b"d" * 16))
+
+
+def numbers(batch: Batch) -> list[int]:
+    return [row.step for row in batch.rows]
+
+
+def test_nothing_is_sent_before_a_recorder_asks(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    steps(feed, 0, 30)
+    assert played[0].is_quiet()
+    played[0].say(feed, 1, -1, -1)
+    kinds = played[0].take(4)
+    assert [k for k, _, _ in kinds] == [HEADER, BATCH, BATCH, BATCH]
+    assert decode_header(kinds[0][2]) == make_header()
+    assert kinds[0][1] == kinds[1][1] == 0
+    assert [step for _, _, body in kinds[1:] for step in numbers(decode_batch(body))] == list(range(30))
+
+
+def test_rows_go_out_after_ten_or_twenty_milliseconds(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    played[0].take(1)
+    steps(feed, 0, BATCH_ROWS - 1)
+    assert played[0].is_quiet()
+    steps(feed, BATCH_ROWS - 1, 1)
+    assert len(numbers(decode_batch(played[0].take(1)[0][2]))) == BATCH_ROWS
+    feed.row(make_row(ROOT, 10, 100_000_000, 0, [], b"d" * 16))
+    feed.row(make_row(ROOT, 11, 120_000_000, 0, [], b"d" * 16))  # paused: 50 steps a second
+    assert numbers(decode_batch(played[0].take(1)[0][2])) == [10, 11]
+
+
+def test_what_is_written_is_forgotten_and_a_new_recorder_gets_the_rest(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    steps(feed, 0, 50)
+    played[0].take(6)
+    played[0].say(feed, 1, 5, 2)
+    assert feed.stats.window_bytes > 0
+    played[0].say(feed, 2, -1, -1)
+    again = played[0].take(3)
+    assert (again[0][0], again[0][1]) == (HEADER, 3)
+    assert [number for _, number, _ in again[1:]] == [3, 4]
+    assert numbers(decode_batch(again[1][2])) == list(range(30, 40))
+    played[0].say(feed, 2, 5, 4)
+    assert feed.stats.window_bytes == 0
+    assert feed.stats.recorders == 2
+    assert feed.close(0.0)
+
+
+def test_a_full_window_spills_and_comes_back_in_order(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
+    feed.header(make_header())
+    steps(feed, 0, 300)
+    assert feed.stats.spilled_batches > 10
+    assert feed.stats.dropped_rows == 0
+    recorder.say(feed, 1, -1, -1)
+    got: list[int] = []
+    written = -1
+    recorder.take(1)
+    while len(got) < 300:
+        for _, number, body in recorder.take(1):
+            got += numbers(decode_batch(body))
+            written = number
+        recorder.say(feed, 1, written + 1, written)
+    assert got == list(range(300))
+    assert feed.stats.waiting_in_spill == 0
+    assert list(folder.glob("*.spill")) == []
+    assert feed.close(0.0)
+
+
+def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, window_bytes=3000, spill_bytes=3000)
+    feed.header(make_header())
+    steps(feed, 0, 500)
+    lost = feed.stats.dropped_rows
+    assert 0 < lost < 500
+    assert "limit" in feed.stats.spill_fault
+    assert feed.take_gap() == lost
+    assert feed.take_gap() == 0
+    assert not feed.wants_keyframe, "a snapshot costs time and there is no room for it"
+    recorder.say(feed, 1, -1, -1)
+    recorder.take(1)
+    while feed.stats.window_bytes:
+        _, number, _ = recorder.take(1)[0]
+        recorder.say(feed, 1, number + 1, number)
+    assert feed.wants_keyframe
+    feed.keyframe(Keyframe(499, b"", b"", b""), ROOT)
+    assert not feed.wants_keyframe
+    batch = decode_batch(recorder.take(1)[0][2])
+    assert batch.dropped_rows == lost
+    assert batch.keyframes[0].step == 499
+    assert not feed.close(0.0)
+
+
+def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    played[0].take(1)
+    head = PresenceItem("p1", "head", Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)), 5)
+    denial = Denial("held", "left is held", "ask", "left", "p2", "Ada")
+    replies = (Outgoing(4, Reply(1, False, denial)), Outgoing(5, Reply(2, True)))
+    feed.decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
+    feed.state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
+    feed.metric("late_ms", 2.5)
+    feed.keyframe(Keyframe(2, b"p", b"a", b"c"), ROOT)
+    batch = decode_batch(played[0].take(1)[0][2])
+    assert [(d.connection, d.denial) for d in batch.denials] == [(4, denial)]
+    assert batch.states[0].presence == (head,)
+    assert np.frombuffer(batch.states[0].poses).tolist() == list(range(21))
+    assert batch.metrics[0].value == 2.5
+    assert check_keyframe(batch.keyframes[0]) == ""
+    assert batch.keyframes[0].chain == ROOT
+
+
+def test_lists_are_bounded_when_no_step_is_taken(feed: RecorderFeed) -> None:
+    for i in range(BATCH_ITEMS + 10):
+        feed.metric("m", i)
+    assert feed.stats.dropped_items == 10

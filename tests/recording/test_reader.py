@@ -1,0 +1,116 @@
+"""Reading what was damaged: as far as it is good, and saying what is not."""
+
+from __future__ import annotations
+
+import os
+import random
+from pathlib import Path
+
+import pytest
+
+from iris_session.recording import NotARecordingError, Recording, rrd_file, verify
+from iris_session.recording.paths import part_path
+from tests.recording.support import SmallCore, journal, write
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write(tmp_path / "session.rrd", *journal(200))
+
+
+def test_scan_finds_every_message_of_a_whole_file(path: Path) -> None:
+    found = rrd_file.scan(path)
+    assert found.good_bytes == found.size == os.path.getsize(path)
+    assert found.messages[-1].kind == rrd_file.KIND_END
+
+
+@pytest.mark.parametrize(("lost_messages", "least"), [(1, 200), (4, 180), (14, 80)])
+def test_a_file_that_was_cut_reads_up_to_the_cut(path: Path, lost_messages: int, least: int) -> None:
+    """As after a kill in the middle of a write: no footer, and half of a message at the end."""
+    cut = rrd_file.scan(path).messages[-lost_messages]
+    path.write_bytes(path.read_bytes()[: cut.offset + 16 + cut.length // 2])
+    with Recording.open(path) as recording:
+        steps = [row.step for row in recording.rows()]
+        assert steps == list(range(len(steps)))
+        assert least <= len(steps) <= 200
+        assert recording.finished == (lost_messages == 1)
+        assert f"cut or changed at byte {cut.offset}" in recording.damage[0]
+    report = verify(path, SmallCore)
+    assert not report.ok
+    assert (report.steps, report.unverified_steps) == (len(steps), 0)
+
+
+def test_any_flipped_bit_in_the_file_is_survived_and_found(path: Path) -> None:
+    """Whole-file property: wherever the bit is, nothing but the room's own error is raised and nothing is called ok."""
+    data = path.read_bytes()
+    rng = random.Random(4)
+    for _ in range(8):
+        at, bit = rng.randrange(len(data)), rng.randrange(8)
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << bit
+        path.write_bytes(damaged)
+        try:  # the header itself may be gone
+            report = verify(path, SmallCore)
+        except NotARecordingError:
+            continue
+        assert not report.ok, f"bit {bit} of byte {at}"
+
+
+def test_a_damaged_message_is_left_out_and_the_rest_is_read(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    messages = [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW]
+    victim = messages[-8]
+    for i in range(victim.offset + 60, victim.offset + victim.length, 7):
+        data[i] ^= 0xFF
+    path.write_bytes(data)
+    with Recording.open(path) as recording:
+        steps = [row.step for row in recording.rows()]
+        assert steps[0] == 0
+        assert steps[-1] == 199
+        assert len(recording.damage) == 1
+        assert f"byte {victim.offset}" in recording.damage[0]
+    report = verify(path, SmallCore)
+    assert not report.ok
+    assert any(p.kind == "unreadable" for p in report.problems)
+
+
+def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) -> None:
+    header, batch = journal(200)
+    first = tmp_path / "session.rrd"
+    rows, keyframes = batch.rows, batch.keyframes
+    batch.rows, batch.keyframes = rows[:110], keyframes[:3]
+    write(first, header, batch)
+    batch.rows, batch.keyframes = rows[95:], keyframes[2:]
+    write(Path(part_path(str(first), 2)), header, batch)
+    report = verify(first, SmallCore)
+    assert report.ok, report.line()
+    assert (report.parts, report.steps) == (2, 200)
+
+
+def test_an_empty_part_is_said_and_skipped(tmp_path: Path, path: Path) -> None:
+    Path(part_path(str(path), 2)).write_bytes(b"")
+    with Recording.open(path) as recording:
+        assert len(list(recording.rows())) == 200
+        assert "part2" in recording.damage[0]
+
+
+@pytest.mark.parametrize(("data", "reason"), [(None, "no recording"), (b"", "not a Rerun"), (b"x" * 99, "not a Rerun")])
+def test_what_is_no_recording_is_one_line(tmp_path: Path, data: bytes | None, reason: str) -> None:
+    path = tmp_path / "x.rrd"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(NotARecordingError, match=reason):
+        Recording.open(path)
+
+
+def test_a_rerun_file_of_something_else_is_no_recording(tmp_path: Path) -> None:
+    import rerun as rr
+
+    path = tmp_path / "x.rrd"
+    stream = rr.RecordingStream("other")
+    stream.set_sinks(rr.FileSink(path))
+    stream.log("points", rr.Points3D([[0, 0, 0]]))
+    stream.flush()
+    stream.disconnect()
+    with pytest.raises(NotARecordingError, match="no session header"):
+        Recording.open(path)

@@ -1,0 +1,48 @@
+"""The spill file: order, bound, and a disk that refuses."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from iris_session.recording.spill import SpillFile
+
+
+def test_first_in_first_out_and_gone_when_empty(tmp_path: Path) -> None:
+    spill = SpillFile(tmp_path / "s", 1 << 20)
+    assert spill.pop() is None
+    for round_ in range(3):
+        for i in range(20):
+            assert spill.push(bytes([i]) * (i + 1), i)
+        assert len(spill) == 20
+        assert (tmp_path / "s").exists()
+        for i in range(20):
+            assert spill.pop() == (bytes([i]) * (i + 1), i), round_
+        assert not (tmp_path / "s").exists()
+
+
+def test_the_limit_refuses_and_says_so(tmp_path: Path) -> None:
+    spill = SpillFile(tmp_path / "s", 100)
+    assert spill.push(b"x" * 60, 10)
+    assert not spill.push(b"x" * 60, 10)
+    assert "limit" in spill.fault
+    assert spill.pop() == (b"x" * 60, 10)
+    assert spill.push(b"y" * 60, 10), "an emptied file begins anew"
+    spill.close()
+
+
+def test_a_folder_that_cannot_be_written_refuses(tmp_path: Path) -> None:
+    spill = SpillFile(tmp_path / "missing" / "s", 1 << 20)
+    assert not spill.push(b"x", 1)
+    assert "cannot be written" in spill.fault
+    assert len(spill) == 0
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs the device that is always full")
+def test_a_full_disk_refuses(tmp_path: Path) -> None:
+    (tmp_path / "s").symlink_to("/dev/full")
+    spill = SpillFile(tmp_path / "s", 1 << 20)
+    assert not spill.push(b"x", 1)
+    assert "No space left" in spill.fault

@@ -1,0 +1,176 @@
+"""Verification names the first thing that is wrong, and goes on behind it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from iris_session.protocol.client_messages import Marker
+from iris_session.protocol.entries import HOST, Entry
+from iris_session.recording import Recording, verify
+from iris_session.recording.journal import Keyframe, make_row, seal
+from tests.recording.support import TICK_NS, SmallCore, journal, write
+
+
+def edited(path: Path, at: int, **fields: Any) -> Path:
+    """A recording of 200 steps in which one row was changed."""
+    header, batch = journal(200)
+    batch.rows[at] = msgspec.structs.replace(batch.rows[at], **fields)
+    return write(path, header, batch)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "session.rrd"
+
+
+def test_a_true_recording_is_ok(path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    report = verify(write(path, *journal(200)), SmallCore, lambda done, total: seen.append((done, total)))
+    assert report.ok
+    assert (report.steps, report.keyframes, report.recording_class, report.finished) == (200, 5, "closed", True)
+    assert report.seconds == pytest.approx(199 * TICK_NS / 1e9)
+    assert seen[-1] == (200, 200)
+    assert report.line().startswith("ok: 200 steps")
+    assert json.loads(report.json())["ok"] is True
+
+
+@pytest.mark.parametrize("field", ["now_ns", "n_ticks", "digest", "chain"])
+def test_a_changed_field_is_named_with_its_step(path: Path, field: str) -> None:
+    value = {"now_ns": 121 * TICK_NS + 1, "n_ticks": 2, "digest": b"e" * 16, "chain": b"c" * 16}[field]
+    report = verify(edited(path, 120, **{field: value}), SmallCore)
+    assert not report.ok
+    first = report.problems[0]
+    assert (first.step, first.field, first.kind) == (120, field, "changed")
+    assert f"step 120, {field}" in report.line()
+
+
+def test_a_changed_step_number_is_no_gap(path: Path) -> None:
+    report = verify(edited(path, 120, step=7120), SmallCore)
+    assert [(p.step, p.field) for p in report.problems] == [(120, "step")]
+    assert report.gaps == []
+    assert report.steps == 200
+
+
+def test_a_flipped_byte_is_named_with_step_and_entry(path: Path) -> None:
+    _, batch = journal(200)
+    row = batch.rows[122]  # two entries
+    blob = bytearray(row.entries)
+    blob[len(blob) - row.entry_lengths[1] + 3] ^= 0x40
+    report = verify(edited(path, 122, entries=bytes(blob)), SmallCore)
+    first = report.problems[0]
+    assert (first.step, first.entry, first.kind) == (122, 1, "changed")
+    assert "step 122, entry 1" in report.line()
+
+
+def test_after_a_change_the_rest_is_verified_from_the_next_keyframe(path: Path) -> None:
+    report = verify(edited(path, 120, n_ticks=2), SmallCore)
+    assert [p.kind for p in report.problems] == ["changed", "divergence"]
+    assert report.unverified_steps == 29, "121 to 149"
+    assert report.steps == 171
+    assert report.keyframes == 5
+
+
+def test_missing_rows_are_a_gap_and_verification_restarts(path: Path) -> None:
+    header, batch = journal(200)
+    del batch.rows[60:70]
+    report = verify(write(path, header, batch), SmallCore)
+    assert report.gaps == [(60, 69)]
+    assert [(p.step, p.kind) for p in report.problems] == [(60, "missing")]
+    assert report.unverified_steps == 30, "70 to 99"
+    assert report.steps == 160
+
+
+def test_a_keyframe_at_the_end_of_a_gap_is_used(path: Path) -> None:
+    header, batch = journal(200)
+    del batch.rows[90:100]
+    report = verify(write(path, header, batch), SmallCore)
+    assert report.gaps == [(90, 99)]
+    assert report.unverified_steps == 0
+
+
+def test_missing_first_and_last_rows_are_found(path: Path) -> None:
+    header, batch = journal(200)
+    full = write(path, header, msgspec.structs.replace(batch, rows=list(batch.rows)))
+    del batch.rows[:10]
+    report = verify(write(path.with_name("head.rrd"), header, journal(200)[1]), SmallCore)
+    assert report.ok
+    report = verify(write(path.with_name("cut.rrd"), header, batch), SmallCore)
+    assert report.gaps == [(0, 9)]
+    with Recording.open(full) as recording:
+        assert recording.end is not None
+        assert recording.end[0] == 199
+
+
+def test_a_rewritten_journal_is_told_by_the_simulation(path: Path) -> None:
+    """Someone who computes every checksum anew still cannot change what happened."""
+    header, batch = journal(200)
+    chain = batch.rows[99].chain
+    for step in range(100, 200):
+        old = batch.rows[step]
+        entries = [Entry(HOST, HOST, old.now_ns, Marker(1, "invented"))]
+        batch.rows[step] = make_row(chain, step, old.now_ns, 1, entries, old.digest)
+        chain = batch.rows[step].chain
+    batch.keyframes = [k for k in batch.keyframes if k.step < 100]
+    report = verify(write(path, header, batch), SmallCore)
+    assert (report.problems[0].step, report.problems[0].kind) == (100, "divergence")
+    assert report.unverified_steps == 99
+
+
+def test_changed_keyframes_are_named(path: Path) -> None:
+    header, batch = journal(200)
+    batch.keyframes[2] = msgspec.structs.replace(batch.keyframes[2], plant=batch.keyframes[2].plant[:-1])
+    report = verify(write(path, header, batch), SmallCore)
+    assert [(p.step, p.field, p.kind) for p in report.problems] == [(49, "plant", "changed")]
+
+
+def test_a_sealed_keyframe_of_another_state_is_a_divergence(path: Path) -> None:
+    header, batch = journal(200)
+    true = batch.keyframes[2]
+    batch.keyframes[2] = seal(Keyframe(99, true.plant, b"other" * 4, true.controller, true.status), true.chain)
+    report = verify(write(path, header, batch), SmallCore)
+    assert [(p.step, p.field, p.kind) for p in report.problems] == [(99, "authority", "divergence")]
+
+
+def test_another_header_breaks_the_chain_of_the_first_row(path: Path) -> None:
+    header, batch = journal(50)
+    report = verify(write(path, msgspec.structs.replace(header, config=b"easier"), batch), SmallCore)
+    assert (report.problems[0].field, report.problems[0].kind) == ("chain", "changed")
+
+
+def test_an_open_session_takes_the_plant_from_its_rows(path: Path) -> None:
+    report = verify(write(path, *journal(120, "open")), SmallCore)
+    assert report.ok, report.line()
+    assert report.recording_class == "open"
+    header, batch = journal(120, "open")
+    plant = bytearray(batch.rows[70].plant)
+    plant[-3] ^= 1
+    batch.rows[70] = msgspec.structs.replace(batch.rows[70], plant=bytes(plant))
+    report = verify(write(path.with_name("b.rrd"), header, batch), SmallCore)
+    assert (report.problems[0].step, report.problems[0].field) == (70, "plant")
+
+
+def test_bytes_alone_can_be_checked_without_a_core(path: Path) -> None:
+    assert verify(write(path, *journal(50)), None).ok
+    report = verify(edited(path.with_name("b.rrd"), 120, digest=b"e" * 16), None)
+    assert (report.problems[0].step, report.problems[0].field) == (120, "digest")
+
+
+def test_other_library_versions_are_said(path: Path) -> None:
+    header, batch = journal(50)
+    header = msgspec.structs.replace(header, versions={"mujoco": "1.2.3"})
+    report = verify(write(path, header, batch), SmallCore)
+    assert report.version_differences[0].startswith("mujoco: recorded 1.2.3, here ")
+    assert "versions differ" in report.line()
+
+
+def test_many_problems_are_counted_not_kept(path: Path) -> None:
+    header, batch = journal(200)
+    batch.rows = batch.rows[::2]
+    report = verify(write(path, header, batch), SmallCore)
+    assert len(report.problems) == 20
+    assert report.more_problems == 79

@@ -1,0 +1,144 @@
+"""What the Rerun viewer will find: read back from a file with Rerun's own reader."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from anchors.pose import apply
+from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
+from iris_session.recording import SessionHeader, scene
+from iris_session.recording.messages import Batch, DenialRecord, StateFrame
+from iris_session.recording.writer import RrdWriter, _drawing
+from tests.recording.support import make_header
+
+IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
+
+
+def read(path: Path) -> dict[str, list[Any]]:
+    """Record batches by entity path."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[Any]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for chunk in RrdReader(str(path)).stream():
+            found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def column(batches: list[Any], name: str) -> list[Any]:
+    return [value for batch in batches for value in batch.column(name).to_pylist()]
+
+
+def frame(step: int, poses: np.ndarray, presence: tuple[PresenceItem, ...] = ()) -> StateFrame:
+    return StateFrame(step, step + 1, step * 0.002, step * 2_000_000 + 7, poses.tobytes(), presence)
+
+
+def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    bodies = (BodyInfo(1, "a/b c", True), BodyInfo(2, "fixed", False), BodyInfo(3, "d", True))
+    writer = RrdWriter(path, "id")
+    writer.header(SessionHeader("s", "n", "closed", 2_000_000, bodies=bodies))
+    poses = np.zeros((3, 7))
+    poses[:, 3] = 1.0
+    writer.add(Batch(states=[frame(0, poses)]))
+    writer.flush()
+    moved = poses.copy()
+    moved[0] = (1, 2, 3, 0.5, -0.5, 0.5, 0.5)
+    moved[1, 0] = 5.0
+    writer.add(Batch(states=[frame(8, poses), frame(16, moved)]))
+    writer.close()
+    found = read(path)
+    tf = found["/tf"]
+    assert column(tf, "Transform3D:child_frame") == [["a/b c"], ["d"], ["a/b c"]]
+    assert set(map(tuple, column(tf, "Transform3D:parent_frame"))) == {("world",)}
+    assert column(tf, "Transform3D:translation")[-1] == [[1.0, 2.0, 3.0]]
+    assert column(tf, "Transform3D:quaternion")[-1] == [[-0.5, 0.5, 0.5, 0.5]], "Rerun has x y z w"
+    assert column(tf, "step") == [0, 0, 16]
+    assert column(tf, "tick") == [1, 1, 17]
+    assert [v.value for v in tf[-1].column("session_time")] == [32_000_007]
+    assert column(found["/state"], "sim_time_s") == [[0.0], [0.016], [0.032]]
+    root = found["/tf_static"]
+    assert column(root, "Transform3D:parent_frame") == [["tf#/"]]
+    assert column(root, "Transform3D:child_frame") == [["world"]]
+
+
+def test_the_scene_is_static_in_the_frames_that_move(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(make_header())
+    writer.close()
+    found = read(path)
+    ball = found["/scene/ball/g\\/ball"][0]
+    assert column([ball], "CoordinateFrame:frame") == [["ball"]]
+    assert column([ball], "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
+    assert "step" not in ball.schema.names, "static"
+    assert found["/scene/arm\\/link\\ 1/geom2"][0].column("Capsules3D:lengths").to_pylist() == [[pytest.approx(0.4)]]
+    assert "small" in column(found["/session"], "TextDocument:text")[0][0]
+
+
+def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
+    q = (0.5, 0.5, -0.5, 0.5)
+    shape = scene.Shape("c", "b", "b", scene.CAPSULE, (1.0, 2.0, 3.0), q, (1, 2, 3, 4), (0.1, 0.25))
+    poses = _drawing(shape)[1]
+    start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
+    end = apply((start, q), (0.0, 0.0, 0.5))
+    assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
+
+
+def test_people_appear_once_and_move_with_their_captures(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    none = np.zeros((0, 7))
+
+    def person(x: float, capture_ns: int) -> tuple[PresenceItem, ...]:
+        return (PresenceItem("p 1", "head", Pose((x, 0.0, 1.6), IDENTITY_Q), capture_ns),)
+
+    states = [frame(0, none, person(0.1, 10)), frame(8, none, person(0.1, 10)), frame(16, none, person(0.3, 20))]
+    writer.add(Batch(states=states))
+    writer.close()
+    found = read(path)
+    assert column(found["/tf"], "Transform3D:child_frame") == [["presence/p 1/head"]] * 2
+    assert column(found["/tf"], "step") == [0, 16]
+    assert column(found["/presence/p\\ 1/head"], "CoordinateFrame:frame") == [["presence/p 1/head"]]
+    assert column(found["/presence/p\\ 1/head"], "Boxes3D:labels") == [["p 1"]]
+
+
+def test_events_and_denials_are_lines_to_read(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    stop = Event(4, 9, 77, EStopChanged(True, "p1", "smoke"))
+    denied = DenialRecord(9, 77, 3, Denial("held", "left is held", "ask for it", "left", "p2", "Ada"))
+    writer.add(Batch(events=[stop], denials=[denied]))
+    writer.close()
+    found = read(path)
+    assert column(found["/events"], "TextLog:text") == [["#4 estop_changed active=True participant=p1 reason=smoke"]]
+    assert column(found["/events"], "TextLog:level") == [["CRITICAL"]]
+    expected = "connection 3: held: left is held; held by Ada; ask for it"
+    assert column(found["/denials"], "TextLog:text") == [[expected]]
+
+
+def test_a_model_that_mujoco_refuses_does_not_stop_the_recording(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(msgspec.structs.replace(make_header(), model=b"no zlib"))
+    writer.close()
+    assert "the scene is not drawn" in column(read(path)["/events/recorder"], "TextLog:text")[0][0]
+
+
+def test_a_blueprint_is_in_the_file(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    path = tmp_path / "w.rrd"
+    RrdWriter(path, "id").close()
+    assert len(RrdReader(str(path)).blueprints()) == 1
+    assert RrdReader(str(path)).recordings()[0].recording_id == "id"
