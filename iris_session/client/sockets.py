@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 from dataclasses import dataclass
 from typing import Any, Final
 
 import zmq
+from zmq.auth import load_certificate
 
-from iris_session.client.errors import ClientError
+from iris_session.client.errors import ClientError, IdentityError
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 
 DEFAULT_CONTROL_PORT: Final = 7721
@@ -29,6 +31,18 @@ class CurveKeys:
     server_public: bytes
     public: bytes
     secret: bytes
+
+    @classmethod
+    def from_files(cls, server_file: str | os.PathLike[str], own_secret_file: str | os.PathLike[str]) -> CurveKeys:
+        """From ZeroMQ certificates: the server's `*.key`, and our own `*.key_secret`. Raises `IdentityError`."""
+        try:
+            server_public, _ = load_certificate(server_file)
+            public, secret = load_certificate(own_secret_file)
+        except (OSError, ValueError) as error:
+            raise IdentityError(f"key file cannot be used: {error}") from error
+        if secret is None:
+            raise IdentityError(f"{os.fspath(own_secret_file)} holds no secret key: give the *.key_secret file")
+        return cls(server_public, public, secret)
 
 
 def parse_address(address: str) -> tuple[str, int]:
