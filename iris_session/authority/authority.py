@@ -114,7 +114,10 @@ class Authority:
         return _encoder.encode(self._ctx.state)
 
     def restore(self, data: bytes) -> None:
-        """Continues from a snapshot of a session with the same robots and objects, else `ValueError`."""
+        """Continues from a snapshot of a session with the same robots and objects, else `ValueError`.
+
+        Raises `msgspec.DecodeError` for bytes that are no snapshot.
+        """
         state = _decoder.decode(data)
         if tuple(state.robots) != tuple(self._ctx.robots) or tuple(state.objects) != tuple(self._ctx.objects):
             raise ValueError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, Release, TrackingEpoch
 from iris_session.protocol.common import Pose
+from iris_session.protocol.server_messages import LeaseChanged
 
 from .table import Person, Table, robot
 
@@ -23,6 +24,7 @@ def test_join_order_gives_the_first_free_robot() -> None:
     assert (got(anna), got(bert)) == (["left"], ["right"])
     assert carl.denied(ANY) == "held"
     carl.does(Acquire(2, wait=True))
+    assert [e.lease.queue for e in t.since(LeaseChanged)] == [(carl.id,), (carl.id,)]
     bert.does(Release())
     assert carl.replies()[0].leases[0].target == "right"
 
