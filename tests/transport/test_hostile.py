@@ -159,6 +159,7 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     slow.linger = 0
     slow.rcvhwm = 1
     slow.setsockopt(zmq.RCVBUF, 4096)
+    disconnects = slow.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     slow.connect(f"tcp://127.0.0.1:{session.ports.control}")
     slow.send(encode_client(envelope(Hello("observer", "Slow", secret=b"s" * 16))))
     session.pump(lambda: slow.poll(0) != 0, "welcome of the slow client")
@@ -175,6 +176,12 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     honest.wait_for(Event, 10)
     seqs = [event.event_seq for event in honest.got(Event)]
     assert seqs == list(range(1, len(seqs) + 1))
+    # Its TCP connection is closed: what waits for it takes no memory any more.
+    while slow.poll(100):
+        slow.recv()
+    assert disconnects.poll(5000)
+    slow.disable_monitor()
+    disconnects.close(linger=0)
     slow.close()
 
 

@@ -156,3 +156,12 @@ def test_two_behind_one_gateway_with_one_secret_are_one_key_but_not_that_of_a_cl
         desk.take(Hello("operator", tab, secret=b"s" * 16), behalf=tab)
     first, second = (e.message.key_id for e in desk.entries() if isinstance(e.message, Join))
     assert first == second != desk.clients.by_number[1].key_id
+
+
+def test_nobody_speaks_for_a_gateway_of_another_tcp_connection(desk: Desk) -> None:
+    desk.join(role="gateway")
+    desk.take(Hello("operator", "Tab", secret=b"s" * 16), EVE, behalf="tab1")
+    refused = desk.last()
+    assert isinstance(refused, Refused)
+    assert refused.code == "gateway_only"
+    assert desk.entries() == []

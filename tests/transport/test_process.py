@@ -111,6 +111,10 @@ def test_clients_are_told_when_the_session_is_closed(session: FrontSession) -> N
     assert [f.code for f in client.got(ProtocolFault)] == ["session_ended"]
 
 
+def test_ctrl_c_in_the_terminal_reaches_only_the_parent(session: FrontSession) -> None:
+    assert os.getsid(session.process.pid) == session.process.pid != os.getsid(0)
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_cleanly(session: FrontSession, number: signal.Signals) -> None:
     client = session.client()
