@@ -15,9 +15,7 @@ import msgspec
 
 from anchors.pose import (
     PoseTuple,
-    Quat,
     Vec3,
-    compose,
     quat_conj,
     quat_from_rotvec,
     quat_mul,
@@ -89,8 +87,19 @@ def latch(command: Command, scale: float, T_world_target: PoseTuple, previous: L
     return Latch(command.kind, scale, T_world_target, T_world_target, sources)
 
 
+def continues(state: Latch, command: Command) -> bool:
+    """True when the command is of the latched kind and at least one latched engagement goes on in it."""
+    if state.kind != command.kind:
+        return False
+    for new in command.sources:
+        for old in state.sources:
+            if (old.engagement, old.participant, old.device) == (new.engagement, new.participant, new.device):
+                return True
+    return False
+
+
 def same_sources(state: Latch, command: Command, scale: float) -> bool:
-    """True when `command` continues the latched engagement: same sources, weights, scale."""
+    """True when nobody joined or left and no weight nor the scale has changed."""
     if state.scale != scale or len(state.sources) != len(command.sources):
         return False
     for old, new in zip(state.sources, command.sources, strict=True):
@@ -201,6 +210,3 @@ def _norm(v: Vec3) -> float:
 def _bounded(v: Vec3, limit: float) -> Vec3:
     n = _norm(v)
     return v if n <= limit else (v[0] * limit / n, v[1] * limit / n, v[2] * limit / n)
-
-
-__all__ = ["Latch", "Quat", "SourceLatch", "clip_scale", "compose", "follow", "integrate", "latch", "same_sources"]

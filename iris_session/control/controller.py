@@ -195,7 +195,8 @@ class Controller:
         r = self._states[i]
         scale = clutch.clip_scale(command.scale, self._config.min_scale, self._config.max_scale)
         new = any(source.new for source in command.sources)
-        if r.latch is None or r.latch.kind != command.kind:
+        if r.latch is None or not clutch.continues(r.latch, command):
+            self._hold(i)  # whoever takes over does not inherit the motion of the one before
             self._engage(i, command, scale)
             return
         if not clutch.same_sources(r.latch, command, scale):

@@ -224,6 +224,19 @@ def test_changing_the_scale_while_engaged_does_not_jump() -> None:
     assert np.subtract(rig.target()[0], start[0]) == pytest.approx((0.11, 0.0, 0.0), abs=1e-9)
 
 
+@pytest.mark.parametrize("successor", [{"participant": "b"}, {"engagement": 2}, {"device": "hand/left"}])
+def test_a_successor_without_a_hold_between_does_not_inherit_the_motion(successor: dict[str, object]) -> None:
+    rig = iiwa()
+    drive(rig, rig.source((0.0, 0.0, 0.0)))
+    drive(rig, rig.source((0.0, 0.5, 0.0)), steps=30)  # still far from there, and moving fast
+    assert np.abs(rig.controller._joints.v).max() > 0.5
+    goal = rig.controller._joints.q + rig.controller._joints.v**2 / 80 * np.sign(rig.controller._joints.v)
+    for _ in range(40):
+        drive(rig, rig.source((3.0, 3.0, 3.0), **successor), steps=7)
+    assert rig.data.ctrl == pytest.approx(goal, abs=0.01)
+    assert np.abs(rig.controller._joints.v).max() < 0.02  # no more than the elbow on its way to the rest posture
+
+
 def test_changing_the_kind_while_engaged_does_not_jump() -> None:
     rig = iiwa()
     for _ in range(60):
