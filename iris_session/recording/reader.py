@@ -63,8 +63,9 @@ class State(NamedTuple):
 class Recording:
     """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
 
-    `damage`: one line per thing that could not be read. `end`: last step and its chain value
-    as the recorder noted when it closed the last part, None when it was killed.
+    `damage`: one line per thing that could not be read. `cuts`: parts that end in the middle of a write, as a kill
+    leaves them. `end`: last step and its chain value as noted when the last part was closed, None when its recorder
+    was killed.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -72,6 +73,7 @@ class Recording:
         self.files: list[str] = []
         self._readable: list[str] = []
         self.damage: list[str] = []
+        self.cuts: list[str] = []
         with Prober() as prober:
             for path in files:
                 self._add_part(path, prober)
@@ -197,7 +199,9 @@ class Recording:
         """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
         try:
             found = rrd_file.scan(path)
-            whole = found.good_bytes == found.size and prober.readable(path)
+            if found.cut:
+                self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
+            whole = found.good_bytes == found.size and not found.holes and prober.readable(path)
             self._readable.append(path if whole else self._salvaged(path, prober))
             self.files.append(path)
         except NotARecordingError as error:

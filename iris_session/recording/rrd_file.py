@@ -21,10 +21,13 @@ from iris_session.recording.probe import Prober
 MAGIC: Final = b"RRF2"
 FILE_HEAD: Final = 12
 FILE_TAIL: Final = 32  # after the end message of a file with a footer
+FOOT: Final = b"FOOT"
 _HEAD: Final = struct.Struct("<QQ")
 KIND_END: Final = 0
 KIND_STORE_INFO: Final = 1
 KIND_ARROW: Final = 2
+KIND_LAST: Final = 3
+_ARROW_HEAD: Final = struct.pack("<Q", KIND_ARROW)
 #: Messages that are tried together; a group that fails is halved until the bad ones are alone.
 GROUP: Final = 256
 
@@ -38,11 +41,16 @@ class Message(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """`good_bytes`: the file is whole up to here."""
+    """`holes`: spans between readable messages that are none. `good_bytes`: after the last readable message.
+
+    `cut`: the file ends in the middle of a message, as after a kill or a full disk (and has no footer).
+    """
 
     messages: list[Message]
+    holes: list[tuple[int, int]]
     good_bytes: int
     size: int
+    cut: bool
 
 
 class Mark(NamedTuple):
@@ -57,21 +65,53 @@ def scan(path: str | Path) -> Scan:
     """Walks over the messages of a file without decoding them. Raises `NotARecordingError`."""
     size = os.path.getsize(path)
     found: list[Message] = []
+    holes: list[tuple[int, int]] = []
     with open(path, "rb") as file:
         if file.read(FILE_HEAD)[: len(MAGIC)] != MAGIC:
             raise NotARecordingError(f"{path} is not a Rerun file (it does not begin with {MAGIC.decode()})")
         at = FILE_HEAD
-        while at + _HEAD.size <= size:
-            file.seek(at)
-            kind, length = _HEAD.unpack(file.read(_HEAD.size))
-            if kind > KIND_ARROW + 1 or at + _HEAD.size + length > size:
+        while at < size:
+            message = _message_at(file, at, size)
+            if message is None:
+                after = _next_message(file, at + 1, size)
+                if after is None:
+                    break
+                holes.append((at, after))
+                at = after
+                continue
+            found.append(message)
+            at += _HEAD.size + message.length
+            if message.kind == KIND_END:
                 break
-            found.append(Message(at, kind, length))
-            at += _HEAD.size + length
-            if kind == KIND_END:
-                break
-    has_footer = bool(found) and found[-1].kind == KIND_END and size - at == FILE_TAIL
-    return Scan(found, size if has_footer else at, size)
+        file.seek(max(0, size - FILE_TAIL))
+        has_footer = FOOT in file.read()
+    if has_footer and size - at == FILE_TAIL:
+        return Scan(found, holes, size, size, False)
+    return Scan(found, holes, at, size, at < size and not has_footer)
+
+
+def _message_at(file: BinaryIO, at: int, size: int) -> Message | None:
+    file.seek(at)
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return None
+    kind, length = _HEAD.unpack(head)
+    return Message(at, kind, length) if kind <= KIND_LAST and at + _HEAD.size + length <= size else None
+
+
+def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
+    """Where messages go on behind a damaged head: an Arrow message that is followed by another one or by the end."""
+    file.seek(begin)
+    rest = file.read()
+    at = rest.find(_ARROW_HEAD)
+    while at >= 0:
+        message = _message_at(file, begin + at, size)
+        if message is not None:
+            end = message.offset + _HEAD.size + message.length
+            if end == size or _message_at(file, end, size) is not None:
+                return message.offset
+        at = rest.find(_ARROW_HEAD, at + 1)
+    return None
 
 
 def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
@@ -108,9 +148,9 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
     Raises `NotARecordingError` when nothing is readable.
     """
     found = scan(path)
-    damage = []
-    if found.good_bytes < found.size:
-        damage.append(f"cut or changed at byte {found.good_bytes} of {found.size}: nothing after it is readable")
+    damage = [f"bytes {begin} to {end} hold no message and are left out" for begin, end in found.holes]
+    if found.good_bytes < found.size and not found.cut:
+        damage.append(f"nothing after byte {found.good_bytes} of {found.size} is readable")
     messages = [m for m in found.messages if m.kind != KIND_END]
     infos = [m for m in messages if m.kind == KIND_STORE_INFO]
     with open(path, "rb") as file, tempfile.TemporaryDirectory() as folder:
@@ -124,7 +164,7 @@ def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:
         damage += [f"message of {m.length} bytes at byte {m.offset} is damaged and left out" for m in bad]
         refused = {m.offset for m in bad}
         _write(file, [m for m in messages if m.offset not in refused], Path(copy))
-    return damage or ["the footer is damaged: read without it"]
+    return damage if damage or found.cut else ["the footer is damaged: read without it"]
 
 
 class _Trial:

@@ -67,6 +67,7 @@ class VerifyReport(msgspec.Struct):
     """`ok`: every step was checked and simulated again with the same result.
 
     `gaps`: `(first, last)` missing steps. `unverified_steps`: rows between a gap or divergence and the next keyframe.
+    `finished`: the recorder closed the file, so nothing can be missing at its end. `cuts`: see `Recording`.
     `keyframes`: how many were met and equal. `seconds`: session time simulated. `problems`: the first ones, in order.
     """
 
@@ -83,7 +84,9 @@ class VerifyReport(msgspec.Struct):
     problems: list[Problem] = []
     more_problems: int = 0
     gaps: list[tuple[int, int]] = []
+    last_step: int = -1
     damage: list[str] = []
+    cuts: list[str] = []
     version_differences: list[str] = []
 
     def line(self) -> str:
@@ -94,7 +97,7 @@ class VerifyReport(msgspec.Struct):
         if self.unverified_steps:
             parts.append(f"{self.unverified_steps} steps could not be verified")
         if not self.finished:
-            parts.append("the file was not finished (the recorder was killed)")
+            parts.append(f"good up to step {self.last_step}, then the recorder was killed")
         if self.ok:
             return "ok: " + "; ".join(parts)
         if self.version_differences:
@@ -142,7 +145,9 @@ def verify(
             progress(total, total)
         run.end(recording.end)
         report.finished = recording.finished
+        report.last_step = run.last_step
         report.damage = list(recording.damage)
+        report.cuts = list(recording.cuts)
         for line in recording.damage:
             run.found(Problem(run.last_step, "unreadable", "file", line))
         for line in recording.changed_spans():

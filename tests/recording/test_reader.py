@@ -34,10 +34,26 @@ def test_a_file_that_was_cut_reads_up_to_the_cut(path: Path, lost_messages: int,
         assert steps == list(range(len(steps)))
         assert least <= len(steps) <= 200
         assert recording.finished == (lost_messages == 1)
-        assert f"cut or changed at byte {cut.offset}" in recording.damage[0]
+        assert recording.damage == []
+        assert f"at byte {cut.offset}" in recording.cuts[0]
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.last_step, report.finished) == (len(steps), len(steps) - 1, lost_messages == 1)
+
+
+def test_a_damaged_length_hides_one_message_and_not_the_rest(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    messages = [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW]
+    victim = messages[-6]
+    data[victim.offset + 12] ^= 0x40
+    path.write_bytes(data)
+    found = rrd_file.scan(path)
+    assert found.holes == [(victim.offset, messages[-5].offset)]
+    assert not found.cut
     report = verify(path, SmallCore)
     assert not report.ok
-    assert (report.steps, report.unverified_steps) == (len(steps), 0)
+    assert f"bytes {victim.offset} to" in report.damage[0]
+    assert report.last_step == 199
 
 
 def test_any_flipped_bit_in_the_file_is_survived_and_found(path: Path) -> None:
