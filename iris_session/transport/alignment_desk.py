@@ -10,6 +10,9 @@ from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import AlignmentProposal
 
+#: What numbers of a stranger can make of linear algebra.
+_UNSOLVABLE = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+
 
 class AlignmentDesk:
     """Observations in, proposals out: when something new was observed, and at most one per `period_ns`."""
@@ -31,16 +34,19 @@ class AlignmentDesk:
             return False
         pose = observation.T_tracking_anchor
         self._unknown = None
-        used = self._estimator.add(
-            observation.anchor_id,
-            (pose.p, pose.q),
-            observation.capture_ns,
-            observation.tracking_epoch,
-            viewpoint_id=observation.viewpoint_id,
-            quality=observation.quality,
-            size_m=observation.size_m,
-            covariance=observation.covariance,
-        )
+        try:
+            used = self._estimator.add(
+                observation.anchor_id,
+                (pose.p, pose.q),
+                observation.capture_ns,
+                observation.tracking_epoch,
+                viewpoint_id=observation.viewpoint_id,
+                quality=observation.quality,
+                size_m=observation.size_m,
+                covariance=observation.covariance,
+            )
+        except _UNSOLVABLE:
+            return False
         self._pending = self._pending or used
         return used
 
@@ -56,7 +62,7 @@ class AlignmentDesk:
         else:
             try:
                 proposal = _proposal(self._estimator.estimate())
-            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+            except _UNSOLVABLE:
                 proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
         refused = (proposal.tracking_epoch, proposal.advice) if proposal.refused else None
         if refused is not None and refused == self._refused:

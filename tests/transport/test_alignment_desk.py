@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from anchors.pose import IDENTITY_POSE, PoseTuple
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import Entry, decode_entry, encode_entry
 from iris_session.transport.alignment_desk import AlignmentDesk
 
 PERIOD = 200_000_000
@@ -62,3 +67,40 @@ def test_hostile_numbers_are_of_no_use_and_harm_nothing() -> None:
             assert not desk.observe(seen(pose=pose))
     assert not desk.observe(seen(pose=Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))))
     assert not desk.due(0)
+
+
+FLOAT = st.floats() | st.sampled_from([1e308, -1e308, 1e-308, 0.0, 1.0])
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.tuples(FLOAT, FLOAT, FLOAT),
+            st.tuples(FLOAT, FLOAT, FLOAT, FLOAT) | st.just(IDENTITY.q),
+            st.integers(0, 2**63 - 1),
+            FLOAT,
+            st.just(()) | st.lists(FLOAT, min_size=36, max_size=36).map(tuple),
+            st.integers(0, 3),
+        ),
+        max_size=12,
+    )
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's word on overflow; the authority judges the result
+def test_no_observation_raises(rows: list[tuple[object, ...]]) -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    for i, (p, q, epoch, quality, covariance, viewpoint) in enumerate(rows):
+        message = Observation(
+            "table",
+            "qr",
+            Pose(p, q),  # type: ignore[arg-type]
+            epoch,  # type: ignore[arg-type]
+            epoch,  # type: ignore[arg-type]
+            viewpoint_id=viewpoint,  # type: ignore[arg-type]
+            quality=quality,  # type: ignore[arg-type]
+            covariance=covariance,  # type: ignore[arg-type]
+        )
+        desk.observe(message)
+        proposal = desk.propose(i * PERIOD)
+        if proposal is not None:
+            decode_entry(encode_entry(Entry(1, 1, 0, proposal)))
