@@ -20,6 +20,8 @@ from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
+#: Length of a `Text` on the wire.
+MAX_TEXT: Final = 512
 #: 95 % quantile of the standard normal distribution.
 Z95: Final = 1.6448536269514722
 
@@ -127,10 +129,17 @@ def refuse_at_robot(ctx: Context, p: Participant, robot: str, error: float, advi
 
 
 def _refuse(ctx: Context, p: Participant, text: str, advice: str) -> None:
-    """Tells the wearer why, at most once per report period. The alignment in force stays."""
-    if p.refused_ns is None or ctx.now_ns - p.refused_ns >= ctx.config.report_ns:
-        p.refused_ns = ctx.now_ns
-        ctx.deny(p, 0, Denial(DenialReason.ALIGNMENT_REFUSED, text, advice))
+    """Tells the wearer why, at most once per report period, and everyone when it is news.
+
+    The alignment in force stays.
+    """
+    if p.refused_ns is not None and ctx.now_ns - p.refused_ns < ctx.config.report_ns:
+        return
+    p.refused_ns = ctx.now_ns
+    ctx.deny(p, 0, Denial(DenialReason.ALIGNMENT_REFUSED, text, advice))
+    if p.refused_text != text:
+        p.refused_text = text
+        ctx.emit(Notice("warning", f"alignment of {p.name} refused: {text}; {advice}"[:MAX_TEXT]))
 
 
 def _accept(
@@ -144,7 +153,7 @@ def _accept(
     offset: bool = False,
 ) -> None:
     p.alignment_version += 1
-    p.refused_ns = None
+    p.refused_ns, p.refused_text = None, ""
     p.alignment = Alignment(
         p.alignment_version,
         kind,

@@ -6,7 +6,7 @@ except caches that are derived from `State` and rebuilt by `adopt`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from iris_session.authority.config import AuthorityConfig
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Grant, LeaseState, Participant, State
@@ -153,6 +153,13 @@ class Context:
         """Every target that `p` holds, robots first, in the order of the specification."""
         held = [*self.state.robots.values(), *self.held_objects]
         return [lease for lease in held if any(g.participant == p.id for g in lease.grants)]
+
+
+def some(names: Iterable[str], most: int = 6) -> str:
+    """Names for an error text, which must stay within the length of a `Text` on the wire."""
+    listed = list(names)
+    rest = f" and {len(listed) - most} more" if len(listed) > most else ""
+    return ", ".join(listed[:most]) + rest
 
 
 def find_grant(lease: LeaseState, participant: str, device: str = "") -> Grant | None:

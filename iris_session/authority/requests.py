@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.authority import assignment, engagement, leases
-from iris_session.authority.context import HUMAN, Context, find_grant
+from iris_session.authority.context import HUMAN, Context, find_grant, some
 from iris_session.authority.leases import held_by_other
 from iris_session.authority.state import LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode
@@ -51,10 +51,10 @@ def _acquire_denial(
         return denial
     for name in robots:
         if name not in ctx.robots:
-            return Denial(DenialReason.UNKNOWN_TARGET, f"no robot {name}", f"robots: {', '.join(ctx.robots)}", name)
+            return Denial(DenialReason.UNKNOWN_TARGET, f"no robot {name}", f"robots: {some(ctx.robots)}", name)
     for name in objects:
         if name not in ctx.objects:
-            return Denial(DenialReason.UNKNOWN_TARGET, f"no object {name}", f"objects: {', '.join(ctx.objects)}", name)
+            return Denial(DenialReason.UNKNOWN_TARGET, f"no object {name}", f"objects: {some(ctx.objects)}", name)
     if not MIN_WEIGHT <= m.weight <= 1.0 / MIN_WEIGHT:
         text = f"weight {m.weight} is not between {MIN_WEIGHT} and {1.0 / MIN_WEIGHT:g}"
         return Denial(DenialReason.INVALID, text, "use 1.0")
@@ -134,7 +134,7 @@ def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None
     state = ctx.state
     held = [lease.target for lease in state.robots.values() if any(g.participant == p.id for g in lease.grants)]
     if held:
-        text = f"who holds a robot cannot wait for another: you hold {', '.join(held)}"
+        text = f"who holds a robot cannot wait for another: you hold {some(held)}"
         denial = Denial(
             DenialReason.HELD, text, "release it and acquire all robots in one request", held[0], p.id, p.name
         )
@@ -242,7 +242,7 @@ def grasp(ctx: Context, p: Participant, m: Grasp) -> None:
     denial = _role_denial(p)
     lease = ctx.state.objects.get(m.object)
     if denial is None and lease is None:
-        text, known = f"no object {m.object}", f"objects: {', '.join(ctx.objects)}"
+        text, known = f"no object {m.object}", f"objects: {some(ctx.objects)}"
         denial = Denial(DenialReason.UNKNOWN_TARGET, text, known, m.object)
     if denial is None and m.device not in Device.ALL:
         known = f"devices: {', '.join(sorted(Device.ALL))}"
@@ -267,7 +267,7 @@ def assign(ctx: Context, p: Participant, m: Assign) -> None:
     denial = _role_denial(person) if person is not None else None
     unknown = next((name for name in m.robots if name not in ctx.robots), None)
     if unknown is not None:
-        known = f"robots: {', '.join(ctx.robots)}"
+        known = f"robots: {some(ctx.robots)}"
         denial = Denial(DenialReason.UNKNOWN_TARGET, f"no robot {unknown}", known, unknown)
     if denial is not None:
         return ctx.deny(p, m.request_id, denial)
@@ -288,7 +288,7 @@ def set_mode(ctx: Context, p: Participant, m: SetMode) -> None:
     """A director changes the mode of a robot. Of several holders only the one in charge stays, unless it is shared."""
     lease = ctx.state.robots.get(m.robot)
     if lease is None:
-        known = f"robots: {', '.join(ctx.robots)}"
+        known = f"robots: {some(ctx.robots)}"
         denial = Denial(DenialReason.UNKNOWN_TARGET, f"no robot {m.robot}", known, m.robot)
         return ctx.deny(p, m.request_id, denial)
     if m.mode not in LeaseMode.ALL:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from iris_session.authority import engagement, leases
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
@@ -11,10 +13,13 @@ from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason,
 from iris_session.protocol.server_messages import ParticipantJoined, ParticipantLeft
 from iris_session.protocol.steps import Admitted, Dropped
 
-NOT_NEEDED = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
+NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
 #: A client sends the capability `run:<random>`, made anew at every start of its tracking, to keep its alignment when
 #: only the connection broke. A client that does not must be aligned again after a resume.
-RUN_PREFIX = "run:"
+RUN_PREFIX: Final = "run:"
+
+#: A goodbye is free text, the reason of `participant_left` is as short as a name on the wire.
+MAX_REASON: Final = 64
 
 
 def host() -> Participant:
@@ -124,7 +129,7 @@ def leave(ctx: Context, p: Participant, reason: str) -> None:
     ctx.dropped.append(Dropped(connection, "bye"))
     del ctx.by_connection[connection]
     p.connection = NO_CONNECTION
-    remove(ctx, p, "left", reason or "bye")
+    remove(ctx, p, "left", reason[:MAX_REASON] or "bye")
     _lose_clients(ctx, connection, "gateway")
 
 

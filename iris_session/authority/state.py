@@ -63,6 +63,7 @@ class Participant(msgspec.Struct):
     offset: Pose | None = None
     pivot_world: Vec3 = (0.0, 0.0, 0.0)
     refused_ns: int | None = None
+    refused_text: str = ""
     tilt_warned: bool = False
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}

@@ -45,6 +45,7 @@ REARMED: Final = (
     "untracked",
 )
 _encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(Decision).decode
 
 
 class Client:
@@ -112,6 +113,7 @@ class Play:
         self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view)
         self.journal.append((self.now_ns, blob, n_ticks))
         self.results.append(_encode(self.decision))
+        assert _decode(self.results[-1]) == self.decision, "a client's schema would not take this"
         assert _encode(self.twin.step(self.now_ns, entries, n_ticks, self.view)) == self.results[-1]
         for admitted in self.decision.admitted:
             next(c for c in self.people if c.connection == admitted.connection).id = admitted.participant_id
@@ -176,7 +178,14 @@ class Play:
         self.enter(old.role, old)
 
     def trouble(self) -> None:
-        messages = [Lost(), cm.Bye(), cm.EStop(), cm.Release(), cm.Release(), cm.Heartbeat(worn=False)]
+        messages = [
+            Lost(),
+            cm.Bye("x" * 500),
+            cm.EStop("x" * 500),
+            cm.Release(),
+            cm.Release(),
+            cm.Heartbeat(worn=False),
+        ]
         self.say(self.who(), self.rng.choice(messages))
 
     def recover(self) -> None:

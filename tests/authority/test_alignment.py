@@ -90,11 +90,13 @@ def test_refusals_come_with_advice_and_not_too_often(changes: dict[str, Any]) ->
     assert denial is not None
     assert denial.reason == "alignment_refused"
     assert "closer" in denial.advice
+    assert denial.message in t.since(Notice)[0].text
     t.step(anna.says(proposal(**changes)))
     assert anna.replies() == []
     t.wait(SECOND)
     t.step(anna.says(proposal(**changes)))
     assert len(anna.replies()) == 1
+    assert t.since(Notice) == []
     assert not any(isinstance(e, AlignmentChanged) for e in t.events)
 
 

@@ -372,3 +372,14 @@ def test_waiting_for_seconds_keeps_the_reply_for_the_end() -> None:
         t.step(anna.says(anna.sample()), bert.says(bert.sample()), dt_ns=100 * MS)
         assert bert.replies() == []
     assert t.now_ns > 5 * SECOND
+
+
+def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
+    t = Table(objects=[f"a rather long name of object number {i}" for i in range(300)])
+    anna = t.join()
+    for message in (Acquire(1, (), ("nothing",)), Release(1, (Target("nothing", 1),)), Grasp(1, "nothing", "head")):
+        denial = anna.asks(message).denial
+        assert denial is not None
+        assert len(denial.message) <= 512
+        assert denial.advice.endswith("more")
+        assert len(denial.advice) <= 512
