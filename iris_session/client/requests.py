@@ -26,7 +26,7 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import Lease, Pose, Target
-from iris_session.protocol.names import AnchorKind
+from iris_session.protocol.names import AnchorKind, TargetKind
 from iris_session.protocol.server_messages import Reply
 
 
@@ -48,18 +48,28 @@ class Requests:
     def lease_version(self, target: str) -> int | None: ...
 
     def acquire(
-        self, robots: Sequence[str] = (), *, objects: Sequence[str] = (), wait: bool = False, weight: float = 1.0
+        self,
+        robots: Sequence[str] = (),
+        *,
+        objects: Sequence[str] = (),
+        wait: bool = False,
+        weight: float = 1.0,
+        timeout_s: float = 5.0,
     ) -> tuple[Lease, ...]:
         """Takes leases, all or none; without names the assignment policy chooses one robot.
 
-        `wait`: queue when somebody holds them; the lease then comes as an event. `weight`: share in mode `shared`.
+        `wait`: queue when somebody holds them. The answer then comes with the lease, as it does after a holder's
+        consent in mode `request`: `RequestTimeoutError` after `timeout_s` leaves us in the queue, `release()` leaves
+        it. `weight`: share in mode `shared`.
         """
-        return self.request(Acquire(0, tuple(robots), tuple(objects), wait, weight)).leases
+        return self.request(Acquire(0, tuple(robots), tuple(objects), wait, weight), timeout_s).leases
 
     def release(self, *names: str) -> None:
-        """Gives robots and objects back; without names all, and leaves every queue."""
-        tokens = [(name, self.lease_version(name)) for name in names]
-        self.request(Release(0, tuple(Target(name, token) for name, token in tokens if token is not None)))
+        """Gives robots and objects back; without names all, and leaves every queue. Denied for what is not ours."""
+        leases = self.connection.mirror.leases
+        kinds = [leases[name].kind if name in leases else TargetKind.ROBOT for name in names]
+        tokens = [self.lease_version(name) or 0 for name in names]
+        self.request(Release(0, tuple(map(Target, names, tokens, kinds))))
 
     def grasp(self, name: str, device: str) -> tuple[Lease, ...]:
         """Takes a free object with a hand that has no robot."""

@@ -87,7 +87,7 @@ class Person:
         self._seen_here = 0
         self._moved_ns = 0
         self._looked_ns = 0
-        self._request: int | None = None
+        self._request: tuple[int, int] | None = None
         self._retry_ns = 0
         self._refused_because = ""
         self._holding_since = 0
@@ -267,12 +267,14 @@ class Person:
             self._request = None
             self._enter("work", now_ns)
         elif self._request is None and now_ns >= self._retry_ns:
-            self._request = self.client.submit(Acquire(0, (self.spec.robot,), wait=True))
-            self._retry_ns = now_ns + int(RETRY_S * 1e9)
+            number = self.client.submit(Acquire(0, (self.spec.robot,), wait=True))
+            self._request = (self.client.connection.generation, number)
         elif self._request is not None:
-            reply = self.client.answer(self._request)
-            if reply is not None or now_ns >= self._retry_ns:
-                self._request = None
+            generation, number = self._request
+            reply = self.client.answer(number)
+            if reply is not None or generation != self.client.connection.generation:
+                self._request = None  # answered, or asked on a connection that is gone
+                self._retry_ns = now_ns + int(RETRY_S * 1e9)
             if reply is not None and reply.denial is not None:
                 self._refused_because = f"{reply.denial.reason}: {reply.denial.message} {reply.denial.advice}"
 
