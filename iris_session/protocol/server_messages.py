@@ -149,7 +149,7 @@ class ParticipantLeft(EventBody, frozen=True, tag="participant_left"):
 
 
 class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
-    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode."""
+    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue."""
 
     lease: Lease
     cause: Name

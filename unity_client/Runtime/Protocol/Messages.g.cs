@@ -836,7 +836,9 @@ namespace IrisSession.Protocol
     /// State of one lease as everyone sees it. holder is a participant id, empty when free.
     ///
     /// expires_ns is the session time at which the grace period of a disconnected holder ends, 0 while it is connected.
-    /// sub_holders and weights are used in mode shared only and have the same length.
+    /// sub_holders and weights have the same length: everyone who shares the target (mode shared, objects), or an
+    /// agent and the human who stands by (mode priority; the one in charge is holder and has weight 1, the other 0).
+    /// In mode shared a token stays valid for its holder when others join and raise lease_version.
     /// </summary>
     public sealed class Lease : WireValue
     {
@@ -2733,7 +2735,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode.
+    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue.
     /// </summary>
     public sealed class LeaseChanged : EventKind
     {
