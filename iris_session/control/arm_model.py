@@ -7,6 +7,8 @@ the caller supplies `T_world_root` (constant unless the robot's base moves).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +71,13 @@ def moving_base(scene: mujoco.MjModel, body: int) -> bool:
             return True
         body = int(scene.body_parentid[body])
     return False
+
+
+def joint_ranges(scene: mujoco.MjModel, arms: Sequence[ArmModel]) -> tuple[Floats, Floats]:
+    """Lower and upper limits of all arms' joints, shape (n,) each; infinite where there is none."""
+    ids = np.array([joint for arm in arms for joint in arm.joint_ids], dtype=np.intp)
+    limited, ranges = np.asarray(scene.jnt_limited)[ids].astype(bool), np.asarray(scene.jnt_range)[ids]
+    return np.where(limited, ranges[:, 0], -np.inf), np.where(limited, ranges[:, 1], np.inf)
 
 
 def _joints_of(scene: mujoco.MjModel, body: int) -> list[int]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from anchors.pose import PoseTuple
 from iris_session.control import clutch
-from iris_session.control.arm_model import ArmModel, moving_base, site_pose
+from iris_session.control.arm_model import ArmModel, joint_ranges, moving_base, site_pose
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.errors import ControlError
 from iris_session.control.grasp import Grasps
@@ -53,12 +53,13 @@ class Controller:
         self._columns = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
         self._qpos = np.array([model.jnt_qposadr[j] for arm in self._arms for j in arm.joint_ids], dtype=np.intp)
         self._writes_ctrl = self._config.output == OUTPUT_CTRL
-        self._laws = ActuatorLaws(model, self._robots, self._config)
+        # Without ctrl output the environment drives the actuators: any kind will do.
+        driven = self._robots if self._writes_ctrl else ()
+        self._laws = ActuatorLaws(model, driven, self._config)
+        self._bounds = (self._laws.lower, self._laws.upper) if driven else joint_ranges(model, self._arms)
         self._joints = JointInterpolator(*speed_limits(model, self._robots, self._arms, self._config), self._dt)
-        self._reach = Reach(
-            self._robots, self._arms, self._columns, self._joints, (self._laws.lower, self._laws.upper), self._config
-        )
-        self._grippers = Grippers(model, self._robots, self._config, self._dt)
+        self._reach = Reach(self._robots, self._arms, self._columns, self._joints, self._bounds, self._config)
+        self._grippers = Grippers(model, driven, self._config, self._dt)
         self._grasps = Grasps(model, objects, self._config)
         self._proximity = Proximity(model, self._robots, self._config)
         self._check_ticks = max(1, round(self._config.proximity_period_s / self._dt))
@@ -225,9 +226,9 @@ class Controller:
         r.pending = _newest(command)
 
     def _follow_joints(self, i: int, state: clutch.Latch, command: Command) -> None:
-        r, columns, laws = self._states[i], self._columns[i], self._laws
+        r, columns, (lower, upper) = self._states[i], self._columns[i], self._bounds
         goal = leader_goal(state, command.sources, self._joints.goal[columns], self._config)
-        goal = np.minimum(np.maximum(goal, laws.lower[columns]), laws.upper[columns])
+        goal = np.minimum(np.maximum(goal, lower[columns]), upper[columns])
         r.ramping = ramping(r.ramping, float(np.abs(goal - self._joints.q[columns]).max()), self._config)
         self._set_cap(i)
         self._joints.aim(columns, goal, self._reach.interval(r, self._tick))

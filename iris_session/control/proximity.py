@@ -7,6 +7,7 @@ nearest pairs. Only motion that closes the gap is slowed; motion that opens it n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import mujoco
@@ -53,11 +54,8 @@ class Proximity:
         for a, b in self._near_robots(data):
             for distance, geom_a, geom_b, p_a, p_b in self._near_geoms(data, a, b):
                 gap = p_b - p_a
-                length = float(np.linalg.norm(gap))
-                if length < 1e-9:
-                    continue
-                # Witness points of penetrating geoms are swapped: the direction from a to b stays the same.
-                normal = gap / length if distance >= 0.0 else -gap / length
+                # Points of penetrating geoms are swapped: the direction from a to b stays the same.
+                normal = gap / math.copysign(max(float(np.linalg.norm(gap)), 1e-9), distance)
                 closing = [
                     float(normal @ self._point_velocity(data, a, geom_a, p_a, wanted[a])),
                     -float(normal @ self._point_velocity(data, b, geom_b, p_b, wanted[b])),

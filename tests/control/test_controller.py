@@ -345,6 +345,16 @@ def test_targets_without_ik_move_at_bounded_speed_and_need_no_mink(monkeypatch: 
     assert (rig.data.ctrl == ctrl).all()
 
 
+def test_targets_need_no_actuators_that_control_could_drive() -> None:
+    bare = RobotSpec("iiwa", iiwa_spec().joints, (), "attachment_site", "base", gripper_actuator="none")
+    rig = Rig(iiwa_model("torque"), [bare], TARGETS, home=IIWA_HOME)
+    joints = {"pose_world": None, "q": (9.0,) * 7}
+    for _ in range(2000):
+        rig.step(decision([Command("iiwa", "joints", sources=(rig.source((0.0,) * 3, **joints),), gripper=1.0)]))
+    assert rig.controller._joints.goal == pytest.approx(rig.model.jnt_range[:, 1])
+    assert not rig.data.ctrl.any()
+
+
 def test_a_snapshot_of_other_robots_is_refused() -> None:
     two, one = Rig(aloha_model(), aloha_robots()), Rig(aloha_model(), aloha_robots()[:1])
     with pytest.raises(ControlError, match="snapshot is of 1 robots with 6 joints; this controller has 2 with 12"):
