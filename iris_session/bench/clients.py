@@ -76,6 +76,7 @@ class BenchClient:
         self.ticks: list[int] = []
         self.handed_ns: list[int] = []
         self.state_ns: list[int] = []
+        self.published_ns: list[int] = []
         self.applied_seq: list[int] = []
         self.poses: list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = []
         self.sent = 0
@@ -93,6 +94,7 @@ class BenchClient:
         self.handed_ns.append(time.monotonic_ns() - self._job.origin_ns)
         self.ticks.append(state.header.tick)
         self.state_ns.append(state.header.session_time)
+        self.published_ns.append(state.header.published_ns)
         self.applied_seq.append(_seq_of(state.header.applied, self.spec.robot))
         if self._job.keep_poses:
             self.poses.append(state.poses)
@@ -169,6 +171,7 @@ def _write(job: Job, clients: list[BenchClient]) -> None:
         columns[f"{name}.ticks"] = np.array(client.ticks, np.int64)
         columns[f"{name}.handed_ns"] = np.array(client.handed_ns, np.int64)
         columns[f"{name}.state_ns"] = np.array(client.state_ns, np.int64)
+        columns[f"{name}.published_ns"] = np.array(client.published_ns, np.int64)
         columns[f"{name}.applied_seq"] = np.array(client.applied_seq, np.int64)
         columns[f"{name}.counts"] = np.array(
             [client.sent, client.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes], np.int64

@@ -30,6 +30,7 @@ def run_state(
     got = measure(model, specs, seconds, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
     ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
+    inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
     position_mm, rotation_deg = errors(got)
     messages = sum(int(log["counts"][3]) for log in got.logs.values())
     total = sum(int(log["counts"][4]) for log in got.logs.values())
@@ -38,6 +39,8 @@ def run_state(
         "age_ms_p50": round(float(np.percentile(ages, 50)), 3),
         "age_ms_p95": round(float(np.percentile(ages, 95)), 3),
         "age_ms_p99": round(float(np.percentile(ages, 99)), 3),
+        "age_at_publish_ms_p50": round(float(np.percentile(inside, 50)), 3),
+        "age_at_publish_ms_p99": round(float(np.percentile(inside, 99)), 3),
         "bytes_per_frame": round(total / messages, 1),
         "bytes_per_body": round(total / messages / bodies, 2),
         "max_position_error_mm": round(position_mm, 5),

@@ -37,6 +37,11 @@ _MAX_SQUARES: Final = 0.76
 
 #: Components that are sent when component `i` is the largest.
 _OTHERS: Final = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+#: Where `w, x, y, z` stand in (sent, sent, sent, largest) when component `i` is the largest.
+_PLACES: Final = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])
+_LEVELS: Final = np.uint64(ROTATION_LEVELS)
+_TWO: Final = np.uint64(2)
+_THREE: Final = np.uint64(3)
 
 
 def rotation_codes(q: Floats) -> Words:
@@ -57,23 +62,24 @@ def rotation_codes(q: Floats) -> Words:
 
 def rotations(codes: Words) -> Floats:
     """Unit quaternions (m, 4) of `codes` (m,). Raises `StreamError` for a code that stands for no rotation."""
-    largest = (codes & np.uint64(3)).astype(np.int64)
-    rest = (codes >> np.uint64(2)).astype(np.int64)
-    high, a = np.divmod(rest, ROTATION_LEVELS)
-    c, b = np.divmod(high, ROTATION_LEVELS)
-    components = np.empty((len(codes), 3))
-    components[:, 0] = a
-    components[:, 1] = b
-    components[:, 2] = c
-    components -= _HALF
-    components /= _PER_UNIT
-    squares = np.einsum("ij,ij->i", components, components)
-    if len(codes) and not (squares.max() <= _MAX_SQUARES and c.max() < ROTATION_LEVELS):
+    n = len(codes)
+    rest = codes >> _TWO
+    high = rest // _LEVELS  # division of unsigned integers by a constant is vectorised, divmod is not
+    c = high // _LEVELS
+    parts = np.empty((n, 4))
+    parts[:, 0] = rest - high * _LEVELS
+    parts[:, 1] = high - c * _LEVELS
+    parts[:, 2] = c
+    parts -= _HALF
+    parts /= _PER_UNIT
+    parts[:, 3] = 0.0
+    squares = np.einsum("ij,ij->i", parts, parts)
+    if n and not (squares.max() <= _MAX_SQUARES and c.max() < _LEVELS):
         raise StreamError("a rotation code stands for no unit quaternion")
-    q = np.empty((len(codes), 4))
-    rows = np.arange(len(codes))
-    q[rows[:, None], _OTHERS[largest]] = components
-    q[rows, largest] = np.sqrt(1.0 - squares)
+    np.sqrt(1.0 - squares, out=parts[:, 3])
+    order = _PLACES.take((codes & _THREE).view(np.int64), axis=0)
+    order += np.arange(0, 4 * n, 4)[:, None]
+    q: Floats = parts.take(order)
     return q
 
 
@@ -86,4 +92,5 @@ def unpack_words(data: bytes | memoryview, n_bytes: int) -> Words:
     """Inverse of `pack_words`; `len(data)` must be a multiple of `n_bytes`."""
     wide = np.zeros((len(data) // n_bytes, 8), np.uint8)
     wide[:, :n_bytes] = np.frombuffer(data, np.uint8).reshape(-1, n_bytes)
-    return wide.view("<u8").reshape(-1).astype(np.uint64, copy=False)
+    words: Words = wide.view("<u8").reshape(-1).astype(np.uint64, copy=False)
+    return words

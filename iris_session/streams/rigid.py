@@ -341,13 +341,15 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask, Floats, n
         body = escapes["body"].astype(np.int64)
         if body[-1] >= n_bodies or (np.diff(body) <= 0).any() or mask[body].any():
             raise StreamError("escaped bodies are not ascending, in range and apart from the mask")
-    codes = unpack_words(view[at_positions:at_rotations], position_bytes).astype(np.int64)
+    codes = unpack_words(view[at_positions:at_rotations], position_bytes)
     poses = np.empty((n_quantised, 7))
-    rest, x = np.divmod(codes, nx)
-    z, y = np.divmod(rest, ny)
-    poses[:, 0] = x + ox
-    poses[:, 1] = y + oy
-    poses[:, 2] = z + oz
+    ux, uy = np.uint64(nx), np.uint64(ny)
+    rest = codes // ux
+    z = rest // uy
+    poses[:, 0] = codes - rest * ux
+    poses[:, 1] = rest - z * uy
+    poses[:, 2] = z
+    poses[:, :3] += (ox, oy, oz)
     poses[:, :3] *= LATTICE_M
     poses[:, 3:] = rotations(unpack_words(view[at_rotations:at_escapes], ROTATION_BYTES))
     return mask, poses, escapes
