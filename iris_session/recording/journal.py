@@ -157,8 +157,9 @@ def make_row(
     else:
         head = blob = b"\x90"
         lengths = crcs = ()
-    field_crcs = _field_crcs(step, now_ns, n_ticks, digest, plant, head, lengths, crcs)
-    chain = _chain(prev_chain, step, now_ns, n_ticks, blob, digest, plant, (*lengths, *crcs, *field_crcs))
+    ints = _STEP.pack(step, now_ns, n_ticks)
+    field_crcs = _field_crcs(ints, digest, plant, head, lengths, crcs)
+    chain = _chain(prev_chain, ints, blob, digest, plant, (*lengths, *crcs, *field_crcs))
     return JournalRow(step, now_ns, n_ticks, blob, lengths, crcs, digest, chain, field_crcs, plant)
 
 
@@ -204,54 +205,29 @@ def _keyframe_crcs(keyframe: Keyframe, chain: bytes) -> tuple[int, ...]:
 
 def _rechain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | None = None) -> bytes:
     numbers = (*row.entry_lengths, *row.entry_crcs, *(row.field_crcs if field_crcs is None else field_crcs))
-    return _chain(prev_chain, row.step, row.now_ns, row.n_ticks, row.entries, row.digest, row.plant, numbers)
+    ints = _STEP.pack(row.step, row.now_ns, row.n_ticks)
+    return _chain(prev_chain, ints, row.entries, row.digest, row.plant, numbers)
 
 
-def _chain(
-    prev_chain: bytes,
-    step: int,
-    now_ns: int,
-    n_ticks: int,
-    blob: bytes,
-    digest: bytes,
-    plant: bytes,
-    numbers: tuple[int, ...],
-) -> bytes:
-    h = hashlib.blake2b(prev_chain, digest_size=HASH_BYTES)
-    h.update(_STEP.pack(step, now_ns, n_ticks))
-    h.update(digest)
-    h.update(struct.pack(f"<{len(numbers)}q", *numbers))
-    h.update(blob)
-    h.update(plant)
-    return h.digest()
+def _chain(prev_chain: bytes, ints: bytes, blob: bytes, digest: bytes, plant: bytes, numbers: tuple[int, ...]) -> bytes:
+    parts = (prev_chain, ints, digest, struct.pack(f"<{len(numbers)}q", *numbers), blob, plant)
+    return hashlib.blake2b(b"".join(parts), digest_size=HASH_BYTES).digest()
 
 
 def _field_crcs(
-    step: int,
-    now_ns: int,
-    n_ticks: int,
-    digest: bytes,
-    plant: bytes,
-    head: bytes,
-    lengths: tuple[int, ...],
-    crcs: tuple[int, ...],
+    ints: bytes, digest: bytes, plant: bytes, head: bytes, lengths: tuple[int, ...], crcs: tuple[int, ...]
 ) -> tuple[int, ...]:
+    """CRCs of `FIELDS`. `ints`: step, now_ns, n_ticks as three int64."""
     crc = zlib.crc32
     index = head if not lengths else head + struct.pack(f"<{2 * len(lengths)}q", *lengths, *crcs)
-    return (
-        crc(_I64.pack(step)),
-        crc(_I64.pack(now_ns)),
-        crc(_I64.pack(n_ticks)),
-        crc(digest),
-        crc(plant),
-        crc(index),
-    )
+    return (crc(ints[:8]), crc(ints[8:16]), crc(ints[16:]), crc(digest), crc(plant), crc(index))
 
 
 def _field_problem(prev_chain: bytes | None, row: JournalRow) -> RowProblem | None:
     head_bytes = max(0, len(row.entries) - sum(row.entry_lengths))
     head = row.entries[:head_bytes]
-    now = _field_crcs(row.step, row.now_ns, row.n_ticks, row.digest, row.plant, head, row.entry_lengths, row.entry_crcs)
+    ints = _STEP.pack(row.step, row.now_ns, row.n_ticks)
+    now = _field_crcs(ints, row.digest, row.plant, head, row.entry_lengths, row.entry_crcs)
     if now == row.field_crcs:
         return None
     if prev_chain is not None and _rechain(prev_chain, row, now) == row.chain:
