@@ -146,13 +146,12 @@ def run(job: Job) -> None:
         now = _now(job)
         if not end and selector.select(0):
             begin, end = map(int, sys.stdin.readline().split())
-        recording = bool(end) and begin <= now < end
         for client in clients:
-            client.recording = recording
+            client.recording = bool(end) and begin <= now < end
             client.step(now)
-            client.client.poll(0.0)
         wake = min(now + 20_000_000, *(c.next_ns for c in clients))
-        wait_any([c.client for c in clients], max(0.0, (wake - _now(job)) * 1e-9))
+        for ready in wait_any([c.client for c in clients], max(0.0, (wake - _now(job)) * 1e-9)):
+            ready.poll(0.0)
     _write(job, clients)
     for client in clients:
         with contextlib.suppress(Exception):  # the session may have ended first
