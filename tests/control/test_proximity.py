@@ -66,6 +66,15 @@ def test_without_the_margin_they_collide() -> None:
     assert gap(rig, Proximity(model, robots, ControlConfig())) < 0.005
 
 
+def test_a_blocked_robots_solution_does_not_run_away_from_its_joints() -> None:
+    model, robots = iiwa_arms(*FACING)
+    rig = Rig(model, robots, ControlConfig(lead_s=0.02), home=IIWA_HOME)
+    rig.hold(200)
+    push(rig, 0.6, 800)
+    ahead = np.abs(rig.controller._joints.goal - rig.controller._joints.q)
+    assert 0.04 < ahead.max() <= 2.5 * 0.02 + 1e-9
+
+
 SLIDERS = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
 <body name="a"><body><joint name="a" type="slide" axis="1 0 0"/>
   <geom size=".1" pos="0 0 1"/><site name="a" pos="0 0 1"/>
