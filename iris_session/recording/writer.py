@@ -18,6 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import BodyInfo, Event
 from iris_session.recording import paths, scene
@@ -29,6 +30,8 @@ from iris_session.recording.text import describe_denial, describe_event, describ
 
 #: Colours of participants in the order of their appearance.
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+#: A chunk per robot: once a second, because they can be had from `/state` again.
+LATENCIES_NS = 1_000_000_000
 _encode = msgspec.msgpack.Encoder().encode
 #: The stream's own batcher never acts: this writer sends whole columns and flushes them.
 _BATCHER = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
@@ -52,6 +55,9 @@ class RrdWriter:
         self._marked = 0  # bytes of the file that marks cover
         self._newest_row = (-1, b"")
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
+        self._applied: dict[str, Applied] = {}
+        self._latencies: list[MetricRecord] = []
+        self._latencies_due_ns = 0
         self._people: dict[str, tuple[int, int, int]] = {}
         self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
 
@@ -110,6 +116,7 @@ class RrdWriter:
 
     def close(self) -> None:
         """Writes the rest and the end mark, and closes the file."""
+        self._write_latencies()
         self.flush()
         self._mark()
         step, chain = self._newest_row
@@ -177,8 +184,26 @@ class RrdWriter:
             blobs("applied", [_encode(s.applied) for s in states]),
         ]
         self._send(paths.STATE, _times(times), columns)
+        self._note_latencies(states)
         self._transforms(states, poses, times)
         self._clock = moments[-1][1:3]
+
+    def _note_latencies(self, states: list[StateFrame]) -> None:
+        """For the plots: from the capture of a sample to the step that it entered, per robot. Written once a second."""
+        for state in states:
+            for applied in state.applied:
+                if self._applied.get(applied.robot) != applied:
+                    self._applied[applied.robot] = applied
+                    name = f"input_to_step_ms/{applied.robot}"
+                    latency_ms = (applied.step_ns - applied.capture_ns) / 1e6
+                    self._latencies.append(MetricRecord(state.step, state.session_time, name, latency_ms))
+        if states[-1].session_time >= self._latencies_due_ns:
+            self._latencies_due_ns = states[-1].session_time + LATENCIES_NS
+            self._write_latencies()
+
+    def _write_latencies(self) -> None:
+        latencies, self._latencies = self._latencies, []
+        self._metrics(latencies)
 
     def _transforms(self, states: list[StateFrame], poses: NDArray[np.float64], times: NDArray[np.int64]) -> None:
         """One row per body that changed in a frame, and per device of a person that has a new pose."""

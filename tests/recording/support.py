@@ -29,7 +29,7 @@ from iris_session.recording import (
     pack_model,
 )
 from iris_session.recording.journal import seal
-from iris_session.recording.messages import Batch
+from iris_session.recording.messages import PART_CHUNKS, Batch
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000
@@ -152,13 +152,13 @@ class SmallSession:
 
 
 @contextmanager
-def recorder(path: Path, **feed_options: int) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
+def recorder(path: Path, part_chunks: int = PART_CHUNKS) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
     """A started recorder process with a feed; ended in any case."""
-    process = RecorderProcess(path, time.monotonic_ns())
+    process = RecorderProcess(path, time.monotonic_ns(), part_chunks)
     feed: RecorderFeed | None = None
     try:
         process.start()
-        feed = RecorderFeed(process.feed_endpoint, path.parent, **feed_options)
+        feed = RecorderFeed(process.feed_endpoint, path.parent)
         yield process, feed
     finally:
         if feed is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from anchors.pose import apply
-from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.common import Applied, Denial, Pose
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
 from iris_session.recording import SessionHeader, scene
 from iris_session.recording.messages import Batch, DenialRecord, StateFrame
@@ -91,6 +91,21 @@ def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
+
+
+def test_latencies_of_applied_samples_are_plotted_once_each(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(SessionHeader("s", "n", "closed", 2_000_000))
+    first = Applied("left", "p1", "controller/right", 1, 1_000_000, 4_000_000, 6_000_000)
+    second = msgspec.structs.replace(first, seq=2, capture_ns=5_000_000, step_ns=8_000_000)
+    states = [
+        msgspec.structs.replace(frame(8 * i, np.zeros((0, 7))), applied=(applied,))
+        for i, applied in enumerate((first, first, second))
+    ]
+    writer.add(Batch(states=states))
+    writer.close()
+    assert column(read(path)["/metrics/input_to_step_ms/left"], "Scalars:scalars") == [[5.0], [3.0]]
 
 
 def test_people_appear_once_and_move_with_their_captures(tmp_path: Path) -> None:

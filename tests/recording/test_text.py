@@ -1,0 +1,42 @@
+"""Lines for people, and what a re-simulation must have in common with the recording."""
+
+from __future__ import annotations
+
+from iris_session.protocol.common import Alignment, Denial, Lease, Pose
+from iris_session.protocol.server_messages import AlignmentChanged, Event, Gap, LeaseChanged
+from iris_session.recording import versions
+from iris_session.recording.messages import DenialRecord
+from iris_session.recording.text import describe_denial, describe_event, describe_session
+from tests.recording.support import make_header
+
+
+def test_events_say_kind_and_fields_without_what_is_empty() -> None:
+    line = describe_event(Event(3, 1, 2, LeaseChanged(Lease("left", "robot", "exclusive", "p1", 4), "acquired")))
+    assert line.level == "INFO"
+    assert line.text.startswith("#3 lease_changed lease.target=left lease.kind=robot")
+    assert "queue" not in line.text
+    pose = Pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
+    aligned = AlignmentChanged("p1", Alignment(2, "measured", pose, covariance=(0.5,) * 36))
+    text = describe_event(Event(4, 1, 2, aligned)).text
+    assert "alignment.kind=measured" in text
+    assert "0.5" not in text, "36 numbers are for the data, not for people"
+    assert describe_event(Event(5, 1, 2, Gap("recording", 7))).level == "ERROR"
+
+
+def test_denials_say_who_holds_and_what_to_do() -> None:
+    line = describe_denial(DenialRecord(1, 2, 3, Denial("role", "observers cannot drive", "join as operator")))
+    assert line == ("WARN", "connection 3: role: observers cannot drive; join as operator")
+
+
+def test_the_session_page_names_class_and_versions() -> None:
+    page = describe_session(make_header("open", {"mujoco": "4.0.0"}))
+    assert "**open**" in page
+    assert "| mujoco | 4.0.0 |" in page
+
+
+def test_versions_here_equal_versions_here() -> None:
+    here = versions.environment()
+    assert here["numpy"] != "absent"
+    assert versions.differences(here) == []
+    other = {**here, "numpy": "1.0", "gone": "2"}
+    assert [line.split(":")[0] for line in versions.differences(other)] == ["gone", "numpy"]
