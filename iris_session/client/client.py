@@ -171,7 +171,7 @@ class Client(SceneView, Requests):
         return progressed
 
     def register(self, poller: zmq.Poller) -> None:
-        """Adds everything that can wake this client to `poller`; `poll` is due at `connection.next_deadline_ns`."""
+        """Adds our sockets to `poller`; `poll` is due when they wake it and at `connection.next_deadline_ns`."""
         if self.connection.phase is not Phase.CLOSED:
             self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
 
@@ -375,6 +375,7 @@ class Client(SceneView, Requests):
     def _wait(self, timeout_ns: int) -> None:
         poller = zmq.Poller()
         self.register(poller)
+        self._sockets.register_wake(poller)
         poller.poll(milliseconds(timeout_ns))
         self._sockets.clear_wake()
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import socket
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, TypeGuard
 
 import zmq
 from zmq.auth import load_certificate
@@ -122,22 +122,24 @@ class ClientSockets:
     def disconnected(self) -> bool:
         """True once after the control socket lost its peer."""
         lost = False
-        while self._monitor is not None and self._monitor.get(zmq.EVENTS) & zmq.POLLIN:
-            self._monitor.recv_multipart(zmq.NOBLOCK)
-            lost = True
+        while _readable(self._monitor):
+            lost = bool(self._monitor.recv_multipart(zmq.NOBLOCK))
         return lost
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> None:
-        """Adds everything that can wake this client to `poller`; `sending`: also that the control socket takes more."""
-        poller.register(self._wake_in, zmq.POLLIN)
+        """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more."""
         if self._control is not None:
             poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
         for sock in (self._monitor, self._state):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
 
+    def register_wake(self, poller: zmq.Poller) -> None:
+        """Adds what `wake` wakes to `poller`."""
+        poller.register(self._wake_in, zmq.POLLIN)
+
     def wake(self) -> None:
-        """Ends a wait on these sockets, from any thread."""
+        """Ends a wait that includes `register_wake`, from any thread."""
         with contextlib.suppress(OSError):  # full: it is awake already; closed: nobody waits
             self._wake_out.send(b"\0")
 
@@ -177,9 +179,14 @@ class ClientSockets:
         return sock
 
 
-def _drain(sock: Any) -> list[list[bytes]]:
-    """What is there now. Asking first costs a tenth of the exception of an empty receive."""
+def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
+    """Whether something is there. Asking first costs a tenth of the exception of an empty receive."""
+    return sock is not None and bool(int(sock.get(zmq.EVENTS)) & zmq.POLLIN)
+
+
+def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:
+    """What is there now."""
     messages: list[list[bytes]] = []
-    while sock is not None and len(messages) < MAX_DRAIN and sock.get(zmq.EVENTS) & zmq.POLLIN:
+    while len(messages) < MAX_DRAIN and _readable(sock):
         messages.append(sock.recv_multipart(zmq.NOBLOCK))
     return messages

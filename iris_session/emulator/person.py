@@ -24,14 +24,14 @@ from anchors.pose import (
     quat_angle,
     quat_from_yaw,
 )
-from iris_session.client import Client, NotConnectedError, SceneState
+from iris_session.client import Client, SceneState
 from iris_session.emulator.behaviours import Behaviour, HandInput, make_behaviour
 from iris_session.emulator.display import Display
 from iris_session.emulator.headset import Headset, look_at
 from iris_session.emulator.link import DelayLine
 from iris_session.emulator.specs import OBSERVER, HeadsetReport, HeadsetSpec
 from iris_session.emulator.viewpoints import between, viewpoint_pose
-from iris_session.protocol.client_messages import Acquire, ClientMessage
+from iris_session.protocol.client_messages import Acquire, Sample
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.names import AlignmentKind, CommandKind, Device, HoldReason, Role
 from iris_session.protocol.server_messages import Event, Handover, Notice
@@ -42,7 +42,7 @@ MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
 RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...
 RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
-AGES_KEPT: Final = 20_000
+AGES_KEPT: Final = 4_000  # a minute of frames
 RETRY_S: Final = 1.0
 
 #: Reasons of a hold that end by clutching again.
@@ -77,7 +77,7 @@ class Person:
             on_event=self._on_event,
         )
         self.display = Display(self.client, spec.display_delay_s)
-        self._uplink: DelayLine[ClientMessage] = DelayLine(spec.model.link, self.headset.rng)
+        self._uplink: DelayLine[Sample] = DelayLine(spec.model.link, self.headset.rng)
         self._ages: deque[float] = deque(maxlen=AGES_KEPT)
         self.started_ns = start_ns
         self._joined_ns = 0
@@ -112,11 +112,8 @@ class Person:
 
     def step(self, now_ns: int) -> None:
         """One round of the loop, after `client.poll`."""
-        for message in self._uplink.pop(now_ns):
-            try:
-                self.report.samples += self.client.send(message)
-            except NotConnectedError:
-                self.report.samples_not_sent += 1
+        for sample in self._uplink.pop(now_ns):
+            self.report.samples += self.client.send(sample)
         if not self.headset.sample_due(now_ns) or not self.client.ready:
             return
         if not self._joined_ns:
@@ -143,7 +140,7 @@ class Person:
             report.age_ms_p99 = ages[min(len(ages) - 1, int(0.99 * len(ages)))]
         report.participant = client.participant_id
         report.rejected = self._rejected()
-        report.samples_not_sent += client.connection.counters.samples_not_sent
+        report.samples_not_sent = client.connection.counters.samples_not_sent
         report.reconnects = client.connection.counters.reconnects
         report.clock_error_ms = client.clock_error_ns() / 1e6
         report.mirror_hash, report.event_seq = client.mirror.mirror_hash(), client.mirror.event_seq

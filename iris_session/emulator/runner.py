@@ -36,28 +36,30 @@ def run_headsets(
     end = None if seconds is None else start + int(seconds * 1e9)
     people = [Person(address, spec, start) for spec in specs]
     told: dict[str, tuple[str, int]] = {}
+    ready = [person.client for person in people]
     try:
         while not stop():
             now = time.monotonic_ns()
             if (end is not None and now >= end) or _all_finished(people):
                 break
             for person in people:
-                _drive(person)
+                _drive(person, person.client in ready)
                 if report is not None:
                     _tell(person, told, report, now)
             wake = min(person.next_ns for person in people)
             if end is not None:
                 wake = min(wake, end)
-            wait_any([person.client for person in people], max(0.0, (wake - time.monotonic_ns()) / 1e9))
+            ready = wait_any([person.client for person in people], max(0.0, (wake - time.monotonic_ns()) / 1e9))
         return [person.finish_report() for person in people]
     finally:
         for person in people:
             person.client.close()
 
 
-def _drive(person: Person) -> None:
+def _drive(person: Person, ready: bool) -> None:
     try:
-        person.client.poll(0.0)
+        if ready:
+            person.client.poll(0.0)
     except RefusedError as error:
         if not person.finished:
             person.fail(str(error), time.monotonic_ns())
