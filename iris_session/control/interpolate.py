@@ -83,8 +83,8 @@ class JointInterpolator:
         arrived = (np.abs(self.goal - self.q) < 1e-9) & (np.abs(self.v) <= self._dv)
         if arrived.any():
             self.q[arrived] = self.goal[arrived]
-            self.v[arrived] = 0.0
-            self.moving = not bool(arrived.all())
+            # The speed of arrival ends in the next tick, within the acceleration limit whatever is asked then.
+            self.moving = not bool((arrived & (self.v == 0.0)).all())
 
     def state(self) -> list[bytes]:
         """Arrays as raw bytes, for snapshots."""

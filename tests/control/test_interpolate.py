@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from iris_session.control import ControlConfig, ControlError
@@ -26,6 +26,7 @@ goals = st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 3), min_size=1, max_size=12
 
 
 @settings(max_examples=60, deadline=None)
+@example([(1.0, 0.0, 0.0)] * 2 + [(0.0, 0.0, 0.0)] * 5 + [(1.0, 0.0, 0.0)], 1, 1.0, 2.0, False)  # back at once
 @given(goals, st.integers(1, 12), st.floats(0.3, 4.0), st.floats(2.0, 60.0), st.booleans())
 def test_limits_hold_for_any_goals(
     sequence: list[tuple[float, ...]], every: int, velocity: float, acceleration: float, stop: bool
