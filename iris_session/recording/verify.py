@@ -136,7 +136,13 @@ def verify(
         report = VerifyReport(str(path), recording_class=header.recording_class, parts=len(recording.files))
         report.version_differences = versions.differences(header.versions)
         total = recording.count_rows() if progress else 0
-        run = _Run(recording, make_core(header) if make_core else None, report)
+        try:
+            core = make_core(header) if make_core else None
+        except Exception as error:  # a changed header, or another version of the rooms: said in the report
+            text = f"the session cannot be built from the header: {_one_line(error)}"
+            report.problems.append(Problem(-1, "divergence", "header", text))
+            return report
+        run = _Run(recording, core, report)
         for done, row in enumerate(recording.rows()):
             run.take(row)
             if progress is not None and done % PROGRESS_ROWS == 0:
@@ -166,6 +172,7 @@ class _Run:
         self.simulating = True
         self._core = core
         self._chain: bytes | None = header_root(recording.header)
+        self._stored_chain: bytes | None = None  # of the last row, when it is not what it ought to be
         self._now_ns: int | None = None
         self._keyframes = recording.keyframes()
         self._next_keyframe = next(self._keyframes, None)
@@ -173,21 +180,31 @@ class _Run:
 
     def take(self, row: JournalRow) -> None:
         """Checks one row, simulates it, and meets the keyframe taken after it."""
-        problem = check_fields(row) if self._chain is None else check_row(self._chain, row)
+        problem = self._check(row)
         expected = self.last_step + 1
-        if row.step != expected and not (problem and problem.field == "step"):
+        is_step = problem is not None and problem.field == "step"
+        if row.step != expected and not is_step:
             self._gap(expected, row.step - 1)
             problem = check_fields(row)
         elif problem is None and self._now_ns is not None and row.now_ns < self._now_ns:
             problem = RowProblem(row.step, "now_ns", "session time goes back")
+        self.last_step = expected if is_step else row.step
         if problem is not None:
-            self.found(Problem(expected, "changed", problem.field, problem.text, problem.entry))
-        # A changed chain value is known from the one before it; after any other change the stored one is right.
-        is_chain = problem is not None and problem.field == "chain" and self._chain is not None
-        self._chain = chain_of(self._chain, row) if is_chain and self._chain is not None else row.chain
-        self.last_step = row.step if problem is None or problem.field != "step" else expected
-        self._simulate(row)
+            self.found(Problem(self.last_step, "changed", problem.field, problem.text, problem.entry))
+        # A changed chain value follows from the one before it, unless it was that one that was changed: see `_check`.
+        bad_chain = problem is not None and problem.field == "chain" and self._chain is not None
+        self._stored_chain = row.chain if bad_chain else None
+        self._chain = chain_of(self._chain, row) if bad_chain and self._chain is not None else row.chain
+        self._simulate(row, compare=problem is None or problem.field != "digest")
         self._meet_keyframe(self.last_step)
+
+    def _check(self, row: JournalRow) -> RowProblem | None:
+        if self._chain is None:
+            return check_fields(row)
+        problem = check_row(self._chain, row)
+        if problem is not None and problem.field == "chain" and self._stored_chain is not None:
+            return check_row(self._stored_chain, row)
+        return problem
 
     def end(self, mark: tuple[int, bytes] | None) -> None:
         """Checks that the rows reach as far as the recorder noted at its end."""
@@ -210,7 +227,7 @@ class _Run:
         self._chain = None
         self._meet_keyframe(last)
 
-    def _simulate(self, row: JournalRow) -> None:
+    def _simulate(self, row: JournalRow, *, compare: bool) -> None:
         elapsed = 0 if self._now_ns is None else max(0, row.now_ns - self._now_ns)
         self._now_ns = row.now_ns
         if not self.simulating:
@@ -223,10 +240,9 @@ class _Run:
         try:
             digest = self._core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
         except Exception as error:  # changed bytes may mean anything to the core; what came of it is the finding
-            why = f"the step cannot be taken again: {type(error).__name__}: {' '.join(str(error).split())}"
-            self._diverged("entries", why)
+            self._diverged("entries", f"the step cannot be taken again: {_one_line(error)}")
             return
-        if digest != row.digest:
+        if compare and digest != row.digest:
             self._diverged("digest", "the simulation gives another result than the recording")
 
     def _diverged(self, field: str, text: str) -> None:
@@ -248,13 +264,23 @@ class _Run:
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         if self._chain is not None and keyframe.chain != self._chain:
-            self.found(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
+            if keyframe.step < 0:
+                text = "the header is not the one that the journal was begun with"
+                self.found(Problem(keyframe.step, "changed", "header", text))
+            else:
+                self.found(Problem(keyframe.step, "changed", "chain", "keyframe: it belongs to another journal"))
             return
         self._chain = keyframe.chain
         if self._core is None:
             self.simulating = True
         elif not self.simulating:
-            self._core.restore(keyframe)
+            try:
+                self._core.restore(keyframe)
+            except Exception as error:  # snapshots of another version may mean anything to the core
+                self.found(
+                    Problem(keyframe.step, "divergence", "keyframe", f"it cannot be restored: {_one_line(error)}")
+                )
+                return
             self.simulating = True
         else:
             mine = self._core.keyframe(keyframe.step)
@@ -271,3 +297,7 @@ class _Run:
             self.report.problems.append(problem)
         else:
             self.report.more_problems += 1
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

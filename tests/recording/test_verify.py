@@ -11,7 +11,7 @@ import pytest
 
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
-from iris_session.recording import Recording, verify
+from iris_session.recording import Recording, SessionHeader, verify
 from iris_session.recording.journal import Keyframe, make_row, seal
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
@@ -47,6 +47,9 @@ def test_a_changed_field_is_named_with_its_step(path: Path, field: str) -> None:
     first = report.problems[0]
     assert (first.step, first.field, first.kind) == (120, field, "changed")
     assert f"step 120, {field}" in report.line()
+    changed = [p for p in report.problems if p.kind == "changed"]
+    assert len(changed) == 1, "the rows behind it are as they were"
+    assert report.steps == (200 if field in {"digest", "chain"} else 171)
 
 
 def test_a_changed_step_number_is_no_gap(path: Path) -> None:
@@ -136,10 +139,19 @@ def test_a_sealed_keyframe_of_another_state_is_a_divergence(path: Path) -> None:
     assert [(p.step, p.field, p.kind) for p in report.problems] == [(99, "authority", "divergence")]
 
 
-def test_another_header_breaks_the_chain_of_the_first_row(path: Path) -> None:
+def test_another_header_is_named(path: Path) -> None:
     header, batch = journal(50)
     report = verify(write(path, msgspec.structs.replace(header, config=b"easier"), batch), SmallCore)
-    assert (report.problems[0].field, report.problems[0].kind) == ("chain", "changed")
+    assert [(p.step, p.field) for p in report.problems] == [(-1, "header"), (0, "chain")]
+
+
+def test_a_core_that_cannot_be_built_is_in_the_report(path: Path) -> None:
+    def refuse(header: SessionHeader) -> SmallCore:
+        raise ValueError("config of\nversion 9")
+
+    report = verify(write(path, *journal(50)), refuse)
+    assert not report.ok
+    assert report.problems[0].text.endswith("ValueError: config of version 9")
 
 
 def test_an_open_session_takes_the_plant_from_its_rows(path: Path) -> None:
