@@ -85,7 +85,7 @@ def test_the_scene_is_static_in_the_frames_that_move(tmp_path: Path) -> None:
 
 
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
-    q = (0.5, 0.5, -0.5, 0.5)
+    q = (0.8, 0.2, -0.4, 0.4)
     shape = scene.Shape("c", "b", "b", scene.CAPSULE, (1.0, 2.0, 3.0), q, (1, 2, 3, 4), (0.1, 0.25))
     poses = _drawing(shape)[1]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
