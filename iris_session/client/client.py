@@ -11,6 +11,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import zmq
@@ -322,20 +323,21 @@ class Client(SceneView, Requests):
         with self._lock:
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            now, phase = time.monotonic_ns(), self.connection.phase
+            phase = self.connection.phase
             state, progressed = self._drain_state()
+        if state is not None and self.on_state is not None:
+            self.on_state(state)
+        with self._lock:
             if self._sockets.disconnected() and self._generation == self.connection.generation:
-                self.connection.lost(now)
-            progressed |= self._drain_control(now)
-            self.connection.tick(now)
+                self.connection.lost(time.monotonic_ns())
+            progressed |= self._drain_control()
+            self.connection.tick(time.monotonic_ns())
             self._flush()
             progressed |= self.connection.phase is not phase
             inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
             for message in inbox:
                 if isinstance(message, Feedback):
                     self.feedback[message.robot] = message
-        if state is not None and self.on_state is not None:
-            self.on_state(state)
         for message in inbox:
             self._call_back(message)
         return progressed
@@ -344,11 +346,14 @@ class Client(SceneView, Requests):
         messages = self._sockets.drain_state()
         state = self.connection.stream.drain(messages, self.session_now_ns())
         if state is not None:
+            now_ns = self.session_now_ns()  # decoding is part of the age
+            state = replace(state, received_ns=now_ns, age_ns=now_ns - state.header.session_time)
             self._state = state
         return state, bool(messages)
 
-    def _drain_control(self, now_ns: int) -> bool:
+    def _drain_control(self) -> bool:
         messages = self._sockets.drain_control()
+        now_ns = time.monotonic_ns()  # after receiving: a pong stamped too early would understate its round trip
         for frames in messages:
             self.connection.receive(frames, now_ns)
         if self.connection.joined and self.connection.welcome is not None:
