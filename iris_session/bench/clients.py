@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from anchors.pose import PoseTuple
-from iris_session.client import Client, CurveKeys, SceneState, wait_any
+from iris_session.client import Client, ClientGroup, CurveKeys, SceneState
 from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device
 
@@ -141,18 +141,22 @@ def run(job: Job) -> None:
     print("ready", flush=True)
     selector = selectors.DefaultSelector()
     selector.register(sys.stdin, selectors.EVENT_READ)
+    group = ClientGroup([c.client for c in clients])
     begin = end = 0
+    cpu_s = time.process_time()
     while not end or _now(job) < end:
         now = _now(job)
         if not end and selector.select(0):
             begin, end = map(int, sys.stdin.readline().split())
+            cpu_s = time.process_time()
         for client in clients:
             client.recording = bool(end) and begin <= now < end
             client.step(now)
         wake = min(now + 20_000_000, *(c.next_ns for c in clients))
-        for ready in wait_any([c.client for c in clients], max(0.0, (wake - _now(job)) * 1e-9)):
+        for ready in group.wait(max(0.0, (wake - _now(job)) * 1e-9)):
             ready.poll(0.0)
-    _write(job, clients)
+    cpu_share = (time.process_time() - cpu_s) / ((end - begin) * 1e-9)
+    _write(job, clients, cpu_share)
     for client in clients:
         with contextlib.suppress(Exception):  # the session may have ended first
             client.client.close()
@@ -162,7 +166,7 @@ def _now(job: Job) -> int:
     return time.monotonic_ns() - job.origin_ns
 
 
-def _write(job: Job, clients: list[BenchClient]) -> None:
+def _write(job: Job, clients: list[BenchClient], cpu_share: float) -> None:
     columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.int64 | np.float64]]] = {}
     for client in clients:
         name = client.spec.name
@@ -175,6 +179,7 @@ def _write(job: Job, clients: list[BenchClient]) -> None:
         columns[f"{name}.counts"] = np.array(
             [client.sent, client.overflow, counters.superseded, counters.rigid_messages, counters.rigid_bytes], np.int64
         )
+        columns[f"{name}.cpu_share"] = np.array([cpu_share / len(clients)])
         if job.keep_poses:
             columns[f"{name}.poses"] = np.array(client.poses)
     np.savez(job.log, allow_pickle=False, **columns)

@@ -46,6 +46,7 @@ def run_state(
         "max_position_error_mm": round(position_mm, 5),
         "max_rotation_error_deg": round(rotation_deg, 5),
         "server_cpu_share": round(got.cpu_share, 3),
+        "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in got.logs.values()])), 4),
         "late_tick_share": round(got.stats.late_share, 6),
         "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
         "ticks": got.stats.ticks,

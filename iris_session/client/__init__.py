@@ -19,10 +19,11 @@ from iris_session.client.interpolation import PoseBuffer, Shown
 from iris_session.client.session_state import SessionMirror
 from iris_session.client.sockets import CurveKeys
 from iris_session.client.state_stream import SceneState
-from iris_session.client.waiting import poll_all, wait_any
+from iris_session.client.waiting import ClientGroup, poll_all, wait_any
 
 __all__ = [
     "Client",
+    "ClientGroup",
     "CurveKeys",
     "Identity",
     "PoseBuffer",

@@ -171,6 +171,11 @@ class Client(SceneView, Requests):
             raise self.connection.failure
         return progressed
 
+    @property
+    def registration(self) -> tuple[int, bool]:
+        """Changes when `register` would add something else than before."""
+        return self._sockets.version, self.connection.peek_outgoing() is not None
+
     def register(self, poller: zmq.Poller) -> None:
         """Adds our sockets to `poller`; `poll` is due when they wake it and at `connection.next_deadline_ns`."""
         if self.connection.phase is not Phase.CLOSED:

@@ -68,6 +68,8 @@ class ClientSockets:
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: zmq.Socket[bytes] | None = None
         self._state_port = 0
+        #: Changes whenever a socket is opened or closed.
+        self.version = 0
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_out.setblocking(False)
         self._wake_in.setblocking(False)
@@ -84,6 +86,7 @@ class ClientSockets:
         self._monitor = control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         control.connect(f"tcp://{self._host}:{self._control_port}")
         self._control = control
+        self.version += 1
 
     def open_state(self, port: int) -> None:
         """Subscribes to the state channel. Does nothing when that port is connected already."""
@@ -100,6 +103,7 @@ class ClientSockets:
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
         state.connect(f"tcp://{self._host}:{port}")
         self._state, self._state_port = state, port
+        self.version += 1
 
     def send_control(self, data: bytes) -> bool:
         """Sends without waiting. False: the socket cannot take it now."""
@@ -151,6 +155,7 @@ class ClientSockets:
 
     def close(self) -> None:
         """Closes everything; a last bye still has `LINGER_MS` to leave."""
+        self.version += 1
         self._close_control(linger_ms=LINGER_MS)
         if self._state is not None:
             self._state.close(linger=0)

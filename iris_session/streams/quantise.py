@@ -66,19 +66,20 @@ def rotations(codes: Words) -> Floats:
     rest = codes >> _TWO
     high = rest // _LEVELS  # division of unsigned integers by a constant is vectorised, divmod is not
     c = high // _LEVELS
-    parts = np.empty((n, 4))
-    parts[:, 0] = rest - high * _LEVELS
-    parts[:, 1] = high - c * _LEVELS
-    parts[:, 2] = c
-    parts -= _HALF
-    parts /= _PER_UNIT
-    parts[:, 3] = 0.0
-    squares = np.einsum("ij,ij->i", parts, parts)
+    parts = np.empty((4, n))  # a component in a row: whole rows are several times faster than columns
+    sent = parts[:3]
+    parts[0] = rest - high * _LEVELS
+    parts[1] = high - c * _LEVELS
+    parts[2] = c
+    sent -= _HALF
+    sent *= 1.0 / _PER_UNIT
+    squares = (sent * sent).sum(axis=0)
     if n and not (squares.max() <= _MAX_SQUARES and c.max() < _LEVELS):
         raise StreamError("a rotation code stands for no unit quaternion")
-    np.sqrt(1.0 - squares, out=parts[:, 3])
+    np.sqrt(1.0 - squares, out=parts[3])
     order = _PLACES.take((codes & _THREE).view(np.int64), axis=0)
-    order += np.arange(0, 4 * n, 4)[:, None]
+    order *= n
+    order += np.arange(n)[:, None]
     q: Floats = parts.take(order)
     return q
 
@@ -90,7 +91,8 @@ def pack_words(words: npt.NDArray[Any], n_bytes: int) -> bytes:
 
 def unpack_words(data: bytes | memoryview, n_bytes: int) -> Words:
     """Inverse of `pack_words`; `len(data)` must be a multiple of `n_bytes`."""
-    wide = np.zeros((len(data) // n_bytes, 8), np.uint8)
-    wide[:, :n_bytes] = np.frombuffer(data, np.uint8).reshape(-1, n_bytes)
-    words: Words = wide.view("<u8").reshape(-1).astype(np.uint64, copy=False)
+    n = len(data) // n_bytes
+    # Eight bytes are read at every n_bytes: what follows each word is masked off, and the last one needs room.
+    wide = np.ndarray((n,), "<u8", bytes(data) + bytes(8 - n_bytes), strides=(n_bytes,))
+    words: Words = wide & np.uint64(2 ** (8 * n_bytes) - 1)
     return words

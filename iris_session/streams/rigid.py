@@ -346,10 +346,12 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask, Floats, n
     ux, uy = np.uint64(nx), np.uint64(ny)
     rest = codes // ux
     z = rest // uy
-    poses[:, 0] = codes - rest * ux
-    poses[:, 1] = rest - z * uy
-    poses[:, 2] = z
-    poses[:, :3] += (ox, oy, oz)
-    poses[:, :3] *= LATTICE_M
+    xyz = np.empty((3, n_quantised))
+    xyz[0] = codes - rest * ux
+    xyz[1] = rest - z * uy
+    xyz[2] = z
+    xyz += np.array([[ox], [oy], [oz]], np.float64)
+    xyz *= LATTICE_M
+    poses[:, :3] = xyz.T
     poses[:, 3:] = rotations(unpack_words(view[at_rotations:at_escapes], ROTATION_BYTES))
     return mask, poses, escapes

@@ -81,7 +81,7 @@ class Downlink:
         elif kind == link.DECIDED:
             self._decided(link.decode_decided(frames[1]))
         elif kind == link.PRESENCE:
-            self._publisher.publish_presence(self.heard_ns, link.decode_presence(frames[1]))
+            self._publisher.publish_presence(self.heard_ns, frames[1])
         elif kind == link.SCENE:
             self._publisher.set_scene(link.decode_scene(frames[1]))
         elif kind == link.END:

@@ -24,6 +24,10 @@ _POLL_BOUND: Final = 64
 _SEND_QUEUE: Final = 256
 #: Decisions kept while the front does not read; when they are full the front is given up.
 _BACKLOG: Final = 4096
+#: Presence follows a state frame, so that clients are woken once for both; alone when no state came for so long.
+PRESENCE_ALONE_NS: Final = 50_000_000
+#: State frames come at tick times, so their distance varies by a tick.
+PRESENCE_SLACK_NS: Final = 4_000_000
 
 
 class FrontLink:
@@ -112,13 +116,16 @@ class FrontLink:
             decided = messages.Decided(step, decision.admitted, decision.outgoing, decision.events, decision.dropped)
             self._send(messages.DECIDED, messages.encoder.encode(decided))
         now_ns = self._monotonic_ns()
-        if self._presence and now_ns - self._presence_ns >= self._config.presence_period_ns:
-            self._presence_ns = now_ns
-            items = tuple(self._presence.values())
-            self._presence.clear()
-            self._send(messages.PRESENCE, messages.encoder.encode(items))
+        if self._presence and now_ns - self._presence_ns >= PRESENCE_ALONE_NS:
+            self._send_presence(now_ns)
         elif now_ns - self._sent_ns > messages.KEEPALIVE_NS:
             self._send(messages.ALIVE, b"")
+
+    def _send_presence(self, now_ns: int) -> None:
+        self._presence_ns = now_ns
+        items = tuple(self._presence.values())
+        self._presence.clear()
+        self._send(messages.PRESENCE, messages.encoder.encode(items))
 
     def send_state(self, header: StateHeader, poses: npt.NDArray[np.float64]) -> None:
         """State after a tick: `poses` (n, 7) float64 C-contiguous, `x y z qw qx qy qz`, world, in the order of the
@@ -133,6 +140,8 @@ class FrontLink:
             self._sent_ns = self._monotonic_ns()
         except zmq.Again:
             self.state_drops += 1
+        if self._presence and self._sent_ns - self._presence_ns >= self._config.presence_period_ns - PRESENCE_SLACK_NS:
+            self._send_presence(self._sent_ns)
 
     def send_scene(self, scene: SceneInfo) -> None:
         """Another scene: later snapshots and states are of its bodies."""

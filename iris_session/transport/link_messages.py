@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.server_messages import Event, PresenceItem
+from iris_session.protocol.server_messages import Event
 from iris_session.protocol.steps import Admitted, Dropped, Outgoing
 from iris_session.transport.config import Ports, SceneInfo
 
@@ -62,7 +62,6 @@ class FrontStatus(msgspec.Struct, frozen=True):
 
 encoder: Final = msgspec.msgpack.Encoder()
 decode_decided: Final = msgspec.msgpack.Decoder(Decided).decode
-decode_presence: Final = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 decode_status: Final = msgspec.msgpack.Decoder(FrontStatus).decode
 decode_ports: Final = msgspec.msgpack.Decoder(Ports).decode
 decode_scene: Final = msgspec.msgpack.Decoder(SceneInfo).decode

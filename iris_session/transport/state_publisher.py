@@ -8,13 +8,21 @@ import msgspec
 import numpy as np
 import zmq
 
-from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, Presence, PresenceItem, StateHeader
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, StateHeader
 from iris_session.streams.rigid import RigidEncoder
 from iris_session.transport.config import SceneInfo
 
 POSE_BYTES = 56  # seven float64
 _encoder = msgspec.msgpack.Encoder()
 _decode_header = msgspec.msgpack.Decoder(StateHeader).decode
+
+
+class _RawPresence(msgspec.Struct, array_like=True):
+    """`Presence` on the wire, its items encoded already."""
+
+    session_time: int
+    published_ns: int
+    items: msgspec.Raw
 
 
 class StatePublisher:
@@ -62,8 +70,9 @@ class StatePublisher:
         self.frames += 1
         return True
 
-    def publish_presence(self, session_time: int, items: tuple[PresenceItem, ...]) -> None:
-        presence = Presence(session_time, self._now_ns(), items)
+    def publish_presence(self, session_time: int, items: bytes) -> None:
+        """`items`: encoded array of `PresenceItem`, passed on as it is."""
+        presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
         self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
 
     def keyframe(self) -> tuple[int, bytes]:

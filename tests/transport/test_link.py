@@ -109,22 +109,29 @@ def test_only_what_leaves_the_process_is_sent_and_silence_is_broken(pair: Pair) 
     assert messages.decode_decided(decided[1]) == messages.Decided(4, events=EVENT.events)
 
 
-def test_presence_is_latest_per_device_at_its_rate(pair: Pair) -> None:
+def test_presence_is_latest_per_device_and_follows_the_state(pair: Pair) -> None:
     pair.ready()
+    decode = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 
     def at(step: int, *devices: str) -> Decision:
         return Decision((), presence=tuple(PresenceItem("p1", device, IDENTITY, step) for device in devices))
 
+    def sent() -> list[list[tuple[str, int]]]:
+        heard = [frames for frames in pair.heard() if frames[0] != messages.ALIVE]
+        return [[(i.device, i.capture_ns) for i in decode(f[1])] if f[0] == messages.PRESENCE else [] for f in heard]
+
     pair.link.send_decision(1, at(1, "head"))
+    pair.heard()
     pair.link.send_decision(2, at(2, "head", "hand/left"))
     pair.link.send_decision(3, at(3, "head"))
-    pair.now_ns += 20_000_000
-    pair.link.send_decision(4, Decision(()))
-    presence = [messages.decode_presence(f[1]) for f in pair.heard() if f[0] == messages.PRESENCE]
-    assert [[(i.device, i.capture_ns) for i in items] for items in presence] == [
-        [("head", 1)],
-        [("head", 3), ("hand/left", 2)],
-    ]
+    pair.now_ns += 16_000_000
+    pair.link.send_state(StateHeader(1, 0, 0, 0.0, 0, 0, 0, 0), np.zeros((1, 7)))
+    assert sent() == [[], [("head", 3), ("hand/left", 2)]]  # the state, and right after it who is where
+    pair.link.send_decision(4, at(4, "head"))
+    assert sent() == []
+    pair.now_ns += link_module.PRESENCE_ALONE_NS
+    pair.link.send_decision(5, Decision(()))
+    assert sent() == [[("head", 4)]]  # no state came: presence does not wait for ever
 
 
 def test_a_front_that_reads_nothing_loses_states_but_no_decision_until_it_is_given_up(
