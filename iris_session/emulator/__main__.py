@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
+
+#: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`.
+LISTS: Final = frozenset({"eye", "recentre_at_s"})
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -48,6 +51,8 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         specs += msgspec.json.decode(data, type=list[HeadsetSpec])
     for text in options.headset:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
+        for key in LISTS & pairs.keys():
+            pairs[key] = [float(value) for value in pairs[key].split("/")]
         specs.append(msgspec.convert(pairs, HeadsetSpec, strict=False))
     if not specs:
         raise ValueError("no headset: give --headset name=ann,behaviour=giver,robot=left or --specs FILE")

@@ -186,6 +186,7 @@ class World:
         self._load_state(state)
         if state == self._shown_state:  # shown already: only inputs may have been written since
             mujoco.mj_setState(self.model, self._shown, self._state, STATE)
+            self.diverged = ""
             return
         self._show(round(float(self._state[0]) / float(self.model.opt.timestep)))
 

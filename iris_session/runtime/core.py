@@ -18,7 +18,7 @@ from iris_session.authority import Authority, AuthorityConfig
 from iris_session.control import ControlConfig, Controller
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
-from iris_session.protocol.entries import Entry
+from iris_session.protocol.entries import HOST, Entry, ExternalReset
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision
 
@@ -85,6 +85,8 @@ class SessionCore:
         if decision.reset:
             self._reset_world()
             self.controller.reset(world.data)
+        elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
+            self.controller.reset(world.data)  # the owner moved the robots: they hold where they stand now
         self.controller.begin(now_ns, n_ticks, decision, world.view())
         for _ in range(0 if world.diverged else n_ticks):
             self.controller.tick(world.data)

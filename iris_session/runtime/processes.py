@@ -80,6 +80,7 @@ class SessionProcesses:
         self._front_watch = _Watch()
         self._recorder_watch = _Watch()
         self._next_watch_ns = 0
+        self._address = ""
 
     def start(self) -> None:
         """Starts the recorder, then the front; ends both again when one fails."""
@@ -89,7 +90,8 @@ class SessionProcesses:
                 self.recorder.start()
                 self.feed = RecorderFeed(self.recorder.feed_endpoint, self.recording.parent)
             self.front = FrontProcess(self._front_config(), self._scene)
-            self.front.start()
+            ports = self.front.start()
+            self._address = f"{ports.host}:{ports.control}"
         except BaseException:
             self.close()
             raise
@@ -113,10 +115,8 @@ class SessionProcesses:
 
     @property
     def address(self) -> str:
-        """`host:port` of the control channel."""
-        assert self.front is not None
-        ports = self.front.link.ports
-        return "" if ports is None else f"{ports.host}:{ports.control}"
+        """`host:port` of the control channel; it stays the same when the front is replaced."""
+        return self._address
 
     def make_stepper(self, core: SessionCore, clock: Callable[[], int], *, user_owned: bool) -> Stepper:
         """The stepper of this session's core, tied to the front's link and the recorder's feed."""
@@ -155,8 +155,9 @@ class SessionProcesses:
             self.front.restart()
             stepper.post(Marker(request_id=0, text="the front process ended and was replaced"))
         if self.recorder is not None and not self.recorder.alive and self._recorder_watch.dead(now_ns):
+            failure = self.recorder.failure or "the recorder ended"
             self.recorder.restart()
-            stepper.post(Marker(request_id=0, text="the recorder process ended and was replaced"))
+            stepper.post(Marker(request_id=0, text=f"{failure}; it was replaced"))
 
     @property
     def front_pid(self) -> int:

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.client_messages import Control, Marker
 from iris_session.protocol.common import Applied
-from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap, StalledGap
+from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import JournalRow, Keyframe, make_row
 from iris_session.runtime.core import SessionCore, StepOutcome
 from iris_session.runtime.status import SessionLedger
 
-#: A pause between steps above which robots must be clutched again (the freshness bound of samples, DESIGN 5.3).
-GAP_NS: Final = 150_000_000
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
 MAX_HOST_ENTRIES: Final = 256
 
@@ -122,7 +120,8 @@ class Stepper:
         if self.on_entries is not None:
             self.on_entries(entries)
         if outcome.diverged and (self.last is None or not self.last.diverged):
-            self.post(Control(request_id=0, action="pause"))
+            if not plant:  # a user's loop is not ours to pause
+                self.post(Control(request_id=0, action="pause"))
             self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
@@ -134,10 +133,9 @@ class Stepper:
         return outcome
 
     def _gather(self, now_ns: int) -> list[Entry]:
+        """Host entries first. A long time between two steps is no entry: the authority sees it in `now_ns`."""
         entries = self.front.poll()
         host: list[Entry] = []
-        if self._last_now_ns >= 0 and now_ns - self._last_now_ns > GAP_NS:
-            host.append(Entry(HOST, HOST, now_ns, StalledGap(now_ns - self._last_now_ns)))
         while self._host:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
         return host + entries if host else entries

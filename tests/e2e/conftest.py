@@ -6,7 +6,6 @@ Everything waits on conditions with a deadline; everything that was started is e
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -14,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -22,8 +22,8 @@ from anchors.pose import PoseTuple
 from iris_session.client import Client
 from iris_session.protocol.server_messages import Event
 
-DEADLINE_S = 20.0
-_COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
+DEADLINE_S = 30.0
+COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
 
 
 def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
@@ -35,17 +35,65 @@ def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE
         time.sleep(0.005)
 
 
-class Server:
-    """One `iris-session serve` process and its recording."""
+def iris(*arguments: str, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """Runs one command to its end."""
+    return subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, check=False, cwd=cwd, timeout=timeout_s
+    )
 
-    def __init__(self, folder: Path, scene: str, arguments: Sequence[str]) -> None:
-        self.recording = folder / "session.rrd"
+
+def relatives(pid: int) -> list[psutil.Process]:
+    """All processes below `pid`, to look at after it ended."""
+    return psutil.Process(pid).children(recursive=True)
+
+
+def none_left(processes: Sequence[psutil.Process], timeout_s: float = 10.0) -> None:
+    """Fails when one of `processes` does not end by itself; ends it then."""
+    _, alive = psutil.wait_procs(list(processes), timeout=timeout_s)
+    text = [f"{p.pid} {' '.join(p.cmdline())}" for p in alive if p.is_running()]
+    for p in alive:
+        p.kill()
+    assert not text, f"left behind: {text}"
+
+
+def tails(folder: Path) -> str:
+    """The last lines of everything that the processes of this test said."""
+    return "\n".join(f"--- {p.name}\n{p.read_text(errors='replace')[-1500:]}" for p in sorted(folder.rglob("*.out")))
+
+
+def front_and_recorder(pid: int) -> dict[str, psutil.Process]:
+    """The children of a session's process by name."""
+    found = {}
+    for child in psutil.Process(pid).children():
+        line = " ".join(child.cmdline())
+        for name in ("transport.front", "recording.process"):
+            if name in line:
+                found[name] = child
+    return found
+
+
+def verify(recording: Path, status: int = 0) -> dict[str, Any]:
+    """Report of `iris-session verify --json`, which must exit with `status`."""
+    done = iris("verify", "--json", str(recording), cwd=recording.parent)
+    assert done.returncode == status, (done.stdout[-2000:], done.stderr[-2000:])
+    report: dict[str, Any] = json.loads(done.stdout)["files"][0]
+    return report
+
+
+def serve_command(scene: str, recording: Path, *arguments: str) -> list[str]:
+    ports = ["--control-port", "0", "--state-port", "0"]
+    return [*COMMAND, "serve", scene, *ports, "--record", str(recording), *arguments]
+
+
+class Server:
+    """One process with a session and its recording. It must print `on HOST:PORT,` and `recording to`."""
+
+    def __init__(self, folder: Path, recording: Path, command: Sequence[str]) -> None:
+        self.folder = folder
+        self.recording = recording
         self._out = folder / "serve.out"
-        options = ["--control-port", "0", "--state-port", "0", "--record", str(self.recording), *arguments]
         with self._out.open("wb") as out:
-            self.process = subprocess.Popen(
-                [*_COMMAND, "serve", scene, *options], stdout=out, stderr=subprocess.STDOUT, cwd=folder
-            )
+            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=folder)
         wait(lambda: "recording to" in self.output or self.process.poll() is not None, "the session listens")
         match = re.search(r"on (\S+:\d+),", self.output)
         assert match, self.output
@@ -57,34 +105,22 @@ class Server:
 
     def children(self) -> dict[str, psutil.Process]:
         """Front and recorder by name."""
-        found = {}
-        for child in psutil.Process(self.process.pid).children():
-            line = " ".join(child.cmdline())
-            for name in ("transport.front", "recording.process"):
-                if name in line:
-                    found[name] = child
-        return found
+        return front_and_recorder(self.process.pid)
 
     def stop(self) -> None:
         """Ctrl-C; the process must end in order."""
         self.process.send_signal(signal.SIGINT)
         assert self.process.wait(DEADLINE_S) == 0, self.output
 
-    def verify(self) -> dict[str, object]:
-        """`iris-session verify --json` of the recording; it must be identical."""
-        done = subprocess.run(
-            [*_COMMAND, "verify", "--json", str(self.recording)], capture_output=True, text=True, check=False
-        )
-        report: dict[str, object] = json.loads(done.stdout)
-        assert done.returncode == 0, report
-        return report
+    def verify(self) -> dict[str, Any]:
+        """`iris-session verify --json` of the recording; it must be identical. Gives the report of the file."""
+        return verify(self.recording)
 
-    def finish(self) -> dict[str, object]:
+    def finish(self) -> dict[str, Any]:
         """Stops and verifies; nothing may stay behind."""
-        children = list(self.children().values())
+        children = relatives(self.process.pid)
         self.stop()
-        _, alive = psutil.wait_procs(children, timeout=5.0)
-        assert not alive, alive
+        none_left(children)
         return self.verify()
 
 
@@ -178,7 +214,7 @@ class Stage:
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
-                pytest.fail(f"not within {timeout_s:g} s: {what}\n{self.server.output[-2000:]}")
+                pytest.fail(f"not within {timeout_s:g} s: {what}\n{tails(self.server.folder.parent)}")
             self.step()
 
     def seconds(self, seconds: float) -> None:
@@ -203,17 +239,23 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Server]]:
     def start(scene: str = "handover", *arguments: str) -> Server:
         folder = tmp_path / f"server{len(servers)}"
         folder.mkdir()
-        server = Server(folder, scene, arguments)
+        recording = folder / "session.rrd"
+        server = Server(folder, recording, serve_command(scene, recording, *arguments))
         servers.append(server)
         return server
 
     yield start
+    end_all(servers)
+
+
+def end_all(servers: Sequence[Server]) -> None:
+    """Ends what a failed test left running."""
     for server in servers:
-        children = list(server.children().values()) if server.process.poll() is None else []
         if server.process.poll() is None:
+            children = relatives(server.process.pid)
             server.process.kill()
             server.process.wait()
-        psutil.wait_procs(children, timeout=5.0)
+            psutil.wait_procs(children, timeout=5.0)
 
 
 @pytest.fixture
@@ -225,17 +267,16 @@ def stage(serve: Callable[..., Server]) -> Iterator[Stage]:
 
 
 @pytest.fixture
-def emulate() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """Starts emulated people in a process of their own."""
+def emulate(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts emulated people in a process of their own; what they say is shown when a condition fails."""
     started: list[subprocess.Popen[bytes]] = []
 
-    def start(address: str, *headsets: str, seconds: float = 60.0) -> subprocess.Popen[bytes]:
+    def start(address: str, *headsets: str, seconds: float = 100.0) -> subprocess.Popen[bytes]:
         options = [x for headset in headsets for x in ("--headset", headset)]
-        process = subprocess.Popen(
-            [*_COMMAND, "emulate", address, *options, "--seconds", str(seconds), "--json"],
-            stdout=subprocess.DEVNULL,
-            env={**os.environ},
-        )
+        with (tmp_path / f"emulator{len(started)}.out").open("wb") as out:
+            process = subprocess.Popen(
+                [*COMMAND, "emulate", address, *options, "--seconds", str(seconds)], stdout=out, stderr=out
+            )
         started.append(process)
         return process
 

@@ -170,6 +170,9 @@ def test_wrong_version_is_refused_with_what_is_supported(serve: Callable[..., Se
         socket.close()
     finally:
         context.term()
+    stage = Stage(server)
+    stage.join("ann")  # the session takes others as before
+    stage.close()
     server.finish()
 
 
