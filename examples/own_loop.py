@@ -1,0 +1,34 @@
+"""A loop of your own that says where a tick begins and ends, so that clients see exactly what `mj_step` made.
+
+python examples/own_loop.py            then, elsewhere: iris-session emulate --behaviour wander
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import mujoco
+
+from iris_session import Session, SessionConfig
+from iris_session.physics.scenes import scene_path
+
+
+def main(seconds: float) -> None:
+    model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    with Session(model, data, SessionConfig(name="own-loop", record=False)) as session:
+        print(f"join at {session.address}", flush=True)
+        begun = time.monotonic()
+        while data.time < seconds:
+            session.begin_tick()  # writes data.ctrl of the robots that somebody drives, or that hold
+            mujoco.mj_step(model, data)
+            session.end_tick()  # publishes the new state
+            time.sleep(max(0.0, begun + data.time - time.monotonic()))
+        for person in session.status().participants:
+            print(f"{person.name} ({person.role}) drives {', '.join(person.robots) or 'nothing'}")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0)

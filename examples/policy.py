@@ -1,0 +1,45 @@
+"""A policy joins as a participant like any other: it takes a robot, moves its end effector in a circle, and leaves.
+
+iris-session serve handover            then: python examples/policy.py [HOST:PORT] [SECONDS]
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+
+from iris_session import Client, ClientError
+
+
+def main(address: str, seconds: float) -> None:
+    with Client(address, role="agent", name="policy", devices=("target",)) as client:
+        (lease,) = client.acquire()  # no name: the assignment policy of the session chooses
+        robot = lease.target
+        if not client.wait_for(lambda c: c.tip_pose(robot) is not None):
+            raise SystemExit("no state came within 5 s")
+        tip = client.tip_pose(robot)
+        assert tip is not None
+        (x, y, z), q = tip
+        period_ns = 1_000_000_000 // 60
+        begun = due = client.session_now_ns()
+        while client.session_now_ns() < begun + int(seconds * 1e9):
+            t = (client.session_now_ns() - begun) * 1e-9
+            angle, radius = 0.8 * t, 0.05 * min(1.0, t)
+            target = (x + radius * math.cos(angle), y + radius * math.sin(angle), z)
+            # The clutch must be seen open once before it closes: nothing moves by accident.
+            client.send_sample("target", (target, q), robots=[robot], clutch=t > 0.1)
+            due += period_ns
+            while client.session_now_ns() < due:
+                client.poll((due - client.session_now_ns()) * 1e-9)
+        feedback = client.feedback.get(robot)
+        rejected = dict(feedback.rejected) if feedback is not None else {}
+        moved = client.tip_pose(robot)
+        assert moved is not None
+        print(f"{robot}: tip moved {1e3 * math.dist(moved[0], (x, y, z)):.0f} mm, rejected samples: {rejected}")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:7721", float(sys.argv[2]) if len(sys.argv) > 2 else 20.0)
+    except ClientError as error:
+        raise SystemExit(f"policy: {error}") from None
