@@ -14,6 +14,7 @@ import math
 import selectors
 import sys
 import time
+import zlib
 from typing import Final
 
 import msgspec
@@ -56,7 +57,7 @@ class Job(msgspec.Struct, frozen=True):
 class BenchClient:
     """One client with its log."""
 
-    def __init__(self, job: Job, spec: ClientJob, index: int) -> None:
+    def __init__(self, job: Job, spec: ClientJob) -> None:
         self.spec = spec
         self._job = job
         curve = None
@@ -81,7 +82,7 @@ class BenchClient:
         self.poses: list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = []
         self.sent = 0
         self.overflow = 0
-        self._phase = 0.7 * index
+        self._phase = zlib.crc32(spec.name.encode()) / 2**32
         self._next_ns = 0
         self._open_samples = 5
 
@@ -109,7 +110,10 @@ class BenchClient:
         """Sends one sample of each device when it is time."""
         if not self.spec.samples or now_ns < self._next_ns:
             return
-        self._next_ns = max(self._next_ns + SAMPLE_NS, now_ns - SAMPLE_NS) if self._next_ns else now_ns + SAMPLE_NS
+        if not self._next_ns:  # independent headsets do not sample at the same instant
+            self._next_ns = now_ns + round(self._phase * SAMPLE_NS)
+            return
+        self._next_ns = max(self._next_ns + SAMPLE_NS, now_ns - SAMPLE_NS)
         t = now_ns * 1e-9
         for i, device in enumerate(DEVICES):
             robots = [self.spec.robot] if self.spec.robot and device == Device.CONTROLLER_RIGHT else []
@@ -119,7 +123,7 @@ class BenchClient:
 
     def _pose(self, t: float, device: int) -> PoseTuple:
         """A slow circle of 3 cm radius, so that inverse kinematics has work to do all the time."""
-        angle = 2.0 * math.pi * 0.25 * t + self._phase
+        angle = 2.0 * math.pi * (0.25 * t + self._phase)
         return ((0.03 * math.cos(angle), 0.03 * math.sin(angle), 1.0 + 0.1 * device), (1.0, 0.0, 0.0, 0.0))
 
     @property
@@ -133,7 +137,7 @@ def _seq_of(applied: tuple[Applied, ...], robot: str) -> int:
 
 def run(job: Job) -> None:
     """Joins, waits for the window, measures, writes the log."""
-    clients = [BenchClient(job, spec, i) for i, spec in enumerate(job.clients)]
+    clients = [BenchClient(job, spec) for spec in job.clients]
     for client in clients:
         client.join()
     gc.collect()
