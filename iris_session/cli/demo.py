@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(msgspec.to_builtins(result))
     else:
         print(summary(result))
-    return 0 if result.ok else 1
+    return 130 if result.interrupted else 0 if result.ok else 1
 
 
 def summary(result: DemoResult) -> str:

@@ -37,6 +37,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit status."""
     arguments = build_parser().parse_args(argv)
+    from iris_session.physics import AmbiguousModelError
+
     try:
         status: int = arguments.run(arguments)
     except KeyboardInterrupt:
@@ -49,6 +51,8 @@ def main(argv: list[str] | None = None) -> int:
         return error.status
     except expected_errors() as error:
         print(f"iris-session: {error}", file=sys.stderr)
+        if isinstance(error, AmbiguousModelError):  # to standard output: `iris-session robots scene.xml > robots.toml`
+            print(error.toml)
         return 2
     return status
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from typing import Any, Final
@@ -28,9 +29,13 @@ def main(argv: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
     say = _say_json if options.json else _say_line
-    reports = run_headsets(options.address, specs, options.seconds, say, lambda: bool(stopped))
-    for report in reports:
-        say(report, final=True)
+    try:
+        reports = run_headsets(options.address, specs, options.seconds, say, lambda: bool(stopped))
+        for report in reports:
+            say(report, final=True)
+    except BrokenPipeError:  # whoever started us is gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     return int(any(report.failed for report in reports))
 
 

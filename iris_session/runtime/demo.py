@@ -6,6 +6,7 @@ saw the object change hands by contact alone, and if the recording verifies bit 
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -90,7 +91,8 @@ def _nan_for_null(line: bytes) -> bytes:
 
 
 class DemoResult(msgspec.Struct, frozen=True):
-    """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet."""
+    """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet; nobody who
+    never was aligned."""
 
     ok: bool
     demo: str
@@ -105,6 +107,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     lateness_ms_p99: float
     state_age_ms_p99: dict[str, float]
     problems: tuple[str, ...]
+    interrupted: bool = False
 
 
 def handover_specs(seed: int) -> tuple[HeadsetSpec, HeadsetSpec]:
@@ -146,13 +149,20 @@ def run_handover(
         finally:
             for emulator in emulators:
                 emulator.close()
+        interrupted = session.stopping
         status = session.status()
         seconds = session.clock() * 1e-9
         recording = session.recording
     reports = {name: report for emulator in emulators for name, report in emulator.reports.items()}
-    verified, verification = _verify(recording)
-    problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
-    problems += [f"{name}: not done, at '{r.phase}'" for name, r in reports.items() if not (r.done or r.failed)]
+    # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
+    verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
+    problems = ["interrupted before its end"] if interrupted else []
+    problems += [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
+    problems += [
+        f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
+        for name, r in reports.items()
+        if not (r.done or r.failed)
+    ]
     if not status.handovers:
         problems.append("the detector saw no handover by contact alone")
     if verified is False:
@@ -169,11 +179,13 @@ def run_handover(
         alignment_mm={
             name: {"stated_p95": round(r.stated_error_mm, 2), "at_sheet": round(r.alignment_error_mm, 2)}
             for name, r in reports.items()
+            if math.isfinite(r.stated_error_mm)
         },
         late_tick_share=status.lateness.get("late_share", 0.0),
         lateness_ms_p99=round(status.lateness.get("p99_ms", 0.0), 3),
-        state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items()},
+        state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
+        interrupted=interrupted,
     )
 
 

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import datetime
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
-import mujoco
 import numpy as np
 
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.common import Pose
-from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import CLOSED, OPEN, RecorderFeed, RecorderProcess, SessionHeader, header_root, pack_model
 from iris_session.recording.versions import environment
 from iris_session.runtime.config import SessionConfig
@@ -63,16 +61,14 @@ class SessionProcesses:
     def __init__(
         self,
         config: SessionConfig,
-        model: mujoco.MjModel,
-        robots: Sequence[RobotSpec],
-        objects: Sequence[ObjectSpec],
+        world: World,
         origin_ns: int,
     ) -> None:
         self._config = config
         self._origin_ns = origin_ns
         self.session_id = secrets.token_hex(8)
         self.recording = config.recording_path()
-        self._scene, self._tick_period_ns = _scene_info(model, robots, objects)
+        self._scene, self._tick_period_ns = _scene_info(world), world.tick_period_ns
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
@@ -194,11 +190,7 @@ class SessionProcesses:
             self.recorder = None
 
 
-def _scene_info(
-    model: mujoco.MjModel, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]
-) -> tuple[SceneInfo, int]:
-    world = World(model, robots, objects)
+def _scene_info(world: World) -> SceneInfo:
     poses = np.zeros((len(world.bodies), 7))
     world.poses(poses)
-    scene = SceneInfo(world.scene_hash, world.robot_infos, world.bodies, poses.tobytes())
-    return scene, world.tick_period_ns
+    return SceneInfo(world.scene_hash, world.robot_infos, world.bodies, poses.tobytes())

@@ -37,11 +37,11 @@ from iris_session.protocol.server_messages import Event
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.core import CoreConfig, SessionCore, plant_state
-from iris_session.runtime.errors import OwnershipError
+from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.scheduling import tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
-from iris_session.runtime.stepper import Stepper, session_clock
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
 from iris_session.runtime.user_loop import UserLoop
 
 #: Zero-tick steps while paused come at 100 Hz (DESIGN 5 asks for at least 50 Hz).
@@ -73,8 +73,10 @@ class Session:
         self.origin_ns = time.monotonic_ns()
         self.clock = session_clock(self.origin_ns)
         self._processes: SessionProcesses | None = None
+        self._core: SessionCore | None = None
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
+        self._early: list[EntryMessage] = []  # posted before anybody drove the session
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
@@ -92,9 +94,12 @@ class Session:
         self.close()
 
     def start(self) -> None:
-        """Opens the sockets and the recording. Called by `with`. Participants can connect from here on."""
+        """Opens the sockets and the recording. Called by `with`. Participants can connect from here on.
+
+        Raises before it opens anything when the robots cannot be driven: `ControlError`, `PhysicsError`, `ConfigError`.
+        """
         if self._processes is None:
-            self._processes = SessionProcesses(self.config, self.model, self.robots, self.objects, self.origin_ns)
+            self._processes = SessionProcesses(self.config, self._make_core(user_owned=False).world, self.origin_ns)
             self._processes.start()
 
     def close(self) -> None:
@@ -151,6 +156,11 @@ class Session:
         """Ends `run()` after the step in progress. May be called from another thread or a signal handler."""
         self._stop.set()
 
+    @property
+    def stopping(self) -> bool:
+        """True from `stop()`, Ctrl-C, SIGTERM or `close()` on."""
+        return self._stop.is_set()
+
     @contextmanager
     def signals(self) -> Iterator[None]:
         """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
@@ -182,7 +192,8 @@ class Session:
 
     def targets(self) -> dict[str, Pose]:
         """End-effector targets `T_world_tip` per robot, for an environment's own controller."""
-        return dict(self._make_stepper(user_owned=self._user_loop is not None).core.controller.targets())
+        self._live()
+        return {} if self._core is None else dict(self._core.controller.targets())
 
     @classmethod
     def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
@@ -220,7 +231,12 @@ class Session:
 
     def post(self, message: EntryMessage) -> None:
         """Puts an input of the owner (connection 0, rights of a director) into the next step."""
-        self._make_stepper(user_owned=self._user_loop is not None).post(message)
+        if self._stepper is not None:
+            self._stepper.post(message)
+        elif len(self._early) < MAX_HOST_ENTRIES:
+            self._early.append(message)
+        else:
+            raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for the first step: call run() first")
 
     def pause(self) -> None:
         """Stops physics; leases, heartbeats and requests go on."""
@@ -290,12 +306,26 @@ class Session:
         return self._processes
 
     def _make_stepper(self, *, user_owned: bool) -> Stepper:
-        if self._stepper is None:
-            authority = msgspec.structs.replace(self.config.authority, user_owned_loop=user_owned)
-            initial = b"" if self.data is None else plant_state(self.model, self.data)
-            core_config = CoreConfig(authority, self.config.control, self.robots, self.objects, initial)
-            core = SessionCore(self.model, core_config)
-            self._stepper = self._live().make_stepper(core, self.clock, user_owned=user_owned)
+        if self._stepper is not None:
+            if user_owned != self._stepper.core.config.authority.user_owned_loop:
+                raise OwnershipError("one session is driven in one way: by run(), or by begin_tick() and end_tick()")
+        else:
+            live, core = self._live(), self._make_core(user_owned=user_owned)
+            self._stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
             if not user_owned:
                 self.data = core.world.data
+            for message in self._early:
+                self._stepper.post(message)
         return self._stepper
+
+    def _make_core(self, *, user_owned: bool) -> SessionCore:
+        """The core for the data as it is now; the one made at the start when nothing has changed since."""
+        authority = msgspec.structs.replace(self.config.authority, user_owned_loop=user_owned)
+        initial = b"" if self.data is None else plant_state(self.model, self.data)
+        config = CoreConfig(authority, self.config.control, self.robots, self.objects, initial)
+        if self._core is None or self._core.config != config:
+            try:
+                self._core = SessionCore(self.model, config)
+            except ValueError as error:  # the authority's own check of its numbers and names
+                raise ConfigError(str(error)) from error
+        return self._core

@@ -40,7 +40,8 @@ class FrontPort(Protocol):
 class RecorderPort(Protocol):
     """What the stepper needs of the recorder's feed."""
 
-    wants_keyframe: bool
+    @property
+    def wants_keyframe(self) -> bool: ...
 
     def row(self, row: JournalRow) -> None: ...
 
