@@ -1,0 +1,304 @@
+"""The documents tell the truth where a machine can check it: code runs, commands parse, links and files exist, no
+reason is missing from a table, and the command line reference has every option."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from iris_session import Session, SessionConfig
+from iris_session.cli.main import build_parser
+from iris_session.physics.scenes import scene_path
+from iris_session.protocol import names
+
+ROOT = Path(__file__).parents[1]
+#: `docs/protocol.md` has tests of its own (tests/protocol); its links are checked here too.
+PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")))
+EXAMPLES = tuple(sorted((ROOT / "examples").glob("*.py")))
+ADDRESS = "127.0.0.1:7721"
+TIMEOUT_S = 60.0
+
+#: Runs before a block: sessions take free ports, and `run()` without an end takes 0.3 s. The text stays as printed.
+PRELUDE = """
+from iris_session import Session, SessionConfig
+SessionConfig.__init__.__defaults__ = tuple(
+    0 if value in (7721, 7722) and value is not True else value for value in SessionConfig.__init__.__defaults__
+)
+_run = Session.run
+Session.run = lambda self, seconds=None, until=None: _run(self, 0.3 if seconds is None else seconds, until)
+"""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page. `line`: of its opening fence."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.page.name}:{self.line}"
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    opened: tuple[int, str, int] | None = None
+    lines = page.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, 1):
+        fence = re.match(r"^\s*```(\w*)", line)
+        if fence and opened is None:
+            opened = (number, fence[1], number)
+        elif fence and opened is not None:
+            yield Block(page, opened[0], opened[1], "\n".join(lines[opened[2] : number - 1]))
+            opened = None
+    assert opened is None, f"{page.name}: the block of line {opened} is not closed" if opened else ""
+
+
+BLOCKS = tuple(block for page in PAGES for block in blocks(page))
+PYTHON = tuple(block for block in BLOCKS if block.language == "python")
+SHELL = tuple(block for block in BLOCKS if block.language == "bash")
+
+
+def prose(page: Path) -> str:
+    """The page without its fenced blocks."""
+    return re.sub(r"^\s*```.*?^\s*```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+# --- Python ---
+
+
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a session of the handover scene, a process of its own."""
+    folder = tmp_path_factory.mktemp("serve")
+    command = [sys.executable, "-m", "iris_session.cli.main", "serve", "handover", "--no-record"]
+    process = subprocess.Popen(
+        [*command, "--control-port", "0", "--state-port", "0"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        found = re.search(r" on (\S+:\d+),", line)
+        assert found, f"no address in {line!r}"
+        yield found[1]
+    finally:
+        process.terminate()
+        process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0
+
+
+@pytest.fixture
+def run_python(tmp_path: Path) -> Callable[..., str]:
+    """Runs a script in a process of its own in an empty folder; its output."""
+
+    def run(script: str, *arguments: str) -> str:
+        path = tmp_path / "block.py"
+        path.write_text(script, encoding="utf-8")
+        done = subprocess.run(
+            [sys.executable, "-W", "error", str(path), *arguments],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("block", PYTHON, ids=lambda block: block.name)
+def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
+    text = block.text
+    if ADDRESS in text:
+        text = text.replace(ADDRESS, request.getfixturevalue("serve"))
+    run_python(PRELUDE + text)
+
+
+@pytest.mark.e2e
+def test_examples_of_user_loops_run(run_python: Callable[..., str]) -> None:
+    for name in ("share_a_script", "own_loop"):
+        output = run_python(PRELUDE + (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"), "0.3")
+        assert re.search(r"join at 127\.0\.0\.1:[1-9]\d*", output), output
+
+
+@pytest.mark.e2e
+def test_example_of_a_policy_moves_its_robot(serve: str, run_python: Callable[..., str]) -> None:
+    output = run_python((ROOT / "examples" / "policy.py").read_text(encoding="utf-8"), serve, "1.5")
+    moved = re.search(r"tip moved (\d+) mm", output)
+    assert moved, output
+    assert int(moved[1]) > 20
+
+
+@pytest.mark.e2e
+def test_examples_of_recordings_run(tmp_path: Path, run_python: Callable[..., str]) -> None:
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(control_port=0, state_port=0, record=path)
+    with Session(scene_path("handover"), config=config) as session:
+        session.run(seconds=0.3)
+    output = run_python((ROOT / "examples" / "read_recording.py").read_text(encoding="utf-8"), str(path))
+    assert "class closed" in output
+    assert re.search(r"hammer: [1-9]\d* frames, travelled 0\.\d+ m", output), output
+
+
+def test_every_example_is_run_here() -> None:
+    assert {path.stem for path in EXAMPLES} == {"share_a_script", "own_loop", "policy", "read_recording"}
+
+
+# --- commands ---
+
+
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """Every `iris-session` command that a page shows, as `(where, arguments)`."""
+    for block in SHELL:
+        for line in block.text.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["iris-session"]:
+                yield block.name, words[1 : words.index(">") if ">" in words else None]
+    for page in PAGES:
+        for code in re.findall(r"`(iris-session [^`]+)`", prose(page).replace("\n", " ")):
+            words = shlex.split(code)
+            if words[1].islower() and not {"...", "--help"} & set(words):
+                yield page.name, words[1:]
+
+
+@pytest.mark.parametrize(("where", "arguments"), sorted({(w, tuple(a)) for w, a in commands()}), ids=str)
+def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
+    parser = build_parser()
+    kind = {"verify": ["FILE"], "serve": ["SCENE"], "robots": ["SCENE"], "demo": ["handover"]}
+    bare = len(arguments) == 1 or (len(arguments) > 1 and arguments[1].startswith("--") and arguments[0] in kind)
+    # In running text a command may be named without its argument.
+    completed = [arguments[0], *kind.get(arguments[0], []), *arguments[1:]] if bare and ":" not in where else arguments
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors):
+        try:
+            parser.parse_args(list(completed))
+        except SystemExit:
+            pytest.fail(f"{where}: iris-session {shlex.join(arguments)}: {errors.getvalue().splitlines()[-1]}")
+
+
+def test_commands_are_found() -> None:
+    found = {arguments[0] for _, arguments in commands()}
+    assert found == {"demo", "serve", "verify", "emulate", "robots", "bench"}
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    shown = [line.split()[1] for block in SHELL for line in block.text.splitlines() if line.startswith("make ")]
+    for page in PAGES:
+        shown += re.findall(r"`make (\w+)`", prose(page))
+    assert shown
+    for target in shown:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"no target {target}"
+
+
+def test_command_line_reference_has_every_option() -> None:
+    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    actions = build_parser()._subparsers
+    assert actions is not None
+    subparsers = next(a for a in actions._group_actions if isinstance(a, argparse._SubParsersAction))
+    common = _section(page, "Session options")
+    for name, parser in subparsers.choices.items():
+        text = _section(page, name)
+        if "#session-options" in text:
+            text += common
+        known = {option for action in parser._actions for option in action.option_strings} - {"-h", "--help", "--json"}
+        shown = set(re.findall(r"`(--[a-z-]+)", text)) - {"--json"}
+        assert shown == known, f"{name}: {sorted(shown ^ known)}"
+
+
+def _section(page: str, title: str) -> str:
+    found = re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+    assert found, f"docs/cli.md has no section '{title}'"
+    return found[1]
+
+
+# --- links and files ---
+
+
+def slug(title: str) -> str:
+    """Anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
+
+
+def headings(page: Path) -> set[str]:
+    return {slug(title) for title in re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_resolve(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if re.match(r"https?:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name}: {target} does not exist"
+        assert ROOT in (file, *file.parents), f"{page.name}: {target} lies outside the repository"
+        if anchor:
+            assert anchor in headings(file), f"{page.name}: {target}: no such heading"
+
+
+#: Written as code, a name with a folder and one of these endings is a file of ours.
+FILE = re.compile(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_files_exist(page: Path) -> None:
+    for name in FILE.findall(prose(page)):
+        # Modules are named from the root or, in short, from the package.
+        assert (ROOT / name).is_file() or (ROOT / "iris_session" / name).is_file(), f"{page.name}: {name}"
+
+
+def test_files_are_named() -> None:
+    assert any(FILE.findall(prose(page)) for page in PAGES)
+
+
+def test_picture_is_small() -> None:
+    assert (ROOT / "docs" / "img" / "handover.png").stat().st_size <= 200_000
+
+
+# --- reasons ---
+
+TABLES = re.findall(
+    r"<!-- names: (\w+) -->\n(.*?)<!-- end -->",
+    (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"),
+    re.DOTALL,
+)
+
+
+@pytest.mark.parametrize(("enumeration", "table"), TABLES, ids=[name for name, _ in TABLES])
+def test_every_reason_is_explained(enumeration: str, table: str) -> None:
+    values = {v for k, v in vars(getattr(names, enumeration)).items() if k.isupper() and isinstance(v, str)}
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| (.*?) ?\|$", table, re.MULTILINE)
+    assert sorted(code for code, _, _ in rows) == sorted(values)
+
+
+def test_all_tables_of_reasons_are_there() -> None:
+    assert {name for name, _ in TABLES} == {"HoldReason", "RejectReason", "DenialReason", "RefusalCode", "FaultCode"}
+
+
+def test_roles_modes_and_policies_are_in_the_guide() -> None:
+    guide = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    wanted = names.Role.ALL | names.LeaseMode.ALL | names.AssignmentPolicy.ALL | names.Device.ALL
+    missing = sorted(value for value in wanted | names.EpisodeAction.ALL if not re.search(rf'[`"]{value}["`]', guide))
+    assert not missing
