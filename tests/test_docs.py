@@ -29,14 +29,16 @@ EXAMPLES = tuple(sorted((ROOT / "examples").glob("*.py")))
 ADDRESS = "127.0.0.1:7721"
 TIMEOUT_S = 60.0
 
-#: Runs before a block: sessions take free ports, and `run()` without an end takes 0.3 s. The text stays as printed.
-PRELUDE = """
+#: Runs a block: sessions take free ports, and `run()` without an end takes 0.3 s. The text stays as printed.
+RUN = """
 from iris_session import Session, SessionConfig
 SessionConfig.__init__.__defaults__ = tuple(
     0 if value in (7721, 7722) and value is not True else value for value in SessionConfig.__init__.__defaults__
 )
 _run = Session.run
 Session.run = lambda self, seconds=None, until=None: _run(self, 0.3 if seconds is None else seconds, until)
+import runpy
+runpy.run_path("block.py", run_name="__main__")
 """
 
 
@@ -68,7 +70,9 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 BLOCKS = tuple(block for page in PAGES for block in blocks(page))
-PYTHON = tuple(block for block in BLOCKS if block.language == "python")
+#: A block with an address of a lab needs keys, and is run by `test_keys_of_the_network_page_work`.
+LAB_ADDRESS = "192.168.0.10"
+PYTHON = tuple(block for block in BLOCKS if block.language == "python" and LAB_ADDRESS not in block.text)
 SHELL = tuple(block for block in BLOCKS if block.language == "bash")
 
 
@@ -80,11 +84,10 @@ def prose(page: Path) -> str:
 # --- Python ---
 
 
-@pytest.fixture(scope="module")
-def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+@contextlib.contextmanager
+def served(folder: Path, *options: str) -> Iterator[str]:
     """Address of a session of the handover scene, a process of its own."""
-    folder = tmp_path_factory.mktemp("serve")
-    command = [sys.executable, "-m", "iris_session.cli.main", "serve", "handover", "--no-record"]
+    command = [sys.executable, "-m", "iris_session.cli.main", "serve", "handover", "--no-record", *options]
     process = subprocess.Popen(
         [*command, "--control-port", "0", "--state-port", "0"],
         cwd=folder,
@@ -104,15 +107,20 @@ def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert process.returncode == 0
 
 
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with served(tmp_path_factory.mktemp("serve")) as address:
+        yield address
+
+
 @pytest.fixture
 def run_python(tmp_path: Path) -> Callable[..., str]:
     """Runs a script in a process of its own in an empty folder; its output."""
 
     def run(script: str, *arguments: str) -> str:
-        path = tmp_path / "block.py"
-        path.write_text(script, encoding="utf-8")
+        (tmp_path / "block.py").write_text(script, encoding="utf-8")
         done = subprocess.run(
-            [sys.executable, "-W", "error", str(path), *arguments],
+            [sys.executable, "-W", "error", "-c", RUN, *arguments],
             cwd=tmp_path,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
             capture_output=True,
@@ -132,13 +140,21 @@ def test_python_block_runs(block: Block, run_python: Callable[..., str], request
     text = block.text
     if ADDRESS in text:
         text = text.replace(ADDRESS, request.getfixturevalue("serve"))
-    run_python(PRELUDE + text)
+    run_python(text)
+
+
+@pytest.mark.e2e
+def test_keys_of_the_network_page_work(tmp_path: Path, run_python: Callable[..., str]) -> None:
+    make, use = (block.text for block in BLOCKS if block.page.name == "network.md" and block.language == "python")
+    run_python(make)
+    with served(tmp_path, "--curve-key", "keys/server.key_secret", "--curve-clients", "keys/clients") as address:
+        assert re.search(r"\(\d+, 7\)", run_python(use.replace(f"{LAB_ADDRESS}:7721", address)))
 
 
 @pytest.mark.e2e
 def test_examples_of_user_loops_run(run_python: Callable[..., str]) -> None:
     for name in ("share_a_script", "own_loop"):
-        output = run_python(PRELUDE + (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"), "0.3")
+        output = run_python((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"), "0.3")
         assert re.search(r"join at 127\.0\.0\.1:[1-9]\d*", output), output
 
 
