@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +24,7 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.scheduling import quiet_collector
 from iris_session.runtime.session import Session
 
 #: DESIGN section 11: at most four clients in one process.
@@ -146,7 +146,7 @@ def _run(
     if waiting:
         raise RuntimeError("the clients did not join within 60 s")
     progress("warm-up")
-    with _quiet_collector():
+    with quiet_collector():
         session.run(seconds=WARM_UP_S)
         begin = session.clock() + 50_000_000
         end = begin + round(seconds * 1e9)
@@ -200,17 +200,6 @@ def _every(period_s: float, clock: Callable[[], int], check: Callable[[], bool])
         return check()
 
     return until
-
-
-@contextlib.contextmanager
-def _quiet_collector() -> Iterator[None]:
-    """As in `iris-session serve`: what exists now is not looked at again by the garbage collector."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 def _keep(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from iris_session.cli.common import add_json, add_session_options, print_json
@@ -42,14 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
-    with ExitStack() as stack:
 
-        def show(session: Session) -> Callable[[], object]:
-            view = LiveView(session, out, f"demo {arguments.demo} on {session.address}")
-            stack.enter_context(view.open())
-            return view.update
+    def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
+        return LiveView(session, out, f"demo {arguments.demo} on {session.address}").open()
 
-        result = run_handover(config, arguments.seed, arguments.timeout, show)
+    result = run_handover(config, arguments.seed, arguments.timeout, show)
     if arguments.json:
         print_json(msgspec.to_builtins(result))
     else:

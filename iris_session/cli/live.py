@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
@@ -64,8 +64,8 @@ class LiveView:
         self.skipped = 0
 
     @contextmanager
-    def open(self) -> Iterator[None]:
-        """Starts the display, ends it after the last line."""
+    def open(self) -> Iterator[Callable[[], None]]:
+        """Starts the display, gives `update`, ends it after the last line."""
         self._out.flush()
         child = subprocess.Popen(
             [sys.executable, "-m", "iris_session.cli.live", self._title], stdin=subprocess.PIPE, stdout=self._out
@@ -74,7 +74,7 @@ class LiveView:
         self._pipe = child.stdin.fileno()
         os.set_blocking(self._pipe, False)
         try:
-            yield
+            yield self.update
         finally:
             self.update(force=True)
             child.stdin.close()

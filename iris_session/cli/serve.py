@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,8 +85,6 @@ def run(arguments: argparse.Namespace) -> int:
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
         view = LiveView(session, out, f"iris-session {session.config.name} on {session.address}")
-        gc.collect()
-        gc.freeze()  # what exists now lives as long as the session: later collections need not look at it
         with view.open():
             session.run(seconds=arguments.seconds, until=view.update)
         status = session.status()

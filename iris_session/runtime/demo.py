@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -121,15 +122,17 @@ def run_handover(
     config: SessionConfig,
     seed: int = 0,
     timeout_s: float = 90.0,
-    on_session: Callable[[Session], Callable[[], object]] | None = None,
+    on_session: Callable[[Session], AbstractContextManager[Callable[[], object]]] | None = None,
 ) -> DemoResult:
-    """Runs the handover demo. `on_session` gets the session and returns what to call in every pass of its loop."""
+    """Runs the handover demo. `on_session`: a context around the running session; gives what its loop calls always."""
     emulators: list[EmulatorProcess] = []
     next_read_ns = 0
 
     session = Session(scene_path("handover"), config=config)
-    with session.signals(), session:
-        update = on_session(session) if on_session is not None else (lambda: None)
+    with ExitStack() as stack:
+        stack.enter_context(session.signals())
+        stack.enter_context(session)
+        update = stack.enter_context(on_session(session)) if on_session is not None else (lambda: None)
 
         def finished() -> bool:
             nonlocal next_read_ns

@@ -7,6 +7,7 @@ is shown in the session's status, so that late ticks can be explained.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -37,3 +38,14 @@ def tick_priority(wanted: bool = True) -> Iterator[str]:
     finally:
         with suppress(PermissionError):
             os.sched_setscheduler(0, before[0] & ~os.SCHED_RESET_ON_FORK, before[1])
+
+
+@contextmanager
+def quiet_collector() -> Iterator[None]:
+    """What exists when the loop begins lives as long as the loop: later garbage collections need not look at it."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

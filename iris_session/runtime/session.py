@@ -29,6 +29,7 @@ from typing import Final, Self
 import msgspec
 import mujoco
 
+from iris_session.control import ControlError
 from iris_session.physics import Pacer, PacerStats, find_objects, find_robots, load_model
 from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker
 from iris_session.protocol.common import Pose
@@ -39,7 +40,7 @@ from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.core import CoreConfig, SessionCore, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.scheduling import tick_priority
+from iris_session.runtime.scheduling import quiet_collector, tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
 from iris_session.runtime.user_loop import UserLoop
@@ -96,7 +97,8 @@ class Session:
     def start(self) -> None:
         """Opens the sockets and the recording. Called by `with`. Participants can connect from here on.
 
-        Raises before it opens anything when the robots cannot be driven: `ControlError`, `PhysicsError`, `ConfigError`.
+        Raises before it opens anything when the robots cannot be driven: `ControlError`, `PhysicsError`, `ConfigError`;
+        afterwards `StartError`: a port in use, a folder that cannot be written, a key that is missing.
         """
         if self._processes is None:
             self._processes = SessionProcesses(self.config, self._make_core(user_owned=False).world, self.origin_ns)
@@ -124,7 +126,7 @@ class Session:
         stepper = self._make_stepper(user_owned=False)
         end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
         pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
-        with self.signals(), tick_priority(self.config.realtime) as self._scheduling:
+        with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
@@ -134,6 +136,7 @@ class Session:
                 else:
                     self._tick(stepper, pacer, now_ns)
                 self._live().watch(stepper)
+        pacer.pause(self.clock())  # what nobody asked to run is not late
 
     def _tick(self, stepper: Stepper, pacer: Pacer, now_ns: int) -> None:
         pacer.resume(now_ns)
@@ -326,6 +329,8 @@ class Session:
         if self._core is None or self._core.config != config:
             try:
                 self._core = SessionCore(self.model, config)
+            except ControlError:
+                raise
             except ValueError as error:  # the authority's own check of its numbers and names
                 raise ConfigError(str(error)) from error
         return self._core
