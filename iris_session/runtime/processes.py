@@ -18,12 +18,22 @@ import numpy as np
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.common import Pose
-from iris_session.recording import CLOSED, OPEN, RecorderFeed, RecorderProcess, SessionHeader, header_root, pack_model
+from iris_session.recording import (
+    CLOSED,
+    OPEN,
+    RecorderFeed,
+    RecorderProcess,
+    RecordingError,
+    SessionHeader,
+    header_root,
+    pack_model,
+)
 from iris_session.recording.versions import environment
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.core import SessionCore
+from iris_session.runtime.errors import StartError
 from iris_session.runtime.stepper import Stepper
-from iris_session.transport import FrontConfig, FrontProcess, SceneInfo
+from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo
 
 WATCH_PERIOD_NS: Final = 50_000_000
 RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
@@ -56,7 +66,7 @@ class _Watch:
 
 
 class SessionProcesses:
-    """Front and recorder of one session. `start` raises `FrontError` or `RecordingError` with one line."""
+    """Front and recorder of one session. `start` raises `StartError` with one line."""
 
     def __init__(
         self,
@@ -88,6 +98,9 @@ class SessionProcesses:
             self.front = FrontProcess(self._front_config(), self._scene)
             ports = self.front.start()
             self._address = f"{ports.host}:{ports.control}"
+        except (FrontError, RecordingError) as error:
+            self.close()
+            raise StartError(str(error)) from error
         except BaseException:
             self.close()
             raise

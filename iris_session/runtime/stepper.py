@@ -103,10 +103,13 @@ class Stepper:
         return self.last is not None and self.last.decision.paused
 
     def post(self, message: EntryMessage) -> None:
-        """Queues an input of the session's owner for the next step. Thread-safe (`deque.append`)."""
+        """Queues an input of the session's owner for the next step. Thread-safe (`deque.append`).
+
+        Texts are cut to the length of a `Text`. Raises `ValueError` for anything else that the protocol does not take.
+        """
         if len(self._host) >= MAX_HOST_ENTRIES:
             raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
-        self._host.append(message)
+        self._host.append(_checked(message))
 
     def step(self, n_ticks: int, plant: bytes = b"") -> StepOutcome:
         """Takes one step now. `plant`: see `SessionCore.step` (open sessions)."""
@@ -186,6 +189,18 @@ class Stepper:
         step = self.step_count if self.last is not None else -1
         frame = Keyframe(step, state.plant, state.authority, state.controller, state.status)
         self.recorder.keyframe(frame, self._chain)
+
+
+def _checked(message: EntryMessage) -> EntryMessage:
+    """What a client's message has passed in the front: front and recorder would end at an input that breaks a limit."""
+    texts = {name: getattr(message, name, "") for name in ("text", "reason", "label")}
+    cut = {name: text[: MAX_TEXT - 3] + "..." for name, text in texts.items() if len(text) > MAX_TEXT}
+    checked: EntryMessage = msgspec.structs.replace(message, **cut) if cut else message
+    try:
+        decode_entry(encode_entry(Entry(HOST, HOST, 0, checked)))
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{type(message).__name__} cannot be used: {error}") from error
+    return checked
 
 
 def session_clock(origin_ns: int) -> Callable[[], int]:

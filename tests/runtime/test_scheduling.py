@@ -1,0 +1,39 @@
+"""Priority of the tick loop: taken when allowed, given back, and never a reason to fail."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+
+from iris_session.runtime.scheduling import tick_priority
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="priorities are asked for on Linux only")
+
+
+def test_it_is_given_back() -> None:
+    before = os.sched_getscheduler(0)
+    with tick_priority() as reached:
+        inside = os.sched_getscheduler(0)
+    assert reached in ("realtime", "normal")
+    assert (inside & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR) == (reached == "realtime")
+    assert os.sched_getscheduler(0) == before
+
+
+def test_without_permission_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError("no")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with tick_priority() as reached:
+        assert reached == "normal"
+
+
+def test_it_is_not_asked_for_when_not_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(os, "sched_setscheduler", fail)
+    with tick_priority(False) as reached:
+        assert reached == "normal"

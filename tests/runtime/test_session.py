@@ -1,0 +1,132 @@
+"""The public object: what it refuses, and inputs of its owner. Real processes, no clients."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from iris_session import ConfigError, OwnershipError, Session, SessionConfig, StartError
+from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig, ControlError
+from iris_session.physics import AmbiguousModelError, load_model
+from iris_session.physics.scenes import scene_path
+from iris_session.protocol.server_messages import EStopChanged, MarkerAdded, PauseChanged, SceneChanged
+
+QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(scene_path("handover"), config=QUIET) as session:
+        yield session
+
+
+def _bodies(session: Session) -> list[object]:
+    return [event.body for event in session.recent_events()]
+
+
+def test_what_the_owner_says_before_the_first_step_is_in_it(session: Session) -> None:
+    session.marker("first")
+    session.run(until=session.recent_events)
+    assert isinstance(_bodies(session)[0], MarkerAdded)
+    assert session.status().tick >= 1
+
+
+def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
+    session.pause()
+    session.resume()
+    session.reset()
+    session.estop("from a script")
+    session.run(until=lambda: session.status().estop)
+    session.clear_estop()
+    session.run(until=lambda: not session.status().estop)
+    kinds = [type(body) for body in _bodies(session)]
+    # The e-stop takes the urgent lane, before what was said with it.
+    assert kinds == [EStopChanged, PauseChanged, PauseChanged, SceneChanged, EStopChanged]
+
+
+def test_run_ends_after_its_seconds_and_from_another_thread(session: Session) -> None:
+    session.run(seconds=0.05)
+    ticks = session.status().tick
+    assert ticks >= 1
+    timer = threading.Timer(0.05, session.stop)
+    timer.start()
+    session.run()
+    timer.join()
+    assert session.stopping
+
+
+def test_posting_without_a_loop_is_bounded(session: Session) -> None:
+    for i in range(256):
+        session.marker(f"m{i}")
+    with pytest.raises(OwnershipError, match="call run"):
+        session.marker("one more")
+
+
+def test_one_session_is_driven_in_one_way() -> None:
+    model = load_model(scene_path("handover"))
+    with Session(model, mujoco.MjData(model), QUIET) as session:
+        session.begin_tick()
+        with pytest.raises(OwnershipError, match="one way"):
+            session.run(seconds=0.1)
+    with Session(model, mujoco.MjData(model), QUIET) as session:
+        session.run(seconds=0.01)
+        with pytest.raises(OwnershipError, match="one way"):
+            session.begin_tick()
+
+
+def test_targets_for_an_environment_with_its_own_controller() -> None:
+    model = load_model(scene_path("handover"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    ctrl = data.ctrl.copy()
+    config = SessionConfig(
+        control_port=0, state_port=0, record=False, realtime=False, control=ControlConfig(output="targets")
+    )
+    with Session(model, data, config) as session:
+        for _ in range(5):
+            session.begin_tick()
+            mujoco.mj_step(model, data)
+            session.end_tick()
+        targets = session.targets()
+        assert set(targets) == {"left", "right"}
+        site = data.site(session.robots[0].site)
+        assert targets["left"].p == pytest.approx(tuple(site.xpos), abs=5e-3)
+    assert (data.ctrl == ctrl).all(), "the environment's own controller writes ctrl"
+
+
+def test_closing_twice_and_using_it_afterwards(session: Session) -> None:
+    session.close()
+    session.close()
+    with pytest.raises(OwnershipError, match="not started"):
+        session.run()
+    assert session.recording is None
+
+
+def test_what_cannot_be_driven_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    torque = """<mujoco><worldbody><body name="arm"><joint name="j1"/><geom size=".1"/>
+    <body name="b"><joint name="j2"/><geom size=".1"/><body name="c"><joint name="j3"/><geom size=".1"/>
+    <site name="tip"/></body></body></body></worldbody><actuator><motor name="a1" joint="j1"/>
+    <motor name="a2" joint="j2"/><motor name="a3" joint="j3"/></actuator></mujoco>"""
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
+    session = Session(mujoco.MjModel.from_xml_string(torque), config=config)
+    with pytest.raises(ControlError, match="gravity_pd"):
+        session.start()
+    assert list(tmp_path.iterdir()) == []
+    ambiguous = torque.replace("motor", "position").replace('<site name="tip"/>', '<site name="x"/><site name="y"/>')
+    with pytest.raises(AmbiguousModelError):
+        Session(mujoco.MjModel.from_xml_string(ambiguous), config=config)
+    odd = SessionConfig(authority=AuthorityConfig(leader_apart="wait"), record=False)
+    with pytest.raises(ConfigError, match="'ramp' or 'refuse'"):
+        Session(scene_path("handover"), config=odd).start()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "taken" / "session.rrd")
+    with pytest.raises(StartError, match="taken"):
+        Session(scene_path("handover"), config=config).start()

@@ -1,0 +1,200 @@
+"""The stepper's bounds and rhythms, with recording ports in place of processes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from iris_session.protocol.client_messages import Control, Marker
+from iris_session.protocol.common import Applied
+from iris_session.protocol.entries import Entry, RecordingGap, decode_entries
+from iris_session.protocol.server_messages import Gap, StateHeader
+from iris_session.protocol.steps import Decision
+from iris_session.recording.journal import JournalRow, Keyframe, check_row
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
+from tests.runtime.play import TICK_NS, entries, make_core
+
+MS = 1_000_000
+
+
+class Front:
+    """Keeps what is sent; gives `waiting`."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Entry] = []
+        self.decisions: list[Decision] = []
+        self.states: list[StateHeader] = []
+
+    def poll(self) -> list[Entry]:
+        entries, self.waiting = self.waiting, []
+        return entries
+
+    def send_decision(self, step: int, decision: Decision) -> None:
+        assert step == len(self.decisions)
+        self.decisions.append(decision)
+
+    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
+        assert poses.shape[1] == 7
+        self.states.append(header)
+
+
+class Recorder:
+    """Keeps what is recorded; loses `gap` rows once."""
+
+    def __init__(self) -> None:
+        self.wants_keyframe = False
+        self.gap = 0
+        self.rows: list[JournalRow] = []
+        self.keyframes: list[Keyframe] = []
+        self.states = 0
+
+    def row(self, row: JournalRow) -> None:
+        self.rows.append(row)
+
+    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        assert chain == (self.rows[-1].chain if self.rows else b"root")
+        self.keyframes.append(keyframe)
+
+    def state(
+        self,
+        step: int,
+        tick: int,
+        sim_time: float,
+        session_time: int,
+        poses: NDArray[np.float64],
+        applied: Sequence[Applied] = (),
+    ) -> None:
+        self.states += 1
+
+    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+        pass
+
+    def take_gap(self) -> int:
+        gap, self.gap = self.gap, 0
+        return gap
+
+
+class Rig:
+    """A stepper whose clock the test moves."""
+
+    def __init__(self, state_ms: float = 16.0, keyframe_ms: float = 100.0) -> None:
+        self.now_ns = 0
+        self.front, self.recorder = Front(), Recorder()
+        self.stepper = Stepper(
+            make_core(),
+            self.front,
+            self.recorder,
+            lambda: self.now_ns,
+            round(state_ms * MS),
+            round(keyframe_ms * MS),
+            b"root",
+        )
+
+    def steps(self, n: int, distance_ns: int = TICK_NS) -> None:
+        for _ in range(n):
+            self.now_ns += distance_ns
+            self.front.waiting = entries(self.stepper.step_count)
+            self.stepper.step(1)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_every_step_is_a_row_of_one_chain(rig: Rig) -> None:
+    rig.steps(120)
+    chain = b"root"
+    for i, row in enumerate(rig.recorder.rows):
+        assert row.step == i
+        assert check_row(chain, row) is None
+        chain = row.chain
+    assert len(rig.recorder.rows) == 120
+
+
+def test_keyframes_at_the_start_and_at_their_distance(rig: Rig) -> None:
+    rig.steps(120)  # 240 ms
+    assert [k.step for k in rig.recorder.keyframes] == [-1, 50, 100]
+    core = make_core()
+    assert rig.recorder.keyframes[0].plant == core.snapshot().plant
+
+
+def test_a_keyframe_when_the_recorder_asks(rig: Rig) -> None:
+    rig.steps(3)
+    rig.recorder.wants_keyframe = True
+    rig.steps(1)
+    assert [k.step for k in rig.recorder.keyframes] == [-1, 3]
+
+
+def test_session_time_grows_even_when_the_clock_stands(rig: Rig) -> None:
+    rig.steps(5, distance_ns=0)
+    times = [row.now_ns for row in rig.recorder.rows]
+    assert all(b > a for a, b in pairwise(times))
+
+
+def test_state_keeps_its_rate_and_a_gap_makes_no_burst(rig: Rig) -> None:
+    rig.steps(400)  # 0.8 s
+    assert len(rig.front.states) == pytest.approx(0.8 / 0.016, abs=1)
+    assert rig.recorder.states == len(rig.front.states)
+    before = len(rig.front.states)
+    rig.now_ns += 3_000 * MS
+    rig.steps(8)  # 16 ms
+    assert len(rig.front.states) - before <= 2
+
+
+def test_a_long_time_between_steps_is_one_gap_and_no_entry_of_ours(rig: Rig) -> None:
+    rig.steps(60)
+    rig.now_ns += 400 * MS
+    rig.steps(1)
+    gaps = [e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]
+    assert len(gaps) == 1
+    assert gaps[0].session_time == rig.now_ns
+    assert not decode_entries(rig.recorder.rows[-1].entries)
+    rig.steps(10)
+    assert len([e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]) == 1
+
+
+def test_plain_overload_is_no_gap(rig: Rig) -> None:
+    """Steps that take 20 times as long as they should: slow, but robots go on."""
+    rig.steps(100, distance_ns=40 * MS)
+    assert not [e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]
+
+
+def test_rows_that_the_recorder_lost_are_told_in_the_next_step(rig: Rig) -> None:
+    rig.steps(2)
+    rig.recorder.gap = 17
+    rig.steps(2)
+    (entry,) = decode_entries(rig.recorder.rows[-1].entries)
+    assert entry.message == RecordingGap(17)
+
+
+def test_host_entries_are_bounded(rig: Rig) -> None:
+    for i in range(MAX_HOST_ENTRIES):
+        rig.stepper.post(Marker(0, f"m{i}"))
+    with pytest.raises(RuntimeError, match="is the loop running"):
+        rig.stepper.post(Marker(0, "one more"))
+    rig.steps(1)
+    rig.stepper.post(Marker(0, "there is room again"))
+
+
+def test_physics_that_diverges_pauses_the_session_and_is_told_once(rig: Rig) -> None:
+    rig.steps(5)
+    rig.stepper.core.world.data.qvel[0] = math.nan
+    rig.steps(5)
+    messages = [e.message for row in rig.recorder.rows for e in decode_entries(row.entries) if e.connection == 0]
+    assert messages[0] == Control(0, "pause")
+    assert isinstance(messages[1], Marker)
+    assert "NaN" in messages[1].text
+    assert len(messages) == 2
+    assert rig.stepper.paused
+    rig.stepper.post(Control(0, "reset"))
+    rig.stepper.post(Control(0, "resume"))
+    rig.steps(2)
+    assert not rig.stepper.paused
+    assert rig.stepper.last is not None
+    assert rig.stepper.last.diverged == ""
