@@ -113,7 +113,8 @@ def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableT
         error = "" if row["alignment_mm"] is None else f" {row['alignment_mm']:.1f} mm"
         delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
         name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [lost]")
-        table.add_row(name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
+        cells = (name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
+        table.add_row(*map(Text, cells))  # names are people's words, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
     footer = (

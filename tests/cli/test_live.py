@@ -1,0 +1,104 @@
+"""What the terminal shows while a session runs."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+
+import pytest
+
+from iris_session.cli.live import LiveView, _table, event_line
+from iris_session.protocol.common import Lease
+from iris_session.protocol.server_messages import (
+    Event,
+    Handover,
+    LeaseChanged,
+    MarkerAdded,
+    ParticipantInfo,
+    ParticipantJoined,
+)
+
+STATUS = {
+    "session_time_s": 12.3,
+    "tick": 6150,
+    "paused": False,
+    "estop": True,
+    "participants": [
+        {"id": "p1", "name": "ann", "role": "operator", "connected": False, "robots": ["left"], "alignment": "measured",
+         "alignment_mm": 4.2},
+    ],
+    "input_to_ctrl_ms": {"left": 21.0},
+    "lateness": {"late_share": 0.001, "p99_ms": 0.8},
+    "handovers": [{}],
+    "drops": {"slow": 3},
+}  # fmt: skip
+
+
+def test_events_are_lines_to_read() -> None:
+    info = ParticipantInfo("p1", "ann", "operator", True)
+    joined = event_line(Event(1, 0, 1_500_000_000, ParticipantJoined(info, False)))
+    assert "1.50 s" in joined
+    assert "participant=p1 name=ann role=operator" in joined
+    lease = Lease("left", "robot", "exclusive", "p1", 1)
+    assert "target=left holder=p1 cause=acquired" in event_line(Event(2, 0, 0, LeaseChanged(lease, "acquired")))
+    assert "text=hello" in event_line(Event(3, 0, 0, MarkerAdded("p1", "hello")))
+    assert "giver=left receiver=right" in event_line(
+        Event(4, 0, 0, Handover("hammer", "left", "right", "p1", "p2", 2_000_000))
+    )
+
+
+def test_the_table_says_who_is_lost_and_that_everything_stopped() -> None:
+    from rich.console import Console
+
+    console = Console(file=io.StringIO(), width=140)
+    console.print(_table("lab", STATUS, ["something happened"]))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    for part in ("ann (p1) [lost]", "4.2 mm", "21 ms", "E-STOP", "late 0.10 %", "drops 3", "something happened"):
+        assert part in text
+
+
+def test_the_display_process_prints_events_and_survives_cut_lines() -> None:
+    lines = b'{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
+    done = subprocess.run(
+        [sys.executable, "-m", "iris_session.cli.live", "title"], input=lines, capture_output=True, check=True
+    )
+    assert done.stdout.decode().split() == ["one", "two"]
+
+
+class _Session:
+    """What `LiveView` asks of a session."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def recent_events(self) -> list[Event]:
+        return self.events
+
+    def status(self) -> _Session:
+        return self
+
+    def as_dict(self) -> dict[str, object]:
+        return {"text": "x" * 200_000}
+
+
+def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refreshes that do not fit into the pipe are skipped and counted."""
+    import os
+
+    session = _Session()
+    view = LiveView(session, io.StringIO(), "title")  # type: ignore[arg-type]
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    view._pipe = write
+    session.events = [Event(1, 0, 0, MarkerAdded("p1", "hello"))]
+    for _ in range(3):
+        view.update(force=True)
+    assert view.skipped == 3
+    os.close(read)
+    view.update(force=True)
+    assert view.skipped == 4
+    os.close(write)
+    assert json.dumps(session.as_dict())

@@ -1,0 +1,144 @@
+"""The command line as people use it: help with examples, one JSON object, one line per error."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli.main import build_parser, main
+
+COMMANDS = ("demo", "serve", "verify", "emulate", "robots", "bench")
+
+
+def _help(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example_that_parses(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = _help(command, capsys)
+    assert "example" in text
+    examples = [line.strip() for line in text.splitlines() if line.strip().startswith(f"iris-session {command}")]
+    assert examples
+    for example in examples:
+        words = example.split("   ")[0].split(">")[0].split()  # what follows is a remark, or a file
+        build_parser().parse_args(words[1:])
+
+
+def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    for command in COMMANDS:
+        assert f"iris-session {command}" in text
+
+
+def test_every_option_is_explained() -> None:
+    parser = build_parser()
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    silent = [
+        f"{name} {action.option_strings[0]}"
+        for name, sub in commands.choices.items()
+        for action in sub._actions
+        if action.option_strings and not action.help
+    ]
+    assert silent == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fly"], ["demo", "juggle"], ["serve"], ["bench", "state", "--clients", "x"]]
+)
+def test_a_wrong_command_line_is_status_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert "usage: iris-session" in capsys.readouterr().err
+
+
+def test_robots_prints_toml_that_serve_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from iris_session.physics import load_model, load_robots_toml
+    from iris_session.physics.scenes import scene_path
+
+    scene = scene_path("handover")
+    assert main(["robots", str(scene)]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("# 2 robots, 2 free objects: hammer, board")
+    file = tmp_path / "robots.toml"
+    file.write_text(text)
+    model = load_model(scene)
+    assert [r.name for r in load_robots_toml(file, model)] == ["left", "right"]
+
+
+def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
+    from iris_session.physics.scenes import scene_path
+
+    assert main(["robots", str(scene_path("handover")), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [r["name"] for r in result["robots"]] == ["left", "right"]
+    assert {o["name"] for o in result["objects"]} == {"hammer", "board"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["robots", "nothing.xml"], "nothing.xml"),
+        (["verify", "nothing.rrd"], "nothing.rrd"),
+        (["serve", "nothing"], "Available scenes: arm, handover"),
+        (["serve", "handover", "--seconds", "-1", "--control-port", "99999"], "99999"),
+    ],
+)
+def test_expected_errors_are_one_line(
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    (line,) = err.strip().splitlines()
+    assert line.startswith("iris-session: ")
+    assert expected in line
+
+
+def test_serve_json_is_one_object_and_the_file_is_verified_as_text_and_json(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "session.rrd"
+    ports = ["--control-port", "0", "--state-port", "0", "--record", str(recording)]
+    assert main(["serve", "handover", "--seconds", "0.3", "--json", *ports]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["ok"] is True
+    assert result["recording"] == str(recording)
+    assert result["tick"] > 0
+    assert {"ticks", "late", "late_share", "p99_ms"} <= set(result["lateness"])
+    assert main(["verify", str(recording)]) == 0
+    assert capfd.readouterr().out.startswith(f"{recording}: ok: ")
+    assert main(["verify", "--json", str(recording)]) == 0
+    report = json.loads(capfd.readouterr().out)
+    assert report["ok"] is True
+    assert report["files"][0]["steps"] == result["tick"]
+
+
+def test_a_reader_that_goes_away_is_no_traceback(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "iris_session.cli.main", "robots", "handover.xml"]
+    from iris_session.physics.scenes import scene_path
+
+    command[-1] = str(scene_path("handover"))
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False, cwd=tmp_path)
+    os.close(write)
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 1
