@@ -125,8 +125,8 @@ class Session:
         """
         stepper = self._make_stepper(user_owned=False)
         end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
-        pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
         with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
+            pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
