@@ -86,11 +86,23 @@ class Batch(msgspec.Struct, array_like=True):
     dropped_rows: Count = 0
 
 
+class _Essence(msgspec.Struct, array_like=True):
+    """The part of a `Batch` that verification needs, for a batch whose other parts break a limit of the protocol."""
+
+    rows: list[JournalRow]
+    states: msgspec.Raw
+    events: msgspec.Raw
+    denials: msgspec.Raw
+    metrics: msgspec.Raw
+    keyframes: list[Keyframe]
+
+
 class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     """Sent after every write, and at least every half second. `written`: newest batch that is in the file, -1 for none.
 
     `expecting`: number of the next batch, -1 until a header came. `cpu_ns`: processor time of the recorder so far.
-    `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none.
+    `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none, and
+    batches of which only the journal could be read.
     `fault`: one line when the file can no longer be written; the process then ends.
     """
 
@@ -107,7 +119,14 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
 
 encode_batch = msgspec.msgpack.Encoder().encode
 decode_batch = msgspec.msgpack.Decoder(Batch).decode
+_decode_essence = msgspec.msgpack.Decoder(_Essence).decode
 encode_header = msgspec.msgpack.Encoder().encode
 decode_header = msgspec.msgpack.Decoder(SessionHeader).decode
 encode_status = msgspec.msgpack.Encoder().encode
 decode_status = msgspec.msgpack.Decoder(RecorderStatus).decode
+
+
+def decode_journal(data: bytes) -> Batch:
+    """Rows and keyframes of a batch of which `decode_batch` cannot read everything. Raises `msgspec.DecodeError`."""
+    essence = _decode_essence(data)
+    return Batch(rows=essence.rows, keyframes=essence.keyframes)

@@ -26,10 +26,12 @@ from iris_session.recording.messages import (
     FAULT_PREFIX,
     FRAME,
     HEADER,
+    Batch,
     RecorderConfig,
     RecorderStatus,
     decode_batch,
     decode_header,
+    decode_journal,
     encode_status,
 )
 from iris_session.recording.paths import part_path
@@ -175,12 +177,20 @@ class Recorder:
             self._expecting = number
             self._received = number - 1
         elif kind == BATCH and number == self._expecting:
-            batch = decode_batch(frames[1])
+            batch = self._decode(frames[1])
             if batch.rows:
                 self._newest_ns = batch.rows[-1].now_ns
             self._writer.add(batch)
             self._received = number
             self._expecting = number + 1
+
+    def _decode(self, body: bytes) -> Batch:
+        """A recorder that ended at a batch it cannot read would be followed by others that get the same one."""
+        try:
+            return decode_batch(body)
+        except msgspec.ValidationError:
+            self._refused += 1
+            return decode_journal(body)
 
     def _take_sample(self, data: bytes) -> None:
         try:

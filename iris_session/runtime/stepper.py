@@ -11,12 +11,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.client_messages import Control, Marker
-from iris_session.protocol.common import Applied
-from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap
+from iris_session.protocol.common import MAX_TEXT, Applied
+from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap, decode_entry, encode_entry
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import JournalRow, Keyframe, make_row

@@ -79,7 +79,12 @@ class Downlink:
         elif kind == link.ACK:
             self.acknowledged += frames[1][0]
         elif kind == link.DECIDED:
-            self._decided(link.decode_decided(frames[1]))
+            try:
+                decided = link.decode_decided(frames[1])
+            except msgspec.ValidationError:  # beyond a limit of the protocol: no client would have taken it either
+                self._drops.count("decision_invalid")
+                return
+            self._decided(decided)
         elif kind == link.PRESENCE:
             self._publisher.publish_presence(self.heard_ns, frames[1])
         elif kind == link.SCENE:

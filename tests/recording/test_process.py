@@ -87,6 +87,23 @@ def test_raw_samples_of_the_front(tmp_path: Path) -> None:
     assert samples[7].data == bytes([7, 255])
 
 
+def test_a_batch_that_breaks_a_limit_is_counted_and_its_journal_kept(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(5)
+        feed.metric("n" * 100, 1.0)
+        session.take(100)
+        assert feed.close(20.0)
+        assert feed.stats.recorder is not None
+        assert feed.stats.recorder.samples_refused == 1
+        assert process.alive
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert report.steps == 105
+
+
 def test_a_killed_recorder_loses_no_row(tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
     with recorder(path) as (process, feed):

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iris_session.protocol.client_messages import Control, Marker
+from iris_session.protocol.client_messages import Assign, Control, EStop, Marker
 from iris_session.protocol.common import Applied
-from iris_session.protocol.entries import Entry, RecordingGap, decode_entries
+from iris_session.protocol.entries import HOST, Entry, RecordingGap, decode_entries
 from iris_session.protocol.server_messages import Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import JournalRow, Keyframe, check_row
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
+from iris_session.transport import link_messages
 from tests.runtime.play import TICK_NS, entries, make_core
 
 MS = 1_000_000
@@ -180,6 +181,22 @@ def test_host_entries_are_bounded(rig: Rig) -> None:
         rig.stepper.post(Marker(0, "one more"))
     rig.steps(1)
     rig.stepper.post(Marker(0, "there is room again"))
+
+
+def test_long_texts_of_the_owner_are_cut_and_other_excess_is_refused(rig: Rig) -> None:
+    """Front and recorder check every limit of the protocol: what breaks one must not reach them."""
+    rig.stepper.post(Marker(0, "m" * 3000))
+    rig.stepper.post(EStop("r" * 3000))
+    with pytest.raises(ValueError, match="Assign cannot be used"):
+        rig.stepper.post(Assign(0, ("r" * 65,)))
+    rig.steps(1)
+    assert [e.message for e in decode_entries(rig.recorder.rows[-1].entries) if e.connection == HOST] == [
+        Marker(0, "m" * 509 + "..."),
+        EStop("r" * 509 + "..."),
+    ]
+    for decision in rig.front.decisions:
+        encoded = link_messages.encoder.encode(link_messages.Decided(1, events=decision.events))
+        link_messages.decode_decided(encoded)
 
 
 def test_physics_that_diverges_pauses_the_session_and_is_told_once(rig: Rig) -> None:

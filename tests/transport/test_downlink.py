@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.server_messages import BodyInfo, StateHeader
+from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, StateHeader
 from iris_session.transport import link_messages as link
 from iris_session.transport.clients import ClientTable
 from iris_session.transport.config import SceneInfo
@@ -117,3 +117,12 @@ def test_acknowledgements_and_the_end_are_noticed(far: Far) -> None:
     far.socket.send_multipart((link.END, b""))
     far.downlink.drain()
     assert (far.downlink.acknowledged, far.downlink.ended, far.downlink.heard_ns) == (7, True, 77)
+
+
+def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) -> None:
+    event = Event(1, 1, 0, MarkerAdded("p1", "x" * 3000))
+    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    far.state(1)
+    far.downlink.drain()
+    assert far.drops.by_reason == {"decision_invalid": 1}
+    assert [h.tick for h in far.headers()] == [1]
