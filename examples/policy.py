@@ -9,6 +9,25 @@ import math
 import sys
 
 from iris_session import Client, ClientError
+from iris_session.protocol.names import HoldReason
+
+#: Holds that end only when the clutch was opened and closed again; anything else needs no reaction.
+OPEN_CLUTCH = frozenset(
+    {
+        HoldReason.REARM,
+        HoldReason.REJECTED,
+        HoldReason.STALE,
+        HoldReason.GAP,
+        HoldReason.SCENE_CHANGED,
+        HoldReason.ESTOP,
+    }
+)
+
+
+def may_close(client: Client, robot: str) -> bool:
+    """Whether to close the clutch now: nothing moves again by itself after a disturbance."""
+    feedback = client.feedback.get(robot)
+    return feedback is not None and feedback.hold_reason not in OPEN_CLUTCH
 
 
 def main(address: str, seconds: float) -> None:
@@ -26,8 +45,7 @@ def main(address: str, seconds: float) -> None:
             t = (client.session_now_ns() - begun) * 1e-9
             angle, radius = 0.8 * t, 0.05 * min(1.0, t)
             target = (x + radius * math.cos(angle), y + radius * math.sin(angle), z)
-            # The clutch must be seen open once before it closes: nothing moves by accident.
-            client.send_sample("target", (target, q), robots=[robot], clutch=t > 0.1)
+            client.send_sample("target", (target, q), robots=[robot], clutch=may_close(client, robot))
             due += period_ns
             while client.session_now_ns() < due:
                 client.poll((due - client.session_now_ns()) * 1e-9)
