@@ -208,12 +208,13 @@ class Stress:
 
     def sample(self, person: Person, **forged: Any) -> None:
         rng = self.rng
-        if rng.random() < (0.02 if person.clutch else 0.3):
+        held = self.held(person)
+        follows = any(g.engagement and g.participant == person.id for lease in held for g in lease.grants)
+        if rng.random() < (0.02 if person.clutch and follows else 0.3):
             person.clutch = not person.clutch
         person.seq += 1
         person.p = tuple(x + rng.uniform(-0.01, 0.012) for x in person.p)  # type: ignore[assignment]
         person.turn = tuple(x + rng.uniform(-0.02, 0.02) for x in person.turn)  # type: ignore[assignment]
-        held = self.held(person)
         alignment = getattr(self.state.participants.get(person.id), "alignment", None)
         fields: dict[str, Any] = {
             "device": person.device,
@@ -254,7 +255,7 @@ class Stress:
         if choice == "acquire":
             names = tuple(rng.sample(robots, rng.choice([0, 1, 1, 2])))
             self.say(person, cm.Acquire(1, names, wait=rng.random() < 0.5, weight=rng.choice([1.0, 2.0])))
-        elif choice == "grasp":
+        elif choice == "grasp" and person.kind == "pose":
             self.say(person, cm.Grasp(1, rng.choice(self.config.objects).name, person.device))
         elif choice == "release":
             self.say(person, cm.Release(1))
