@@ -59,7 +59,7 @@ def run_state(
         bar(results, "late_tick_share", "<", 0.001),
         bar(results, "max_position_error_mm", "<=", 0.1),
         bar(results, "max_rotation_error_deg", "<=", 0.05),
-        bar(results, "bytes_per_frame", "<=", 3800.0 * bodies / 300.0),
+        bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
         bar(results, "delivered_hz_min", ">=", 59.0),
     ]
     params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}

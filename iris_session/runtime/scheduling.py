@@ -1,7 +1,7 @@
 """Asks the operating system to run the tick loop before other work, as far as it is allowed.
 
 On a busy machine the scheduler, not our code, decides whether a 2 ms tick is met. Linux: `SCHED_RR` needs root,
-`CAP_SYS_NICE` or an `rtprio` line in /etc/security/limits.d; without it a lower nice value is tried. What was reached
+`CAP_SYS_NICE` or an `rtprio` line in /etc/security/limits.d; without it nothing is changed. What was reached
 is shown in the session's status, so that late ticks can be explained.
 """
 
