@@ -24,7 +24,8 @@ def tick_priority(wanted: bool = True) -> Iterator[str]:
 
     Processes and threads started inside do not inherit it.
     """
-    if not wanted or sys.platform != "linux":
+    # On a single processor an overloaded loop at raised priority would starve the front, and with it the e-stop.
+    if not wanted or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
         yield "normal"
         return
     before = os.sched_getscheduler(0), os.sched_getparam(0)

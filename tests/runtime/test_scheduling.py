@@ -37,3 +37,11 @@ def test_it_is_not_asked_for_when_not_wanted(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(os, "sched_setscheduler", fail)
     with tick_priority(False) as reached:
         assert reached == "normal"
+
+
+def test_a_single_processor_is_shared_fairly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    before = os.sched_getscheduler(0)
+    with tick_priority() as reached:
+        assert reached == "normal"
+        assert os.sched_getscheduler(0) == before
