@@ -8,6 +8,7 @@ output. Ends by SIGTERM, or when its parent is gone, after writing everything th
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -81,6 +82,8 @@ class Recorder:
             self._drain_all()
             self._writer.close()
             self._say(self._received)
+            if self._header is None:
+                self._remove()
         except WriteError as error:
             self._fault = str(error)
             self._say(-1)
@@ -89,7 +92,17 @@ class Recorder:
         finally:
             self._syncer.stop()
             self._context.destroy(linger=500)
+            if os.getppid() != self._config.parent:  # killed: nobody else removes the folder of the sockets
+                shutil.rmtree(Path(self._config.feed_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
         return 0
+
+    def _remove(self) -> None:
+        """Of a session that never began (its port was in use) nothing stays behind: not the file, nor its folder."""
+        path = Path(self._writer.path)
+        path.unlink(missing_ok=True)
+        if self._made_folder:
+            with suppress(OSError):
+                path.parent.rmdir()
 
     def stop(self) -> None:
         """Asks the loop to finish the file."""
@@ -97,7 +110,7 @@ class Recorder:
 
     def _begin_part(self) -> None:
         path = part_path(self._config.path, self._part)
-        claim(Path(path))
+        self._made_folder = claim(Path(path))
         self._writer = RrdWriter(path, self._config.recording_id)
         self._writer.flush()
         self._syncer = _Syncer(path)
@@ -249,10 +262,14 @@ class _Syncer:
                 return
 
 
-def claim(path: Path) -> None:
-    """Creates the folder and the empty file. Raises `RecorderError`: no right, no space, or a file that exists."""
+def claim(path: Path) -> bool:
+    """Creates the folder and the empty file. True: there was no such folder.
+
+    Raises `RecorderError`: no right, no space, or a file that exists.
+    """
     if path.exists():
         raise RecorderError(f"{path} exists, and recordings are never overwritten: choose another file")
+    made_folder = not path.parent.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
@@ -262,6 +279,7 @@ def claim(path: Path) -> None:
     if free.f_bavail * free.f_frsize < MIN_FREE_BYTES:
         path.unlink(missing_ok=True)
         raise RecorderError(f"cannot record to {path}: less than {MIN_FREE_BYTES >> 20} MiB of the disk are free")
+    return made_folder
 
 
 def main() -> int:

@@ -21,6 +21,8 @@ from iris_session.recording.messages import FAULT_PREFIX, PART_CHUNKS, RecorderC
 from iris_session.recording.paths import part_path
 
 START_S: Final = 20.0
+#: Room is left for our own names, of folder and socket.
+LONGEST_FOLDER: Final = 75
 
 
 class RecorderProcess:
@@ -36,7 +38,9 @@ class RecorderProcess:
         self.part = 0
         self._origin_ns = origin_ns
         self._part_chunks = part_chunks
-        self._folder = tempfile.mkdtemp(prefix="iris-rec-")
+        # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
+        short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
+        self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
         self.feed_endpoint = f"ipc://{self._folder}/feed"
         self.samples_endpoint = f"ipc://{self._folder}/samples"
         self._log = Path(self._folder) / "recorder.log"

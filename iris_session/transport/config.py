@@ -93,7 +93,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
 
 
 class Ports(msgspec.Struct, frozen=True):
-    """Where the front listens. `key_fingerprint`: of the server's CURVE key, empty without one."""
+    """Where the front listens. `host`: as in an address, IPv6 in brackets. `key_fingerprint`: of the server CURVE key,
+    empty without one."""
 
     host: str
     control: int

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import gc
+import shutil
 import signal
 import sys
+from pathlib import Path
 from types import FrameType
 
 import msgspec
 
 from iris_session.transport.config import FrontError, FrontStart
 from iris_session.transport.loop import ENDED, ORPHANED, Front
-from iris_session.transport.parent import die_with_parent, parent_is
+from iris_session.transport.parent import die_with_parent, parent_ends, parent_is
 from iris_session.transport.sockets import raise_descriptor_limit
 
 
@@ -41,6 +43,9 @@ def main() -> int:
         front.run()
     finally:
         front.close()
+        if (front.cut_off or front.ended == ORPHANED) and parent_ends(start.parent_pid):
+            # Killed: nobody else removes the folder of the link.
+            shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
     return 0
 
 

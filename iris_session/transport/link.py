@@ -42,7 +42,7 @@ class FrontLink:
         self._monotonic_ns = monotonic_ns
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
         self._socket: zmq.Socket[bytes] | None = None
-        self._restarted = False
+        self._entries: list[Entry] = []
         self._presence: dict[tuple[str, str], PresenceItem] = {}
         self._presence_ns = 0
         self._sent_ns = 0
@@ -60,8 +60,10 @@ class FrontLink:
     def open(self, path: Path) -> str:
         """Listens on a new ipc socket at `path` for the next front; gives its endpoint."""
         if self._socket is not None:
+            self.receive()  # the last words of a front that died: an e-stop, the tokens it gave out
             self._socket.close(linger=0)
-            self._restarted = self._restarted or self.ports is not None
+            if self.ports is not None:
+                self._entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
         self.ports, self.failure, self.overrun = None, "", False
         self._backlog.clear()
         self._taken = 0
@@ -79,18 +81,20 @@ class FrontLink:
 
     def poll(self) -> list[Entry]:
         """Entries since the last call, in the order to be given to the authority. Never waits."""
-        entries: list[Entry] = []
-        if self._restarted:
-            self._restarted = False
-            entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
+        self.receive()
+        entries, self._entries = self._entries, []
+        return entries
+
+    def receive(self) -> None:
+        """Takes what waits; `poll` hands out the entries. Bounded by the front's credits. Never waits."""
         socket = self._socket
         if socket is None or not readable(socket):
-            return entries
+            return
         batches = 0
         for _ in range(_POLL_BOUND):
             kind, payload = socket.recv_multipart(zmq.DONTWAIT)
             if kind == messages.ENTRIES:
-                entries += decode_entries(payload)
+                self._entries += decode_entries(payload)
                 batches += 1
             elif kind == messages.HANDBACK:
                 self.handback = payload
@@ -106,7 +110,6 @@ class FrontLink:
         if self._taken >= self._acknowledge_at:
             self._send(messages.ACK, bytes((self._taken,)))
             self._taken = 0
-        return entries
 
     def send_decision(self, step: int, decision: Decision) -> None:
         """Gives the front what leaves the process; call it in every step, it also says that the session lives."""

@@ -28,6 +28,7 @@ from iris_session.transport.resume_tokens import ResumeTokens
 from iris_session.transport.sockets import (
     bound_port,
     close_tcp,
+    host_in_address,
     open_control,
     open_state,
     readable,
@@ -98,6 +99,8 @@ class Front:
             self._forget,
         )
         self.ended = ""
+        #: The link closed without a word: its process ends, or has ended already.
+        self.cut_off = False
         self._closed: list[tuple[Connection, int]] = []
         self._batches = 0
         self._entries = 0
@@ -116,7 +119,10 @@ class Front:
         self._state = open_state(self._context, config, key)
         self._monitor = watch_disconnects(self._control, "control")
         self._ports = Ports(
-            config.host, bound_port(self._control), bound_port(self._state), key.fingerprint if key else ""
+            host_in_address(config.host),
+            bound_port(self._control),
+            bound_port(self._state),
+            key.fingerprint if key else "",
         )
 
     def _session_ns(self) -> int:
@@ -280,6 +286,7 @@ class Front:
         if self._downlink.ended:
             self.end(ENDED)
         elif readable(self._link_monitor):
+            self.cut_off = True
             self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
 
     def _watch_stall(self, now_ns: int) -> None:

@@ -8,11 +8,15 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
+
+#: Room is left for our own names, of folder and socket.
+LONGEST_FOLDER: Final = 75
 
 
 class FrontProcess:
@@ -32,7 +36,7 @@ class FrontProcess:
     def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
         self._config = config
         self._scene = scene
-        self._folder = tempfile.TemporaryDirectory(prefix="iris-")  # mode 0700
+        self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_folder_for_sockets())  # mode 0700
         self._generation = 0
         self._process: subprocess.Popen[bytes] | None = None
         self.link = FrontLink(config)
@@ -61,7 +65,9 @@ class FrontProcess:
 
     def restart(self) -> None:
         """Replaces a front that died, on the same ports. Does not wait: `link.ports` is set when it is ready."""
-        self._end_process(0.0)
+        if self._process is not None:
+            self._process.kill()  # dead, or it reads nothing any more: no step waits for its answer
+            self._process.wait()
         ports = self.link.ports
         if ports is not None:
             self._config = msgspec.structs.replace(self._config, control_port=ports.control, state_port=ports.state)
@@ -77,7 +83,7 @@ class FrontProcess:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             running = self._process is not None and self._process.poll() is None
-            self.link.poll()
+            self.link.receive()
             if self.link.ports is not None:
                 return self.link.ports
             if self.link.failure or not running:
@@ -123,3 +129,8 @@ class FrontProcess:
         self._process = None
         self.link.close()
         self._folder.cleanup()
+
+
+def _folder_for_sockets() -> str | None:
+    """The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one."""
+    return None if len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER else "/tmp"

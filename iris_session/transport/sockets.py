@@ -83,6 +83,11 @@ def open_state(
     return state
 
 
+def host_in_address(host: str) -> str:
+    """`host` as it stands before `:PORT`: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host and not host.startswith("[") else host
+
+
 def readable(socket: zmq.Socket[bytes]) -> bool:
     """Whether a message waits. Cheaper than to poll, or to receive and catch `Again`."""
     return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
@@ -152,7 +157,8 @@ def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: ServerKey | None, 
         bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public)
         bound.setsockopt(zmq.CURVE_SECRETKEY, key.secret)
     try:
-        bound.bind(f"tcp://{config.host}:{port or '*'}")
+        bound.setsockopt(zmq.IPV6, int(":" in config.host))
+        bound.bind(f"tcp://{host_in_address(config.host)}:{port or '*'}")
     except zmq.ZMQError as error:
         if error.errno == zmq.EADDRINUSE:
             advice = f"pass --{name}-port 0 for any free one"

@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -155,14 +156,36 @@ def test_the_file_is_finished_when_the_parent_dies(tmp_path: Path) -> None:
         "while feed.stats.recorder is None or feed.stats.recorder.expecting < 20: time.sleep(0.01); feed.flush()\n"
         "print(process.pid, flush=True); os.kill(os.getpid(), 9)"
     )
+    folder = tmp_path / "tmp"
+    folder.mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", script, str(path)], cwd=REPOSITORY, stdout=subprocess.PIPE, timeout=60, check=False
+        [sys.executable, "-c", script, str(path)],
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        timeout=60,
+        check=False,
+        env={**os.environ, "TMPDIR": str(folder)},
     )
     pid = int(done.stdout)
     wait_until(lambda: not _exists(pid))
+    assert list(folder.iterdir()) == [], "nobody else can remove the folder of the sockets"
     with Recording.open(path) as recording:
         assert recording.finished
         assert [row.step for row in recording.rows()] == list(range(200))
+
+
+def test_a_session_that_never_began_leaves_no_file(tmp_path: Path) -> None:
+    with recorder(tmp_path / "new" / "session.rrd"):
+        assert (tmp_path / "new" / "session.rrd").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    record(tmp_path / "session.rrd", 20)
+    assert list(folder.iterdir()) == []
 
 
 def test_ctrl_c_does_not_end_the_recorder(tmp_path: Path) -> None:

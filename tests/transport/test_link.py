@@ -192,3 +192,26 @@ def test_failure_status_and_scene_pass(pair: Pair) -> None:
     scene, end = pair.heard()
     assert messages.decode_scene(scene[1]).scene_hash == "other"
     assert end[0] == messages.END
+
+
+def test_the_last_words_of_a_front_that_died_are_heard(pair: Pair) -> None:
+    pair.ready()
+    stop = Entry(3, 3, 5, EStop("stop"))
+    pair.say(messages.ENTRIES, encode_entries([stop]))
+    pair.say(messages.HANDBACK, b"tokens")
+    assert pair.link._socket is not None
+    while not pair.link._socket.poll(1000):
+        pass
+    pair.far.close()
+    pair.far = pair.connect("b")
+    assert pair.link.handback == b"tokens"
+    heard = [entry.message for entry in pair.link.poll()]
+    assert heard == [EStop("stop"), FrontRestarted()]
+
+
+def test_entries_that_come_right_after_ready_are_kept(pair: Pair) -> None:
+    pair.say(messages.READY, msgspec.msgpack.encode(Ports("127.0.0.1", 1, 2)))
+    pair.say(messages.ENTRIES, encode_entries([Entry(1, 1, 5, Heartbeat())]))
+    while pair.link.ports is None:
+        pair.link.receive()
+    assert [entry.message for entry in pair.poll(1)] == [Heartbeat()]

@@ -102,6 +102,28 @@ def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_too_long_for_a_socket_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
+    process.start()
+    process.close()
+    assert list(folder.iterdir()) == []
+
+
+def test_ipv6(open_session: OpenSession) -> None:
+    session = open_session(host="::1")
+    assert session.ports.host == "[::1]"
+    with session.context.socket(zmq.DEALER) as client:
+        client.linger = 0
+        client.ipv6 = True
+        client.connect(f"tcp://{session.ports.host}:{session.ports.control}")
+        client.send(encode_client(envelope(Hello("operator", "Ann", secret=b"s" * 16))))
+        session.wait_entries(Join)
+        session.pump(lambda: bool(client.poll(0)), "welcome over IPv6")
+
+
 def test_clients_are_told_when_the_session_is_closed(session: FrontSession) -> None:
     client = session.client()
     client.join()
@@ -200,8 +222,9 @@ while True:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_front_does_not_outlive_its_parent(number: signal.Signals) -> None:
-    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
+def test_the_front_does_not_outlive_its_parent(number: signal.Signals, tmp_path: Path) -> None:
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True, env=environment)
     assert parent.stdout is not None
     port, pid = map(int, parent.stdout.readline().split())
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -219,6 +242,7 @@ def test_the_front_does_not_outlive_its_parent(number: signal.Signals) -> None:
     while client.poll(100):
         messages.append(decode_server(client.recv()).message)
     assert [m.code for m in messages if isinstance(m, ProtocolFault)][-1] == "session_ended"
+    assert list(tmp_path.iterdir()) == [], "nobody else can remove the folder of the link"
     context.destroy(linger=0)
 
 
