@@ -113,7 +113,8 @@ class Connection:
         """Says bye; leases are released at once. What `peek_outgoing` still shows should be sent."""
         if self.welcome is not None:
             self._queue(Bye())
-            self.identity.resume_token = b""
+            if self.phase is not Phase.REFUSED:  # then the token in a shared file may be that of who took over
+                self.identity.resume_token = b""
         self.phase = Phase.CLOSED
 
     def lost(self, now_ns: int) -> None:
@@ -306,6 +307,9 @@ class Connection:
         self._granted.update((lease.target, lease) for lease in reply.leases)
         if reply.request_id in self._pending:
             self._pending.discard(reply.request_id)
+            while len(self._replies) >= MAX_PENDING:
+                del self._replies[next(iter(self._replies))]
+                self.counters.inbox_dropped += 1
             self._replies[reply.request_id] = reply
         elif reply.request_id:
             self.counters.unexpected_replies += 1

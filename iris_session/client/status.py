@@ -29,7 +29,7 @@ class ConnectionCounters:
     malformed: int = 0  # frames that do not fit the protocol
     other_connection: int = 0  # addressed to an earlier connection of ours
     unexpected_replies: int = 0
-    inbox_dropped: int = 0  # events and feedback that the application did not fetch
+    inbox_dropped: int = 0  # events, feedback and replies that the application did not fetch
     snapshots: int = 0
     reconnects: int = 0
     faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`

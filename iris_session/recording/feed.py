@@ -191,11 +191,14 @@ class RecorderFeed:
         elif self._spill.push(body, rows):
             self.stats.spilled_batches += 1
         else:
-            self.stats.dropped_rows += rows
-            self.stats.spill_fault = self._spill.fault
-            self._gap_rows += rows
-            self._lost = True
-            self._batch.dropped_rows = self.stats.dropped_rows
+            self._lose(rows, self._spill.fault)
+
+    def _lose(self, rows: int, why: str) -> None:
+        self.stats.dropped_rows += rows
+        self.stats.spill_fault = why
+        self._gap_rows += rows
+        self._lost = True
+        self._batch.dropped_rows = self.stats.dropped_rows
 
     def _send_batch(self, body: bytes) -> None:
         number, self._next = self._next, self._next + 1
@@ -212,7 +215,12 @@ class RecorderFeed:
         for _ in range(UNSPILL_BATCHES):
             if not self._spill or self.stats.window_bytes >= self._window_limit:
                 break
-            record = self._spill.pop()
+            try:
+                record = self._spill.pop()
+            except OSError as error:  # a disk that fails must not end the session
+                self._lose(self._spill.rows, f"the spill file cannot be read: {error}")
+                self._spill.close()
+                break
             if record is not None:
                 self._send_batch(record[0])
         self.stats.waiting_in_spill = len(self._spill)

@@ -11,7 +11,8 @@ _HEAD: Final = struct.Struct("<II")  # bytes of the record, rows in it
 
 
 class SpillFile:
-    """Records of bytes in the order of `push`, at most `limit_bytes` on disk. The file exists only while it holds any.
+    """Records of bytes in the order of `push`, at most `limit_bytes` on disk. It has no name in the
+    folder: nothing stays behind, however the process ends. `rows`: journal rows in the queue.
 
     `push` returns False when the disk or the limit refuses the record, which is then not in the queue.
     """
@@ -23,6 +24,7 @@ class SpillFile:
         self._read_at = 0
         self._write_at = 0
         self.records = 0
+        self.rows = 0
         self.fault = ""
 
     def __len__(self) -> int:
@@ -38,6 +40,7 @@ class SpillFile:
             if self._fd < 0:
                 flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
                 self._fd = os.open(self._path, flags, 0o600)
+                self._path.unlink()  # nobody else reads it, and a killed session leaves nothing behind
             written = os.pwrite(self._fd, record, self._write_at)
         except OSError as error:
             self.fault = f"the spill file {self._path} cannot be written: {error.strerror}"
@@ -47,24 +50,31 @@ class SpillFile:
             return False
         self._write_at += len(record)
         self.records += 1
+        self.rows += rows
         return True
 
     def pop(self) -> tuple[bytes, int] | None:
         """The oldest record as `(data, rows)`, None when empty. Raises `OSError` when the file cannot be read."""
         if not self.records:
             return None
-        length, rows = _HEAD.unpack(os.pread(self._fd, _HEAD.size, self._read_at))
-        data = os.pread(self._fd, length, self._read_at + _HEAD.size)
+        length, rows = _HEAD.unpack(self._read(_HEAD.size, self._read_at))
+        data = self._read(length, self._read_at + _HEAD.size)
         self._read_at += _HEAD.size + length
         self.records -= 1
+        self.rows -= rows
         if not self.records:
             self.close()
         return data, rows
+
+    def _read(self, n: int, at: int) -> bytes:
+        data = os.pread(self._fd, n, at)
+        if len(data) != n:
+            raise OSError(f"the spill file holds {len(data)} of {n} bytes at {at}")
+        return data
 
     def close(self) -> None:
         """Removes the file and what is in it."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-            self._path.unlink(missing_ok=True)
-        self._read_at = self._write_at = self.records = 0
+        self._read_at = self._write_at = self.records = self.rows = 0

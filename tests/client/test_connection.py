@@ -13,6 +13,7 @@ from iris_session.client.connection import (
     HELLO_TIMEOUT_NS,
     MAX_INBOX,
     MAX_OUTGOING,
+    MAX_PENDING,
     Connection,
 )
 from iris_session.client.errors import NotConnectedError, VersionError
@@ -331,6 +332,25 @@ def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
     assert wire.connection.identity.resume_token == b""
     with pytest.raises(NotConnectedError, match="closed"):
         wire.connection.send(EStop())
+
+
+def test_a_client_whose_identity_was_taken_over_leaves_the_token_to_the_other(wire: Wire) -> None:
+    wire.join()
+    wire.get(ProtocolFault("dropped", "the session let this connection go: replaced"), MS)
+    assert wire.connection.phase is Phase.REFUSED
+    wire.connection.close()
+    assert wire.connection.identity.resume_token == b"token"
+
+
+def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
+    wire.join()
+    ids = []
+    for _ in range(MAX_PENDING + 5):
+        ids.append(wire.connection.request(Acquire(0)))
+        wire.get(Reply(ids[-1], True), MS)
+    assert wire.connection.counters.inbox_dropped == 5
+    assert wire.connection.take_reply(ids[4]) is None
+    assert wire.connection.take_reply(ids[5]) == Reply(ids[5], True)
 
 
 @given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -167,6 +168,24 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
     assert batch.dropped_rows == lost
     assert batch.keyframes[0].step == 499
     assert not feed.close(0.0)
+
+
+def test_a_spill_file_that_cannot_be_read_back_is_a_gap_and_not_the_end(played) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
+    feed.header(make_header())
+    steps(feed, 0, 300)
+    waiting = feed._spill.rows
+    os.ftruncate(feed._spill._fd, 10)
+    recorder.say(feed, 1, -1, -1)
+    recorder.take(1)
+    while feed.stats.window_bytes:
+        _, number, _ = recorder.take(1)[0]
+        recorder.say(feed, 1, number + 1, number)
+    assert feed.take_gap() == feed.stats.dropped_rows == waiting > 0
+    assert "cannot be read" in feed.stats.spill_fault
+    assert feed.wants_keyframe
+    feed.close(0.0)
 
 
 def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
