@@ -76,7 +76,8 @@ def _latch(ctx: Context, p: Participant, lease: LeaseState, g: Grant, s: Sample)
 
 
 def _may_engage(ctx: Context, p: Participant, lease: LeaseState) -> bool:
-    if ctx.state.estop or ctx.state.paused:
+    # In the step of a reset the world seen is the one before it: nothing may be latched against that.
+    if ctx.state.estop or ctx.state.paused or ctx.reset:
         return False
     return not lease.override or lease.override == p.id or p.role in HUMAN
 

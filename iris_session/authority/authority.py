@@ -24,14 +24,22 @@ from iris_session.authority import (
     samples,
     stops,
 )
-from iris_session.authority.config import AuthorityConfig
+from iris_session.authority.config import POSITIVE, AuthorityConfig
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, LeaseState, Participant, State
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import HOST, URGENT, Entry
-from iris_session.protocol.names import AssignmentPolicy, DenialReason, LeaseMode, RejectReason, Role, TargetKind
+from iris_session.protocol.names import (
+    AssignmentPolicy,
+    DenialReason,
+    Device,
+    LeaseMode,
+    RejectReason,
+    Role,
+    TargetKind,
+)
 from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply, Snapshot
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
@@ -40,6 +48,8 @@ from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, World
 DIRECTING: Final = (cm.Assign, cm.SetMode, cm.Control, cm.ClearEStop, cm.PlaceAlignment)
 #: Entries that only the process that owns the session may make.
 HOST_ONLY: Final = (em.ExternalReset, em.StalledGap, em.FrontRestarted, em.RecordingGap)
+
+NOT_JOINED: Final = Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first")
 
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(State)
@@ -149,7 +159,7 @@ class Authority:
         observed: list[Entry] = []
         spent: dict[int, int] = {}
         self._gone: list[int] = []
-        self._released: dict[int, int] = {}
+        self._released: list[tuple[int, int, frozenset[str]]] = []
         for index, entry in enumerate(entries):
             if isinstance(entry.message, URGENT):
                 self._apply_urgent(index, entry)
@@ -163,7 +173,7 @@ class Authority:
                 self._over_quota(entry)
             elif isinstance(m, cm.Sample):
                 observed.append(entry)
-            elif isinstance(m, (cm.Acquire, cm.Grasp)) and index < self._released.get(entry.connection, -1):
+            elif isinstance(m, (cm.Acquire, cm.Grasp)) and self._released_again(index, entry.connection, m):
                 self._deny(entry, Denial(DenialReason.INVALID, "released again within the same step", "acquire again"))
             else:
                 others.append(entry)
@@ -175,12 +185,16 @@ class Authority:
     def _apply_urgent(self, index: int, entry: Entry) -> None:
         ctx, m = self._ctx, entry.message
         p = ctx.by_connection.get(entry.connection)
-        if p is None:
-            self._gone.append(entry.connection)
-            return
-        if isinstance(m, cm.EStop):
-            # An honest stop must not fail on a stale envelope: only the connection itself is checked.
-            stops.estop(ctx, p, m)
+        if isinstance(m, cm.EStop) and (p is not None or entry.connection <= ctx.state.last_connection):
+            # An honest stop must not fail on a stale envelope, nor because its sender was just given up: only that the
+            # session once knew the connection is checked.
+            stops.estop(ctx, p.id if p is not None else "", m)
+        elif p is None:
+            if isinstance(m, (em.Lost, cm.Bye)):
+                self._gone.append(entry.connection)
+            else:
+                samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
+                self._deny(entry, NOT_JOINED)
         elif isinstance(m, em.Lost):
             roster.lose(ctx, p, m.reason)
             self._gone.append(entry.connection)
@@ -191,7 +205,15 @@ class Authority:
             self._gone.append(entry.connection)
         elif isinstance(m, cm.Release):
             leases.release(ctx, p, m)
-            self._released[entry.connection] = index
+            self._released.append((index, entry.connection, frozenset(t.name for t in m.targets)))
+
+    def _released_again(self, index: int, connection: int, m: cm.Acquire | cm.Grasp) -> bool:
+        """Whether a later release of this step, applied already, meant what this request asks for."""
+        names = {m.object} if isinstance(m, cm.Grasp) else {*m.robots, *m.objects}
+        return any(
+            sender == connection and index < at and (not released or not names or names & released)
+            for at, sender, released in self._released
+        )
 
     def _over_quota(self, entry: Entry) -> None:
         ctx, m = self._ctx, entry.message
@@ -219,7 +241,7 @@ class Authority:
         p = ctx.by_connection.get(entry.connection)
         if p is None:
             samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
-            self._deny(entry, Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first"))
+            self._deny(entry, NOT_JOINED)
         elif entry.connection_epoch != entry.connection and not isinstance(m, em.AlignmentProposal):
             samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
             denial = Denial(DenialReason.NOT_JOINED, "the envelope names another connection", "use the latest welcome")
@@ -280,6 +302,12 @@ def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: 
         raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
     if config.leader_apart not in ("ramp", "refuse"):
         raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
+    missing = sorted(Device.ALL - config.speed_limits.keys())
+    if missing:
+        raise ValueError(f"speed_limits lacks {', '.join(missing)}; it must have every device")
+    for name in POSITIVE:
+        if not getattr(config, name) > 0:
+            raise ValueError(f"{name} is {getattr(config, name)}; it must be positive")
 
 
 def _heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:

@@ -34,6 +34,20 @@ SPEED_LIMITS: Final[dict[str, SpeedLimit]] = {
 }
 
 
+#: Settings without which nothing can work, or that something is divided by.
+POSITIVE: Final = (
+    "freshness_ns",
+    "gap_ns",
+    "heartbeat_timeout_ns",
+    "reach_m",
+    "quota",
+    "max_participants",
+    "max_sub_holders",
+    "max_step_ticks",
+    "contact_step_n",
+)
+
+
 class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Configuration of `Authority`. Times in nanoseconds of session time, lengths in metres, angles in radians.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from iris_session.authority.context import Context
@@ -29,7 +30,8 @@ def _report_robot(ctx: Context, command: Command, state: FeedbackState) -> None:
     if not holders:
         return
     step = ctx.config.contact_step_n
-    contact_n = round(ctx.view.gripper_force(command.robot) / step) * step
+    force = ctx.view.gripper_force(command.robot)
+    contact_n = round(force / step) * step if math.isfinite(force) else 0.0  # not finite: physics that diverged
     limits: tuple[str, ...] = next((c.limits for c in ctx.control if c.robot == command.robot), ())
     for name in dict.fromkeys(holders):
         p = ctx.state.participants[name]

@@ -28,6 +28,8 @@ def revoke(ctx: Context, lease: LeaseState, g: Grant) -> None:
         engagement.give_back(ctx, lease)
     lease.grants.remove(g)
     if lease.kind == TargetKind.OBJECT:
+        if not lease.grants:
+            lease.lead = 0  # nobody holds it from here on: it may lie anywhere when it is next taken
         ctx.refresh_held()
 
 

@@ -23,6 +23,8 @@ MIN_WEIGHT: Final = 1e-3
 
 def acquire(ctx: Context, p: Participant, m: Acquire) -> None:
     """All or none of the named robots and objects; without names, what the assignment policy chooses."""
+    if ctx.state.queue:
+        advance(ctx)  # what was freed earlier in this step belongs to those who wait for it
     robots, objects = tuple(dict.fromkeys(m.robots)), tuple(dict.fromkeys(m.objects))
     denial = _acquire_denial(ctx, p, m, robots, objects)
     any_robot = not robots and not objects
@@ -222,12 +224,17 @@ def consent(ctx: Context, p: Participant, m: Consent) -> None:
         denial = Denial(DenialReason.CONSENT_REFUSED, f"{p.name} said no", "", lease.target, ctx.holder(lease))
         return ctx.deny(requester, pending.request_id, denial)
     del pending.consents[m.consent_id]
+    pending.granted[lease.target] = ctx.holder(lease)
     return None if pending.consents else _consented(ctx, requester, pending)
 
 
 def _consented(ctx: Context, p: Participant, pending: Pending) -> None:
     leases.drop_request(ctx, pending)
-    denial, _ = _obstacles(ctx, p, pending, ctx.state.queue)
+    denial, consent = _obstacles(ctx, p, pending, ctx.state.queue)
+    # Consent is that of one holder: somebody may have taken one of the robots since.
+    unasked = [lease for lease in consent if pending.granted.get(lease.target) != ctx.holder(lease)]
+    if denial is None and unasked:
+        denial = held_by_other(ctx, unasked[0])
     if denial is not None:
         ctx.deny(p, pending.request_id, denial)
     else:

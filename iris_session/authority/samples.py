@@ -177,8 +177,10 @@ def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
         if s.device in g.armed:
             g.armed.remove(s.device)
         if not g.engagement:
-            # The cause of an earlier stop (e-stop, reset) stays visible until the clutch opens.
-            if hold == HoldReason.UNALIGNED or g.hold in (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN):
+            # The cause of an earlier stop (e-stop, reset) stays visible until the clutch opens, and another device that
+            # is ready to engage stays ready.
+            shown = hold == HoldReason.UNALIGNED or g.hold in (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
+            if shown and not g.armed:
                 g.hold = hold
         elif g.device == s.device:
             engagement.end(ctx, lease, g, hold)

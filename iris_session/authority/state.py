@@ -116,7 +116,8 @@ class LeaseState(msgspec.Struct):
 class Pending(msgspec.Struct):
     """An `acquire` that has not been answered yet: it waits in the queue, or for consents.
 
-    `consents`: consent id -> robot whose holder has not answered. `expires_ns` 0: never.
+    `consents`: consent id -> robot whose holder has not answered; `granted`: robot -> holder who gave it.
+    `expires_ns` 0: never.
     """
 
     participant: str
@@ -126,6 +127,7 @@ class Pending(msgspec.Struct):
     weight: float
     any_robot: bool = False
     consents: dict[int, str] = {}
+    granted: dict[str, str] = {}
     expires_ns: int = 0
 
 

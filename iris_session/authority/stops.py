@@ -11,12 +11,12 @@ from iris_session.protocol.names import ControlAction, DenialReason, HoldReason
 from iris_session.protocol.server_messages import EStopChanged, Gap, PauseChanged, SceneChanged
 
 
-def estop(ctx: Context, p: Participant, m: EStop) -> None:
-    """Latched; every robot holds from this step on."""
+def estop(ctx: Context, participant: str, m: EStop) -> None:
+    """Latched; every robot holds from this step on. `participant`: empty for one who was given up before."""
     ctx.estop_arrived = True
     if not ctx.state.estop:
         ctx.state.estop = True
-        ctx.emit(EStopChanged(True, p.id, m.reason))
+        ctx.emit(EStopChanged(True, participant, m.reason))
         engagement.rearm_all(ctx, HoldReason.ESTOP)
 
 

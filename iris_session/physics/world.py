@@ -10,6 +10,7 @@ date, because after `mj_step` the user's own derived quantities are those of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Final, NoReturn
 
@@ -188,7 +189,8 @@ class World:
             mujoco.mj_setState(self.model, self._shown, self._state, STATE)
             self.diverged = ""
             return
-        self._show(round(float(self._state[0]) / float(self.model.opt.timestep)))
+        time = float(self._state[0])
+        self._show(round(time / float(self.model.opt.timestep)) if math.isfinite(time) else self._tick)
 
     def _show(self, tick: int) -> None:
         """`_state` into the shown data with everything derived, contact forces too; the state itself stays as it is."""

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
+from iris_session.authority.config import SpeedLimit
 from iris_session.client.session_state import SessionMirror
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -160,6 +161,8 @@ def test_join_order_of_effects_is_that_of_the_entries() -> None:
         ({"policy": "luck"}, (), (), "unknown assignment policy 'luck'"),
         ({"assignments": {"anna": ("b",)}}, (robot("a"),), (), "unknown robots"),
         ({"leader_apart": "jump"}, (), (), "must be 'ramp' or 'refuse'"),
+        ({"speed_limits": {"head": SpeedLimit(1.0, 1.0)}}, (), (), "speed_limits lacks controller/left, "),
+        ({"contact_step_n": 0.0}, (), (), "contact_step_n is 0.0; it must be positive"),
     ],
 )
 def test_construction_says_what_would_be_right(config: dict[str, Any], robots: Any, objects: Any, text: str) -> None:

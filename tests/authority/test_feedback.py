@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import msgspec
+import pytest
 
 from iris_session.protocol.server_messages import Feedback
 from iris_session.protocol.steps import ControlStatus
@@ -37,3 +39,12 @@ def test_feedback_tells_force_limits_and_rejections() -> None:
     t.wait(100 * MS)
     assert anna.told["left"] == Feedback("left", "hold", "rejected", 3.5, ("left/joint1",), {"scene_epoch": 1})
     assert anna.told.keys() == {"left"}
+
+
+@pytest.mark.parametrize("force", [math.nan, math.inf])
+def test_forces_of_physics_that_diverged_are_not_felt(force: float) -> None:
+    t = Table()
+    anna = t.operator("left")
+    t.view = msgspec.structs.replace(t.view, forces={"left": force})
+    t.wait(100 * MS)
+    assert anna.told["left"].contact_n == 0.0

@@ -12,7 +12,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import LeaseChanged, ObjectGrasped
 
-from .table import MS, Person, Table
+from .table import MS, Person, Table, make_view
 
 LEFT: dict[str, Any] = {"device": "hand/left", "p": (-1.0, 0.0, 0.0)}
 RIGHT: dict[str, Any] = {"device": "hand/right", "p": (-0.5, 0.0, 0.0)}
@@ -95,3 +95,33 @@ def test_acquired_objects_take_any_hand_and_a_reset_drops_them() -> None:
     assert [c.object for c in t.decision.objects] == ["hammer", "board"]
     boss.does(Control(1, "reset"))
     assert t.decision.objects == ()
+
+
+def test_an_object_that_everyone_let_go_is_taken_from_where_it_lies() -> None:
+    t, anna = holding()
+    move(anna, LEFT, 0.01, "hammer")
+    bert = t.operator()
+    anna.does(Release())
+    version = t.last(LeaseChanged).lease.lease_version + 1
+    t.view = make_view(objects={"hammer": Pose((0.0, 0.3, 0.0), (1.0, 0.0, 0.0, 0.0))})
+    bert.versions["hammer"] = version
+    hand = {"device": "hand/right", "p": (-0.5, 0.0, 0.0)}
+    bert_opens = bert.says(bert.sample("hammer", **hand))
+    t.step(
+        bert.says(Grasp(1, "hammer", "hand/right")), bert_opens, bert.says(bert.sample("hammer", clutch=True, **hand))
+    )
+    assert t.decision.objects[0].T_world_object.p == pytest.approx((0.0, 0.3, 0.0))
+
+
+def test_nothing_is_taken_hold_of_in_the_step_of_a_reset() -> None:
+    """What is seen of the world in that step is gone a moment later."""
+    t, anna = holding()
+    boss = t.join("director")
+    anna.does(anna.sample("hammer", **LEFT))
+    anna.scene_epoch = 2
+    opens, closes = (anna.says(anna.sample("hammer", clutch=c, **LEFT)) for c in (False, True))
+    t.step(boss.says(Control(1, "reset")), opens, closes)
+    assert t.decision.reset
+    assert t.decision.objects == ()
+    anna.engage("hammer", **LEFT)
+    assert t.decision.objects != ()

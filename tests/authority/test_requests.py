@@ -383,3 +383,37 @@ def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
         assert len(denial.message) <= 512
         assert denial.advice.endswith("more")
         assert len(denial.advice) <= 512
+
+
+def test_a_release_denies_only_what_it_meant() -> None:
+    """The urgent lane applies a release before an acquire that was sent earlier in the same step."""
+    t = Table()
+    anna = t.operator("left")
+    t.step(anna.says(Acquire(1, ("right",))), anna.says(Release(2, (anna.target("left"),))))
+    assert [(r.request_id, r.ok) for r in anna.replies()] == [(2, True), (1, True)]
+    t.step(anna.says(Acquire(3, ("left",))), anna.says(Release(4, (anna.target("right"),))), anna.says(Release(5)))
+    assert [(r.request_id, r.ok) for r in anna.replies()][-1] == (3, False)
+    assert t.hold("left") == t.hold("right") == "no_lease"
+
+
+def test_consent_of_one_holder_takes_nothing_from_another() -> None:
+    t = with_mode("request")
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(1, ("left", "right")))
+    asked = t.last(ConsentRequested)
+    assert asked.target == "left"
+    assert carl.acquire("right").ok
+    anna.does(Consent(2, asked.consent_id, True))
+    denial = bert.replies()[0].denial
+    assert denial is not None
+    assert (denial.reason, denial.target, denial.holder) == ("held", "right", carl.id)
+    assert t.last(LeaseChanged).lease.holder == carl.id
+
+
+def test_who_waits_for_any_robot_is_not_overtaken_in_the_step_of_the_release() -> None:
+    t = Table(robots=(robot("left"),))
+    anna, bert, carl = t.operator("left"), t.join(), t.join()
+    bert.does(Acquire(1, wait=True))
+    t.step(anna.says(Release(2)), carl.says(Acquire(3, ("left",))))
+    assert bert.replies()[0].leases[0].holder == bert.id
+    assert carl.replies()[0].denial.reason == "held"  # type: ignore[union-attr]

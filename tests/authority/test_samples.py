@@ -216,3 +216,13 @@ def test_float_fields_may_hold_whole_numbers_of_a_host_program() -> None:
     source = t.command().sources[0]
     assert source.absolute
     assert all(isinstance(c, float) for c in (*source.pose_world.p, *source.pose_world.q, t.command().gripper))
+
+
+def test_a_rejected_device_does_not_speak_for_another_that_is_ready() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.sends("left", clutch=False)
+    anna.sends("left", device="hand/left", scene_epoch=9)
+    assert t.hold() == "clutch_open"
+    anna.sends("left", clutch=True)
+    assert t.command().kind == "pose"

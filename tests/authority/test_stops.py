@@ -6,13 +6,14 @@ import pytest
 
 from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Release
-from iris_session.protocol.entries import Entry, ExternalReset, Lost, RecordingGap, StalledGap
+from iris_session.protocol.entries import Entry, ExternalReset, Join, Lost, RecordingGap, StalledGap
 from iris_session.protocol.server_messages import (
     EpisodeChanged,
     EStopChanged,
     Gap,
     LeaseChanged,
     PauseChanged,
+    SamplesRejected,
     SceneChanged,
 )
 
@@ -181,3 +182,19 @@ def test_release_acts_before_an_acquire_that_was_sent_earlier() -> None:
     assert [(r.request_id, r.ok) for r in other.replies()] == [(2, True), (1, False)]
     t.step(other.says(Release(3)), other.says(Acquire(4, ("right",))))
     assert [(r.request_id, r.ok) for r in other.replies()] == [(3, True), (4, True)]
+
+
+def test_one_who_was_just_given_up_still_stops_everything() -> None:
+    t, _, _ = playing()
+    lost = t.join()
+    t.step(Entry(lost.connection, lost.connection, t.now_ns, Lost("net")))
+    lost.does(EStop("from afar"))
+    assert t.hold() == "estop"
+    assert t.since(EStopChanged) == [EStopChanged(True, "", "from afar")]
+
+
+def test_a_stop_that_comes_with_its_senders_hello_does_not_end_the_connection() -> None:
+    t = Table()
+    t.step(Entry(7, 7, t.now_ns, EStop()), Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
+    assert [a.connection for a in t.decision.admitted] == [7]
+    assert t.since(SamplesRejected) == [SamplesRejected("", "", "connection_epoch", 1)]

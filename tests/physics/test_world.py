@@ -340,6 +340,10 @@ def test_snapshots_of_others_are_refused(handover: mujoco.MjModel) -> None:
         world.restore(World(handover, (), ()).snapshot())
     with pytest.raises(SnapshotError, match="state of 8 bytes"):
         world.set_state_bytes(bytes(8))
+    state = np.frombuffer(world.state_bytes()).copy()
+    state[0] = np.nan  # the time
+    with pytest.raises(SimulationDivergedError, match="not finite"):
+        world.set_state_bytes(state.tobytes())
     with_robots = World(handover, find_robots(handover), ())
     with pytest.raises(SnapshotError, match="0 robots, but this world has 2"):
         with_robots.restore(World(handover, (), ()).snapshot())
