@@ -37,6 +37,9 @@ class CoreConfig(msgspec.Struct, frozen=True):
     initial_state: bytes = b""
 
 
+_decode_config = msgspec.msgpack.Decoder(CoreConfig).decode
+
+
 class StepOutcome(msgspec.Struct, frozen=True):
     """What one step gave: the authority's decision, control's report, and the digest (16 bytes) of all of it."""
 
@@ -64,10 +67,11 @@ class SessionCore:
     """
 
     def __init__(self, model: mujoco.MjModel, config: CoreConfig) -> None:
-        self.config = config
+        #: As a recording gives it back: a whole number in a float field would change `round(x / step)` and the digest.
+        self.config = config = _decode_config(_encoder.encode(config))
         self.world = World(model, config.robots, config.objects)
         self._reset_world()
-        self.authority = Authority(config.authority, config.robots, config.objects)
+        self.authority = Authority(_within_control(config), config.robots, config.objects)
         self.controller = Controller(model, config.robots, config.objects, config.control)
         self.controller.reset(self.world.data)
         self._status: tuple[ControlStatus, ...] = ()
@@ -130,6 +134,13 @@ class SessionCore:
         self.authority.restore(state.authority)
         self.controller.restore(state.controller)
         self._status = _decode_status(state.status)
+
+
+def _within_control(config: CoreConfig) -> AuthorityConfig:
+    """The authority's configuration without the motion scales that control would not follow."""
+    authority, control = config.authority, config.control
+    low, high = max(authority.min_scale, control.min_scale), min(authority.max_scale, control.max_scale)
+    return msgspec.structs.replace(authority, min_scale=low, max_scale=high)
 
 
 def plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:

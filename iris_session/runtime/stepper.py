@@ -198,10 +198,10 @@ def _checked(message: EntryMessage) -> EntryMessage:
     cut = {name: text[: MAX_TEXT - 3] + "..." for name, text in texts.items() if len(text) > MAX_TEXT}
     checked: EntryMessage = msgspec.structs.replace(message, **cut) if cut else message
     try:
-        decode_entry(encode_entry(Entry(HOST, HOST, 0, checked)))
+        # What is journaled is what is used: whole numbers in float fields become floats, lists tuples.
+        return decode_entry(encode_entry(Entry(HOST, HOST, 0, checked))).message
     except msgspec.ValidationError as error:
         raise ValueError(f"{type(message).__name__} cannot be used: {error}") from error
-    return checked
 
 
 def session_clock(origin_ns: int) -> Callable[[], int]:
