@@ -10,25 +10,23 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import zmq
 
-from anchors.pose import PoseTuple
 from iris_session.client.connection import Connection
 from iris_session.client.errors import ClientError, DeniedError, NotConnectedError, RequestTimeoutError
 from iris_session.client.identity import Identity
 from iris_session.client.requests import Requests
+from iris_session.client.sampling import Sampling
 from iris_session.client.scene_view import SceneView
 from iris_session.client.sockets import ClientSockets, CurveKeys, parse_address
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
 from iris_session.client.waiting import milliseconds
-from iris_session.protocol.client_messages import ClientMessage, Hello, Sample
-from iris_session.protocol.common import Pose, Target
-from iris_session.protocol.names import AlignmentKind, Role, SampleKind
+from iris_session.protocol.client_messages import ClientMessage, Hello
+from iris_session.protocol.names import AlignmentKind, Role
 from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault, Reply
 
 #: Roles that have no headset, so nothing to align.
@@ -36,7 +34,7 @@ UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDE
 DEFAULT_TIMEOUT_S = 5.0
 
 
-class Client(SceneView, Requests):
+class Client(SceneView, Requests, Sampling):
     """A participant of a session.
 
     `address`: `HOST:PORT` of the control channel. `devices`: tracked sources of input that samples will name.
@@ -90,7 +88,7 @@ class Client(SceneView, Requests):
         self.on_feedback = on_feedback
         self.feedback: dict[str, Feedback] = {}
         self._state: SceneState | None = None
-        self._seq: dict[str, int] = {}
+        self._seq = {}
         self._generation = 0
         self._sockets = ClientSockets(host, port, curve)
         self._lock = threading.RLock()
@@ -171,15 +169,30 @@ class Client(SceneView, Requests):
             raise self.connection.failure
         return progressed
 
+    def poll_state(self) -> bool:
+        """Only takes the state that waits, and hands it to `on_state`; everything else is left to `poll`.
+
+        For a loop with several clients: all of them have their picture before the rest of any is looked at.
+        """
+        with self._lock:
+            state, progressed = self._drain_state()
+        if state is not None and self.on_state is not None:
+            self.on_state(state)
+        return progressed
+
     @property
     def registration(self) -> tuple[int, bool]:
         """Changes when `register` would add something else than before."""
         return self._sockets.version, self.connection.peek_outgoing() is not None
 
-    def register(self, poller: zmq.Poller) -> None:
-        """Adds our sockets to `poller`; `poll` is due when they wake it and at `connection.next_deadline_ns`."""
-        if self.connection.phase is not Phase.CLOSED:
-            self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
+    def register(self, poller: zmq.Poller) -> zmq.Socket[bytes] | None:
+        """Adds our sockets to `poller`; `poll` is due when they wake it and at `connection.next_deadline_ns`.
+
+        Returns the one that state comes by: `poll_state` is enough when only that wakes.
+        """
+        if self.connection.phase is Phase.CLOSED:
+            return None
+        return self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
 
     def wait_for(self, condition: Callable[[Self], bool], timeout_s: float = DEFAULT_TIMEOUT_S) -> bool:
         """Polls (or waits for the thread) until `condition(client)` is true; false after `timeout_s`."""
@@ -231,46 +244,6 @@ class Client(SceneView, Requests):
             self._send_soon()
             return queued
 
-    def send_sample(self, device: str, pose: PoseTuple | None = None, **fields: Any) -> bool:
-        """Makes one sample of `device` with `make_sample` and sends it."""
-        return self.send(self.make_sample(device, pose, **fields))
-
-    def make_sample(
-        self,
-        device: str,
-        pose: PoseTuple | None = None,
-        *,
-        robots: Iterable[str] = (),
-        objects: Iterable[str] = (),
-        kind: str = SampleKind.POSE,
-        capture_ns: int | None = None,
-        tracking_epoch: int | None = None,
-        **fields: Any,
-    ) -> Sample:
-        """A sample of `device` as of now; epochs, versions, tokens and `seq` are filled in.
-
-        `pose`: `T_tracking_device`. `robots`, `objects`: what it drives; those that are not ours are left out, so the
-        sample is mere presence when none is. `capture_ns`: session time of capture, default now. `fields`: the other
-        fields of `Sample` (`clutch`, `gripper`, `q`, `twist`, ...).
-        """
-        with self._lock:
-            targets = [*self._targets(robots, "robot"), *self._targets(objects, "object")]
-            seq = self._seq[device] = self._seq.get(device, 0) + 1
-            alignment = self.alignment
-            return Sample(
-                device=device,
-                kind=kind,
-                seq=seq,
-                capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                scene_epoch=self.connection.mirror.scene_epoch,
-                tracking_epoch=self.tracking_epoch if tracking_epoch is None else tracking_epoch,
-                alignment_version=0 if alignment is None else alignment.version,
-                targets=tuple(targets),
-                worn=fields.pop("worn", self.worn),
-                pose=None if pose is None else Pose(*pose),
-                **fields,
-            )
-
     def submit(self, message: Any) -> int:
         """Sends a message that has a `request_id` (which is filled in) without waiting; `answer` has the reply."""
         with self._lock:
@@ -313,10 +286,6 @@ class Client(SceneView, Requests):
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _targets(self, names: Iterable[str], kind: str) -> list[Target]:
-        tokens = ((name, self.connection.lease_version(name)) for name in names)
-        return [Target(name, token, kind) for name, token in tokens if token is not None]
-
     def _send_soon(self) -> None:
         if self._thread is None or threading.current_thread() is self._thread:
             self._flush()
@@ -329,13 +298,12 @@ class Client(SceneView, Requests):
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
             phase = self.connection.phase
-            state, progressed = self._drain_state()
-        if state is not None and self.on_state is not None:
-            self.on_state(state)
+        progressed = self.poll_state()
         with self._lock:
-            if self._sockets.disconnected() and self._generation == self.connection.generation:
+            gone = self._sockets.disconnected() and self._generation == self.connection.generation
+            progressed |= self._drain_control()  # the last words of a session before its end
+            if gone and self._generation == self.connection.generation:
                 self.connection.lost(time.monotonic_ns())
-            progressed |= self._drain_control()
             self.connection.tick(time.monotonic_ns())
             self._flush()
             progressed |= self.connection.phase is not phase
@@ -352,7 +320,7 @@ class Client(SceneView, Requests):
         state = self.connection.stream.drain(messages, self.session_now_ns())
         if state is not None:
             now_ns = self.session_now_ns()  # decoding is part of the age
-            state = replace(state, received_ns=now_ns, age_ns=now_ns - state.header.session_time)
+            state = SceneState(state.header, state.poses, now_ns, now_ns - state.header.session_time)
             self._state = state
         return state, bool(messages)
 

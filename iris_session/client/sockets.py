@@ -22,6 +22,10 @@ CONTROL_HWM: Final = 64
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
 LINGER_MS: Final = 200
+#: As plain integers: operations on the enumerations take longer than asking the socket.
+_EVENTS: Final = int(zmq.EVENTS)
+_POLLIN: Final = int(zmq.POLLIN)
+_NOBLOCK: Final = int(zmq.NOBLOCK)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +134,17 @@ class ClientSockets:
             lost = bool(self._monitor.recv_multipart(zmq.NOBLOCK))
         return lost
 
-    def register(self, poller: zmq.Poller, *, sending: bool) -> None:
-        """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more."""
+    def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
+        """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more.
+
+        Returns the state socket.
+        """
         if self._control is not None:
             poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
         for sock in (self._monitor, self._state):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
+        return self._state
 
     def register_wake(self, poller: zmq.Poller) -> None:
         """Adds what `wake` wakes to `poller`."""
@@ -185,13 +193,23 @@ class ClientSockets:
 
 
 def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
-    """Whether something is there. Asking first costs a tenth of the exception of an empty receive."""
-    return sock is not None and bool(int(sock.get(zmq.EVENTS)) & zmq.POLLIN)
+    """Whether something is there. Asking first costs less than the exception of an empty receive."""
+    return sock is not None and bool(sock.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
 def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:
     """What is there now."""
     messages: list[list[bytes]] = []
     while len(messages) < MAX_DRAIN and _readable(sock):
-        messages.append(sock.recv_multipart(zmq.NOBLOCK))
+        messages.append(_receive(sock))
     return messages
+
+
+def _receive(sock: zmq.Socket[bytes]) -> list[bytes]:
+    """The message that is there. Half the time of `recv_multipart`, which asks anew whether more frames follow."""
+    frame = sock.recv(_NOBLOCK, copy=False)
+    frames = [frame.bytes]
+    while frame.more:
+        frame = sock.recv(_NOBLOCK, copy=False)
+        frames.append(frame.bytes)
+    return frames

@@ -152,7 +152,7 @@ class StateStream:
             self.wants_snapshot = True
             return None
         self.counters.delivered += 1
-        poses = decoder.poses.copy()
+        poses = decoder.poses.view()
         poses.flags.writeable = False
         return SceneState(header, poses, now_ns, now_ns - header.session_time)
 

@@ -22,14 +22,13 @@ class ClientGroup:
 
     group = ClientGroup(clients)
     while running:
-        for client in group.wait(0.1):
-            client.poll(0.0)
+        group.poll(0.1)
     """
 
     def __init__(self, clients: Sequence[Client]) -> None:
         self.clients = tuple(clients)
         self._poller = zmq.Poller()
-        self._owners: dict[int, Client] = {}
+        self._owners: dict[int, tuple[Client, bool]] = {}  # by socket; whether only state comes by it
         self._registered: list[tuple[int, bool]] = []
 
     def wait(self, timeout_s: float) -> list[Client]:
@@ -37,15 +36,31 @@ class ClientGroup:
 
         Returns those to be polled: something came for them, or their own timer is due.
         """
+        state, rest = self._wait(timeout_s)
+        return [c for c in self.clients if c in state or c in rest]
+
+    def poll(self, timeout_s: float) -> None:
+        """Waits like `wait`, then polls: first the state of all for whom state came, then the rest of those who have
+        anything else to do. So nobody's picture waits for the chores of others."""
+        state, rest = self._wait(timeout_s)
+        for client in state:
+            client.poll_state()
+        for client in rest:
+            client.poll(0.0)
+
+    def _wait(self, timeout_s: float) -> tuple[list[Client], list[Client]]:
+        """Clients for whom state came, and those for whom anything else came or whose timer is due."""
         now = time.monotonic_ns()
         due = [client.connection.next_deadline_ns(now) for client in self.clients]
         deadline = min(now + int(timeout_s * 1e9), *due)
         registered = [client.registration for client in self.clients]
         if registered != self._registered:
             self._register(registered)
-        ready = {id(self._owners[id(sock)]) for sock, _ in self._poller.poll(milliseconds(deadline - now))}
+        woken = [self._owners[id(sock)] for sock, _ in self._poller.poll(milliseconds(deadline - now))]
         now = time.monotonic_ns()
-        return [c for c, due_ns in zip(self.clients, due, strict=True) if due_ns <= now or id(c) in ready]
+        rest = [c for c, due_ns in zip(self.clients, due, strict=True) if due_ns <= now]
+        rest += [c for c, only_state in woken if not only_state and c not in rest]
+        return [c for c, only_state in woken if only_state], rest
 
     def _register(self, registered: list[tuple[int, bool]]) -> None:
         self._registered = registered
@@ -53,9 +68,9 @@ class ClientGroup:
         self._owners = {}
         for client in self.clients:
             first = len(self._poller.sockets)
-            client.register(self._poller)
+            state = client.register(self._poller)
             for sock, _ in self._poller.sockets[first:]:
-                self._owners[id(sock)] = client
+                self._owners[id(sock)] = client, sock is state
 
 
 def wait_any(clients: Sequence[Client], timeout_s: float) -> list[Client]:

@@ -239,20 +239,20 @@ def _worth_quantising(index: Ints) -> Mask:
 class RigidDecoder:
     """Mirror of the poses of `n_bodies` bodies.
 
-    `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz`, updated in place; NaN until first received.
+    `poses`: (n_bodies, 7) float64, world frame, `x y z qw qx qy qz`, NaN until first received. Every frame makes a new
+    array, so an earlier one may be kept.
     `state_seq`: newest frame taken, 0 for none. `valid` (n_bodies,): which poses are within the bound at that frame.
     `stale_frames`: frames ignored because a newer one was taken before.
     """
 
     def __init__(self, n_bodies: int) -> None:
         self.n_bodies = n_bodies
-        self.poses: Floats = np.empty((n_bodies, 7))
         self._held = np.empty(n_bodies, np.int64)
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything: for a new connection, whose frames may be numbered anew."""
-        self.poses.fill(np.nan)
+        self.poses: Floats = np.full((self.n_bodies, 7), np.nan)
         self._held.fill(-1)  # newest frame at which the pose was known to be within the bound
         self.state_seq = 0
         self.base_seq = 0
@@ -279,12 +279,17 @@ class RigidDecoder:
             self.stale_frames += 1
             return self.complete
         mask, poses, escapes = _unpack(payload, self.n_bodies)
+        self.state_seq, self.base_seq = state_seq, base_seq
+        if len(poses) == self.n_bodies:  # everything moves: the common case, and the one that must be fast
+            self.poses = poses
+            self._held.fill(state_seq)
+            return self.complete
+        self.poses = self.poses.copy()
         self.poses[mask] = poses
         self._held[mask] = state_seq
         if len(escapes):
             self.poses[escapes["body"]] = escapes["pose"]
             self._held[escapes["body"]] = state_seq
-        self.state_seq, self.base_seq = state_seq, base_seq
         self._carry_over()
         return self.complete
 
@@ -298,6 +303,7 @@ class RigidDecoder:
         if poses.shape != (self.n_bodies, 7):
             raise StreamError(f"keyframe has shape {poses.shape}, expected ({self.n_bodies}, 7)")
         older = self._held < state_seq
+        self.poses = self.poses.copy()
         self.poses[older] = poses[older]
         self._held[older] = state_seq
         if state_seq > self.state_seq:
