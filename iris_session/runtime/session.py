@@ -17,6 +17,7 @@ announced when they die (`runtime.processes`).
 
 from __future__ import annotations
 
+import atexit
 import signal
 import threading
 import time
@@ -109,6 +110,7 @@ class Session:
         self._stop.set()
         if self._attached:
             mujoco.set_mjcb_control(None)
+            atexit.unregister(self.close)
             self._attached = False
         if self._user_loop is not None:
             self._user_loop.close()
@@ -204,15 +206,19 @@ class Session:
 
         Uses MuJoCo's control callback, which is global to the process: it acts on `data` only, once per new time, and
         takes time going back as a reset. RK4 calls it four times a step and is refused (`OwnershipError`), as is a
-        callback that is already set.
+        callback that is already set. The session ends with `close()`, or with the script.
         """
         if int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
             raise OwnershipError("attach() cannot be used with the RK4 integrator: set integrator='implicitfast'")
         if mujoco.get_mjcb_control() is not None:
             raise OwnershipError("MuJoCo's control callback is in use: call begin_tick() and end_tick() instead")
         session = cls(model, data, config)
-        session.start()
-        loop = session._loop()
+        try:
+            session.start()
+            loop = session._loop()
+        except BaseException:
+            session.close()
+            raise
 
         def on_control(_: mujoco.MjModel, callback_data: mujoco.MjData) -> None:
             if callback_data is data:
@@ -220,6 +226,7 @@ class Session:
 
         mujoco.set_mjcb_control(on_control)
         session._attached = True
+        atexit.register(session.close)  # a script may simply end
         return session
 
     def _loop(self) -> UserLoop:

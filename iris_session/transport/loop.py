@@ -50,6 +50,9 @@ STATUS_NS = 500 * MILLISECOND
 COLLECT_NS = 10_000 * MILLISECOND
 #: A restarted front numbers its state frames above those of its predecessor: state is sent at less than 1 kHz.
 SEQ_NS = MILLISECOND
+#: Between the last message and the end of the connections: libzmq throws away what a client (with `IMMEDIATE`) has
+#: not read when its connection closes.
+FAREWELL_S = 0.1
 ENDED = "closed by its owner"
 ORPHANED = "its process is gone"
 
@@ -146,6 +149,8 @@ class Front:
             poller.poll(0 if busy else IDLE_MS)
             busy = self._pass()
         self._downlink.broadcast(ProtocolFault(FaultCode.SESSION_ENDED, f"the session has ended: {self.ended}"))
+        if len(self._clients):
+            time.sleep(FAREWELL_S)
 
     def _pass(self) -> bool:
         """One pass of the loop. True when clients still have something to say."""

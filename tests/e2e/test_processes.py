@@ -91,11 +91,33 @@ def test_a_killed_authority_leaves_a_whole_recording_and_no_process(stage: Stage
     stage.server.process.kill()
     stage.server.process.wait()
     driving.sending = False
-    none_left(children)
     stage.run(lambda: not driving.client.connection.joined, "ann knows that the session is gone")
+    none_left(children)
+    assert "session_ended" in driving.client.connection.counters.faults
     report = stage.server.verify()
     assert report["finished"]
     assert report["last_step"] >= tick - 1, "what the client saw is in the file"
+
+
+def test_an_authority_that_stands_still_is_announced(stage: Stage, driving: Hand) -> None:
+    """A suspended process: the front says `stalled`, nobody loses a lease, robots hold until clutched again."""
+    ann = driving.client
+    stage.server.process.send_signal(signal.SIGSTOP)
+    try:
+        stage.run(lambda: ann.connection.stalled, "the front says that the session stands still")
+        before = driving.tip
+        stage.seconds(4.0)  # longer than heartbeats may be missing
+    finally:
+        stage.server.process.send_signal(signal.SIGCONT)
+    stage.run(lambda: not ann.connection.stalled, "the session steps again")
+    stage.run(lambda: any(isinstance(e.body, Gap) for e in stage.events["ann"]), "the gap is an event")
+    stage.seconds(0.5)
+    assert distance(before[0], driving.tip[0]) < 5e-3
+    assert ann.lease_version("left") is not None
+    assert ann.connection.counters.reconnects == 0
+    driving.velocity = (0.0, 0.0, 0.0)
+    stage.engage(driving)
+    stage.server.finish()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -13,7 +13,7 @@ from anchors.pose import distance
 from iris_session.client import DeniedError
 from iris_session.protocol.names import CommandKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import Gap, MarkerAdded, SceneChanged
-from tests.e2e.conftest import Server, Stage, end_all, verify
+from tests.e2e.conftest import Server, Stage, end_all, none_left, relatives, verify
 
 pytestmark = pytest.mark.e2e
 
@@ -69,6 +69,16 @@ with Session(model, data, config) as session:
         mujoco.mj_step(model, data)
         session.end_tick()
         time.sleep(0.0015)
+print("ended in order", flush=True)
+"""
+
+#: No `close()`: the session ends with the script.
+LAST_LINE = """
+session = Session.attach(model, data, config)
+say(session)
+while obey():
+    mujoco.mj_step(model, data)
+    time.sleep(0.0015)
 print("ended in order", flush=True)
 """
 
@@ -165,6 +175,17 @@ def test_an_attached_script(script: Callable[[str], Stage]) -> None:
     assert state is not None
     assert state.header.tick == round(state.header.sim_time / 0.002)
     _end(stage)
+
+
+def test_an_attached_script_that_simply_ends(script: Callable[[str], Stage]) -> None:
+    stage = script(LAST_LINE)
+    _drive(stage)
+    children = relatives(stage.server.process.pid)
+    _end(stage)
+    none_left(children)
+    assert verify(stage.server.recording)["finished"]
+    ann = stage.clients[0]
+    stage.run(lambda: "session_ended" in ann.connection.counters.faults, "everyone is told that it ended")
 
 
 @pytest.mark.parametrize("body", [TICKS, ATTACH], ids=["ticks", "attach"])
