@@ -14,6 +14,7 @@ from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.runtime.core import CoreConfig, SessionCore
 from iris_session.runtime.stepper import Stepper
+from tests.runtime.fuzz_core import run
 from tests.runtime.play import make_core
 from tests.runtime.replay_stress import play, replay, replay_elsewhere
 
@@ -63,3 +64,12 @@ class Quiet:
     def send_decision(self, step: int, decision: Decision) -> None: ...
 
     def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None: ...
+
+
+@pytest.mark.parametrize("seed", [12, 13])
+def test_no_entry_raises_or_jumps(seed: int) -> None:
+    """Random schema-valid entries, most of them nonsense (see `fuzz_core`)."""
+    fuzz = run(seed, 6000)
+    assert fuzz.moved > 10
+    assert fuzz.rejected >= {"not_finite", "not_holder", "quota", "seq", "stale", "unknown_value"}
+    assert fuzz.largest < 200_000
