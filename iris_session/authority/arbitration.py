@@ -162,9 +162,9 @@ class Commands:
             return self._hold(lease.target, HoldReason.ESTOP if ctx.state.estop else g.hold)
         source = _aged(ctx, g)
         last = self._last.get(lease.target)
-        if last is not None and last.sources[0] is source and len(last.sources) == 1:
+        if last is not None and last.sources[0] is source and last.scale == g.scale and len(last.sources) == 1:
             return last
-        command = Command(lease.target, g.kind, "", (source,), g.gripper)
+        command = Command(lease.target, g.kind, "", (source,), g.gripper, g.scale)
         self._last[lease.target] = command
         return command
 
@@ -185,7 +185,7 @@ class Commands:
         sources = tuple(_weighted(_aged(ctx, g), g.weight / total) for g in engaged)
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
         gripper = sum(w * v for w, v in gripping) / sum(w for w, _ in gripping) if gripping else None
-        return Command(lease.target, kind, "", sources, gripper)
+        return Command(lease.target, kind, "", sources, gripper, ctx.scale(lease))
 
 
 def _aged(ctx: Context, g: Grant) -> CommandSource:

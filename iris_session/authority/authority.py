@@ -6,6 +6,7 @@ Reads no clock, random source or set order; equal calls give equal decisions, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from iris_session.authority import (
     requests,
     roster,
     samples,
+    scaling,
     stops,
 )
 from iris_session.authority.config import POSITIVE, AuthorityConfig
@@ -308,6 +310,10 @@ def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: 
     for name in POSITIVE:
         if not getattr(config, name) > 0:
             raise ValueError(f"{name} is {getattr(config, name)}; it must be positive")
+    if not 0.0 < config.min_scale <= config.max_scale < math.inf:
+        raise ValueError(
+            f"min_scale {config.min_scale} and max_scale {config.max_scale} must be positive, finite and in this order"
+        )
 
 
 def _heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:
@@ -334,6 +340,7 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Consent: requests.consent,
     cm.Assign: requests.assign,
     cm.SetMode: requests.set_mode,
+    cm.SetScale: scaling.set_scale,
     cm.Grasp: requests.grasp,
     cm.Observation: _observation,
     em.AlignmentProposal: alignment.propose,

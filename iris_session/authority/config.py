@@ -80,6 +80,8 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_consents: int = 16
     consent_timeout_ns: int = 15 * SECOND
     max_sub_holders: int = 4  # people who share one robot, hands that hold one object
+    min_scale: float = 0.05  # motion scaling that holders may set; those of `ControlConfig`
+    max_scale: float = 5.0
     # alignment
     max_error_at_robot_m: float = 0.05  # stated p95; above it the alignment is refused with advice
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning

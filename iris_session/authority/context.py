@@ -39,6 +39,8 @@ class Context:
         self.config = config
         self.robots = {r.name: r for r in robots}
         self.objects = {o.name: o for o in objects}
+        #: Scale of a robot that nobody has set another for.
+        self.plain_scale = min(max(1.0, config.min_scale), config.max_scale)
         self.view: WorldView = FixedView()
         self.control: Sequence[ControlStatus] = ()
         self.now_ns = 0
@@ -113,6 +115,11 @@ class Context:
         """Participant in charge of a target: the overriding human, else the first holder; empty when free."""
         return lease.override or (lease.grants[0].participant if lease.grants else "")
 
+    def scale(self, lease: LeaseState) -> float:
+        """Motion scaling of the one in charge; that of a free robot is what its next holder begins with."""
+        holder = self.holder(lease)
+        return next((g.scale for g in lease.grants if g.participant == holder), self.plain_scale)
+
     def lease_info(self, lease: LeaseState) -> Lease:
         """A lease as everyone sees it. In mode `priority` an agent and its stand-by human are both sub-holders."""
         holder = self.holder(lease)
@@ -133,6 +140,7 @@ class Context:
             tuple(waiting) if lease.kind == TargetKind.ROBOT else (),
             tuple(weights),
             tuple(weights.values()),
+            self.scale(lease) if lease.kind == TargetKind.ROBOT else 1.0,
         )
 
     def publish(self, lease: LeaseState, cause: str, previous_holder: str = "") -> None:

@@ -46,7 +46,8 @@ def grant(ctx: Context, lease: LeaseState, p: Participant, cause: str, weight: f
     if not joins:
         clear(ctx, lease)
     lease.version += 1
-    lease.grants.append(Grant(p.id, lease.version, weight, hand))
+    scale = ctx.scale(lease) if lease.mode == LeaseMode.SHARED else ctx.plain_scale
+    lease.grants.append(Grant(p.id, lease.version, weight, hand, scale))
     if lease.kind == TargetKind.OBJECT:
         ctx.refresh_held()
     ctx.publish(lease, cause, previous if previous != p.id else "")

@@ -74,14 +74,15 @@ class Grant(msgspec.Struct):
     """The right of one participant on one target, its clutch latches and its engagement.
 
     `version`: fencing token; tokens from it up to the lease's own are valid, so a second sharer does not fence the
-    first. `hand`: the only device that may use it (objects taken with `grasp`). `armed`: devices whose clutch was seen
-    open since the last rearm. `engagement` 0: not engaged, and `hold` says why.
+    first. `hand`: the only device that may use it (objects taken with `grasp`). `scale`: motion scaling (robots).
+    `armed`: devices whose clutch was seen open since the last rearm. `engagement` 0: not engaged, `hold` says why.
     """
 
     participant: str
     version: int
     weight: float = 1.0
     hand: str = ""
+    scale: float = 1.0
     armed: list[str] = []
     hold: str = HoldReason.NO_SAMPLE
     engagement: int = 0

@@ -23,6 +23,7 @@ from iris_session.protocol.client_messages import (
     PlaceAlignment,
     Release,
     SetMode,
+    SetScale,
     TrackingEpoch,
 )
 from iris_session.protocol.common import Lease, Pose, Target
@@ -86,6 +87,14 @@ class Requests:
     def set_mode(self, robot: str, mode: str) -> None:
         """Director: changes the lease mode of a robot."""
         self.request(SetMode(0, robot, mode))
+
+    def set_scale(self, robots: Sequence[str] = (), scale: float = 1.0) -> tuple[Lease, ...]:
+        """How far robots that we hold move as our hand moves: 1 as far, 0.1 a tenth. Without names, all that we hold.
+
+        A director may set it for whoever holds them. Back to 1 with the next holder. Raises `DeniedError`: not ours, or
+        out of range.
+        """
+        return self.request(SetScale(0, tuple(robots), scale)).leases
 
     def place_alignment(self, participant: str, T_world_tracking: PoseTuple, *, offset: bool = False) -> None:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""

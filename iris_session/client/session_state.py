@@ -27,6 +27,7 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
     PauseChanged,
     RobotInfo,
+    ScaleChanged,
     SceneChanged,
     Snapshot,
 )
@@ -159,6 +160,9 @@ class SessionMirror:
                 self._leave(name, grace)
             case LeaseChanged(lease=lease):
                 self.leases[lease.target] = lease
+            case ScaleChanged(robot=robot, scale=scale):
+                if robot in self.leases:
+                    self.leases[robot] = msgspec.structs.replace(self.leases[robot], scale=scale)
             case AlignmentChanged(participant=name, alignment=alignment):
                 info_or_none = self.participants.get(name)
                 if info_or_none is not None:

@@ -134,6 +134,18 @@ class SetMode(Message, frozen=True, tag="set_mode"):
     mode: Name
 
 
+class SetScale(Message, frozen=True, tag="set_scale"):
+    """A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+
+    Translations and twists are scaled, rotations, joints and device `target` are not. The scale is that of the present
+    holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+    """
+
+    request_id: Count
+    robots: Names = ()
+    scale: float = 1.0
+
+
 class Grasp(Message, frozen=True, tag="grasp"):
     """A hand without a robot takes a free object. The lease on the object comes back in the `Reply`."""
 
@@ -221,6 +233,7 @@ ClientMessage = (
     | Consent
     | Assign
     | SetMode
+    | SetScale
     | Grasp
     | Observation
     | PlaceAlignment

@@ -46,6 +46,7 @@ class Lease(msgspec.Struct, frozen=True):
     `sub_holders` and `weights` have the same length: everyone who shares the target (mode `shared`, objects), or an
     agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0).
     In mode `shared` a token stays valid for its holder when others join and raise `lease_version`.
+    `scale`: motion scaling of a robot in the hands of `holder`, 1 when nothing else was set.
     """
 
     target: Name
@@ -57,6 +58,7 @@ class Lease(msgspec.Struct, frozen=True):
     queue: tuple[Name, ...] = ()
     sub_holders: tuple[Name, ...] = ()
     weights: tuple[float, ...] = ()
+    scale: float = 1.0
 
 
 class Denial(msgspec.Struct, frozen=True):

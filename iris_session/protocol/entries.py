@@ -29,6 +29,7 @@ from iris_session.protocol.client_messages import (
     Release,
     Sample,
     SetMode,
+    SetScale,
     TrackingEpoch,
 )
 from iris_session.protocol.common import Count, Name, Nanoseconds, Pose, Text
@@ -113,6 +114,7 @@ EntryMessage = (
     | Consent
     | Assign
     | SetMode
+    | SetScale
     | Grasp
     | Observation
     | AlignmentProposal

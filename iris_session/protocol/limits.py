@@ -33,6 +33,7 @@ from iris_session.protocol.client_messages import (
     Release,
     Sample,
     SetMode,
+    SetScale,
     TrackingEpoch,
 )
 from iris_session.protocol.server_messages import (
@@ -73,6 +74,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Consent: _REQUEST,
         Assign: _REQUEST,
         SetMode: _REQUEST,
+        SetScale: _REQUEST,
         Grasp: _REQUEST,
         Observation: Limit(2_000, 60, 120),
         PlaceAlignment: _REQUEST,

@@ -179,6 +179,14 @@ class EngagementChanged(EventBody, frozen=True, tag="engagement_changed"):
     reason: Name = ""
 
 
+class ScaleChanged(EventBody, frozen=True, tag="scale_changed"):
+    """`participant` set the motion scaling of a robot for its holder. When a holder goes, `LeaseChanged` tells it."""
+
+    robot: Name
+    scale: float
+    participant: Name
+
+
 class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
     participant: Name
     alignment: Alignment
@@ -266,6 +274,7 @@ EventKind = (
     | ConsentRequested
     | Intervention
     | EngagementChanged
+    | ScaleChanged
     | AlignmentChanged
     | SceneChanged
     | EStopChanged

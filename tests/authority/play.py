@@ -205,6 +205,7 @@ class Play:
                 cm.Release(1, tuple(Target(n, rng.randrange(4)) for n in names)),
                 cm.Release(1, tuple(Target(n, self.state.robots[n].version) for n in names[:1])),
                 cm.Consent(1, rng.choice(self.consents[-2:]), rng.random() < 0.7),
+                cm.SetScale(1, names, rng.choice([0.1, 1.0, 2.0, 9.0, math.nan])),
             ]
         )
         self.say(client, message)

@@ -16,6 +16,7 @@ from iris_session.protocol.server_messages import (
     MarkerAdded,
     ObjectGrasped,
     Reply,
+    ScaleChanged,
 )
 from tests.client.harness import LiveSession
 
@@ -52,6 +53,31 @@ def test_a_director_directs(session: LiveSession, join: Join) -> None:
     boss.episode(EpisodeAction.SUCCESS)
     assert boss.wait_for(lambda c: len(bodies(events, EpisodeChanged)) >= 2)
     assert bodies(events, MarkerAdded) == [MarkerAdded(boss.participant_id, "look here")]
+
+
+def test_a_holder_scales_the_motion_of_its_robot_for_all_to_see(session: LiveSession, join: Join) -> None:
+    events: list[Event] = []
+    ann, bob = join(), join("bob", on_event=events.append)
+    ann.acquire(["left"])
+    (lease,) = ann.set_scale(["left"], 0.25)
+    assert (lease.target, lease.scale) == ("left", 0.25)
+    assert bob.wait_for(lambda c: c.mirror.leases["left"].scale == 0.25)
+    assert bodies(events, ScaleChanged) == [ScaleChanged("left", 0.25, ann.participant_id)]
+    late = join("late")
+    assert late.mirror.leases["left"].scale == 0.25
+    seq = late.mirror.event_seq
+    hashes = []
+    for client in (ann, bob, late):
+        assert client.wait_for(lambda c: c.mirror.event_seq >= seq)
+        hashes.append((client.mirror.event_seq, client.mirror.mirror_hash()))
+    assert len(set(hashes)) == 1
+    with pytest.raises(DeniedError, match=r"0\.05 to 5"):
+        ann.set_scale(["left"], 100.0)
+    with pytest.raises(DeniedError) as denied:
+        bob.set_scale(["left"], 0.5)
+    assert (denied.value.denial.reason, denied.value.denial.holder) == (DenialReason.NOT_HOLDER, ann.participant_id)
+    ann.release("left")
+    assert bob.wait_for(lambda c: c.mirror.leases["left"].scale == 1.0)
 
 
 def test_an_operator_may_not_direct(session: LiveSession, join: Join) -> None:

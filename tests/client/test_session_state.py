@@ -21,6 +21,7 @@ from iris_session.protocol.server_messages import (
     ParticipantJoined,
     ParticipantLeft,
     PauseChanged,
+    ScaleChanged,
     SceneChanged,
     Snapshot,
 )
@@ -36,6 +37,7 @@ bodies = st.one_of(
     st.builds(ParticipantLeft, names, st.just("silent"), flags),
     st.builds(lambda p, v: LeaseChanged(Lease("left", "robot", "exclusive", p, v), "acquired"), names, counts),
     st.builds(lambda p, v: AlignmentChanged(p, Alignment(v, "measured", IDENTITY)), names, counts),
+    st.builds(ScaleChanged, st.sampled_from(["left", "gone"]), st.sampled_from([0.1, 1.0]), names),
     st.builds(SceneChanged, counts, counts, st.just("reset")),
     st.builds(EStopChanged, flags, names),
     st.builds(PauseChanged, flags),

@@ -308,6 +308,7 @@ class Stress:
             cm.Control(1, "reset"),
             cm.Control(1, "step", 3),
             cm.SetMode(1, rng.choice(robots), rng.choice([*MODES, "request"])),
+            cm.SetScale(1, (rng.choice(robots),), rng.choice([0.1, 0.5, 1, 3.0, math.nan])),
             cm.Assign(1, tuple(rng.sample(robots, 1)), rng.choice(["", person.id])),
             cm.PlaceAlignment(1, person.id, Pose((0.2, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), rng.random() < 0.5),
             cm.Episode(1, rng.choice(["start", "success", "rerecord"])),

@@ -684,7 +684,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 20 messages, told apart by the field "type".</summary>
+    /// <summary>One of 21 messages, told apart by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -705,6 +705,7 @@ namespace IrisSession.Protocol
                 case Consent.TagName: return Consent.Read(reader);
                 case Assign.TagName: return Assign.Read(reader);
                 case SetMode.TagName: return SetMode.Read(reader);
+                case SetScale.TagName: return SetScale.Read(reader);
                 case Grasp.TagName: return Grasp.Read(reader);
                 case Observation.TagName: return Observation.Read(reader);
                 case PlaceAlignment.TagName: return PlaceAlignment.Read(reader);
@@ -742,7 +743,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 18 messages, told apart by the field "event".</summary>
+    /// <summary>One of 19 messages, told apart by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
         public abstract string Tag { get; }
@@ -759,6 +760,7 @@ namespace IrisSession.Protocol
                 case ConsentRequested.TagName: return ConsentRequested.Read(reader);
                 case Intervention.TagName: return Intervention.Read(reader);
                 case EngagementChanged.TagName: return EngagementChanged.Read(reader);
+                case ScaleChanged.TagName: return ScaleChanged.Read(reader);
                 case AlignmentChanged.TagName: return AlignmentChanged.Read(reader);
                 case SceneChanged.TagName: return SceneChanged.Read(reader);
                 case EStopChanged.TagName: return EStopChanged.Read(reader);
@@ -839,6 +841,7 @@ namespace IrisSession.Protocol
     /// sub_holders and weights have the same length: everyone who shares the target (mode shared, objects), or an
     /// agent and the human who stands by (mode priority; the one in charge is holder and has weight 1, the other 0).
     /// In mode shared a token stays valid for its holder when others join and raise lease_version.
+    /// scale: motion scaling of a robot in the hands of holder, 1 when nothing else was set.
     /// </summary>
     public sealed class Lease : WireValue
     {
@@ -851,6 +854,7 @@ namespace IrisSession.Protocol
         public string[] Queue = new string[0];
         public string[] SubHolders = new string[0];
         public double[] Weights = new double[0];
+        public double Scale = 1.0;
 
         public static Lease Read(WireReader reader)
         {
@@ -869,6 +873,7 @@ namespace IrisSession.Protocol
                     case "queue": value.Queue = reader.ReadStrings(); break;
                     case "sub_holders": value.SubHolders = reader.ReadStrings(); break;
                     case "weights": value.Weights = reader.ReadDoubles(0); break;
+                    case "scale": value.Scale = reader.ReadDouble(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -878,7 +883,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(9);
+            writer.WriteMapHeader(10);
             writer.Write("target");
             writer.Write(Target);
             writer.Write("kind");
@@ -897,6 +902,8 @@ namespace IrisSession.Protocol
             writer.Write(SubHolders);
             writer.Write("weights");
             writer.Write(Weights);
+            writer.Write("scale");
+            writer.Write(Scale);
         }
     }
 
@@ -1765,6 +1772,52 @@ namespace IrisSession.Protocol
             writer.Write(Robot);
             writer.Write("mode");
             writer.Write(Mode);
+        }
+    }
+
+    /// <summary>
+    /// A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+    ///
+    /// Translations and twists are scaled, rotations, joints and device target are not. The scale is that of the present
+    /// holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+    /// </summary>
+    public sealed class SetScale : ClientMessage
+    {
+        public const string TagName = "set_scale";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string[] Robots = new string[0];
+        public double Scale = 1.0;
+
+        public static SetScale Read(WireReader reader)
+        {
+            SetScale value = new SetScale();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); seen |= 1u; break;
+                    case "robots": value.Robots = reader.ReadStrings(); break;
+                    case "scale": value.Scale = reader.ReadDouble(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of SetScale");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("robots");
+            writer.Write(Robots);
+            writer.Write("scale");
+            writer.Write(Scale);
         }
     }
 
@@ -2909,6 +2962,49 @@ namespace IrisSession.Protocol
             writer.Write(Engaged);
             writer.Write("reason");
             writer.Write(Reason);
+        }
+    }
+
+    /// <summary>
+    /// participant set the motion scaling of a robot for its holder. When a holder goes, LeaseChanged tells it.
+    /// </summary>
+    public sealed class ScaleChanged : EventKind
+    {
+        public const string TagName = "scale_changed";
+        public override string Tag { get { return TagName; } }
+        public string Robot = "";
+        public double Scale = 0.0;
+        public string Participant = "";
+
+        public static ScaleChanged Read(WireReader reader)
+        {
+            ScaleChanged value = new ScaleChanged();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "robot": value.Robot = reader.ReadString(); seen |= 1u; break;
+                    case "scale": value.Scale = reader.ReadDouble(); seen |= 2u; break;
+                    case "participant": value.Participant = reader.ReadString(); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of ScaleChanged");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("robot");
+            writer.Write(Robot);
+            writer.Write("scale");
+            writer.Write(Scale);
+            writer.Write("participant");
+            writer.Write(Participant);
         }
     }
 

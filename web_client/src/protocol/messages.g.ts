@@ -237,6 +237,7 @@ export type Target = [
  * `sub_holders` and `weights` have the same length: everyone who shares the target (mode `shared`, objects), or an
  * agent and the human who stands by (mode `priority`; the one in charge is `holder` and has weight 1, the other 0).
  * In mode `shared` a token stays valid for its holder when others join and raise `lease_version`.
+ * `scale`: motion scaling of a robot in the hands of `holder`, 1 when nothing else was set.
  */
 export interface Lease {
   target: string;
@@ -248,6 +249,7 @@ export interface Lease {
   queue?: string[];
   sub_holders?: string[];
   weights?: number[];
+  scale?: number;
 }
 
 /**
@@ -442,6 +444,19 @@ export interface SetMode {
   request_id: number;
   robot: string;
   mode: LeaseMode;
+}
+
+/**
+ * A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
+ *
+ * Translations and twists are scaled, rotations, joints and device `target` are not. The scale is that of the present
+ * holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+ */
+export interface SetScale {
+  type: "set_scale";
+  request_id: number;
+  robots?: string[];
+  scale?: number;
 }
 
 /** A hand without a robot takes a free object. The lease on the object comes back in the `Reply`. */
@@ -676,6 +691,14 @@ export interface EngagementChanged {
   reason?: string;
 }
 
+/** `participant` set the motion scaling of a robot for its holder. When a holder goes, `LeaseChanged` tells it. */
+export interface ScaleChanged {
+  event: "scale_changed";
+  robot: string;
+  scale: number;
+  participant: string;
+}
+
 export interface AlignmentChanged {
   event: "alignment_changed";
   participant: string;
@@ -840,6 +863,7 @@ export type ClientMessage =
   | Consent
   | Assign
   | SetMode
+  | SetScale
   | Grasp
   | Observation
   | PlaceAlignment
@@ -868,6 +892,7 @@ export type EventKind =
   | ConsentRequested
   | Intervention
   | EngagementChanged
+  | ScaleChanged
   | AlignmentChanged
   | SceneChanged
   | EStopChanged
@@ -893,6 +918,7 @@ export const DEFAULTS = {
   consent: {},
   assign: { participant: "" },
   set_mode: {},
+  set_scale: { robots: [], scale: 1.0 },
   grasp: {},
   observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [] },
   place_alignment: { offset: false },
@@ -917,6 +943,7 @@ export const DEFAULTS = {
   consent_requested: {},
   intervention: {},
   engagement_changed: { reason: "" },
+  scale_changed: {},
   alignment_changed: {},
   scene_changed: {},
   estop_changed: { reason: "" },
