@@ -40,6 +40,10 @@ _OTHERS: Final = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 #: Where `w, x, y, z` stand in (sent, sent, sent, largest) when component `i` is the largest.
 _PLACES: Final = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])
 _LEVELS: Final = np.uint64(ROTATION_LEVELS)
+#: By width in bytes: the bits of one word.
+_MASKS: Final = tuple(np.uint64(2 ** (8 * width) - 1) for width in range(9))
+#: Follows the last word, so that eight bytes can be read from where it begins.
+PADDING: Final = bytes(7)
 _TWO: Final = np.uint64(2)
 _THREE: Final = np.uint64(3)
 
@@ -73,12 +77,11 @@ def rotations(codes: Words) -> Floats:
     parts[2] = c
     sent -= _HALF
     sent *= 1.0 / _PER_UNIT
-    squares = (sent * sent).sum(axis=0)
+    squares = np.einsum("ij,ij->j", sent, sent)
     if n and not (squares.max() <= _MAX_SQUARES and c.max() < _LEVELS):
         raise StreamError("a rotation code stands for no unit quaternion")
     np.sqrt(1.0 - squares, out=parts[3])
-    order = _PLACES.take((codes & _THREE).view(np.int64), axis=0)
-    order *= n
+    order = (n * _PLACES).take((codes & _THREE).view(np.int64), axis=0)
     order += np.arange(n)[:, None]
     q: Floats = parts.take(order)
     return q
@@ -91,8 +94,11 @@ def pack_words(words: npt.NDArray[Any], n_bytes: int) -> bytes:
 
 def unpack_words(data: bytes | memoryview, n_bytes: int) -> Words:
     """Inverse of `pack_words`; `len(data)` must be a multiple of `n_bytes`."""
-    n = len(data) // n_bytes
+    return words_at(bytes(data) + PADDING, 0, len(data) // n_bytes, n_bytes)
+
+
+def words_at(padded: bytes, offset: int, n: int, n_bytes: int) -> Words:
+    """`n` words of `n_bytes` (1 to 8) from byte `offset` of `padded`, which has `PADDING` at its end."""
     # Eight bytes are read at every n_bytes: what follows each word is masked off, and the last one needs room.
-    wide = np.ndarray((n,), "<u8", bytes(data) + bytes(8 - n_bytes), strides=(n_bytes,))
-    words: Words = wide & np.uint64(2 ** (8 * n_bytes) - 1)
+    words: Words = np.ndarray((n,), "<u8", padded, offset, (n_bytes,)) & _MASKS[n_bytes]
     return words

@@ -26,6 +26,7 @@ import numpy.typing as npt
 from iris_session.streams.errors import StreamError
 from iris_session.streams.quantise import (
     LATTICE_M,
+    PADDING,
     POSITION_QUANTUM_ERROR_M,
     ROTATION_BYTES,
     ROTATION_QUANTUM_ERROR_RAD,
@@ -34,7 +35,7 @@ from iris_session.streams.quantise import (
     pack_words,
     rotation_codes,
     rotations,
-    unpack_words,
+    words_at,
 )
 
 MAX_POSITION_ERROR_M: Final = 1e-4
@@ -54,6 +55,7 @@ FORMAT: Final = 1
 #: format u8, position_bytes u8, n_bodies u16, n_quantised u16, n_escaped u16, origin 3 x i32, nx u32, ny u32.
 _HEADER: Final = struct.Struct("<BBHHH3iII")
 _ESCAPE: Final = np.dtype([("body", "<u2"), ("pose", "<f8", (7,))])
+_NO_ESCAPES: Final = np.empty(0, _ESCAPE)
 _MAX_POSITION_BYTES: Final = 7
 _MAX_INDEX: Final = 2**31 - 1
 #: Quaternions farther from unit length (squared) than this are no rotations: they escape.
@@ -336,18 +338,19 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask, Floats, n
     end = at_escapes + n_escaped * _ESCAPE.itemsize
     if len(payload) != end:
         raise StreamError(f"payload of {len(payload)} bytes, its header asks for {end}")
-    view = memoryview(payload)
-    bits = np.frombuffer(view[_HEADER.size : at_positions], np.uint8)
+    padded = bytes(payload) + PADDING
+    bits = np.frombuffer(padded, np.uint8, at_positions - _HEADER.size, _HEADER.size)
     mask = np.unpackbits(bits, bitorder="little").view(np.bool_)
-    if np.count_nonzero(mask) != n_quantised or mask[n_bodies:].any():
+    if np.count_nonzero(mask[:n_bodies]) != n_quantised or np.count_nonzero(mask) != n_quantised:
         raise StreamError(f"mask marks other than {n_quantised} of {n_bodies} bodies")
     mask = mask[:n_bodies]
-    escapes = np.frombuffer(view[at_escapes:], _ESCAPE)
+    escapes = _NO_ESCAPES
     if n_escaped:
+        escapes = np.frombuffer(padded, _ESCAPE, n_escaped, at_escapes)
         body = escapes["body"].astype(np.int64)
         if body[-1] >= n_bodies or (np.diff(body) <= 0).any() or mask[body].any():
             raise StreamError("escaped bodies are not ascending, in range and apart from the mask")
-    codes = unpack_words(view[at_positions:at_rotations], position_bytes)
+    codes = words_at(padded, at_positions, n_quantised, position_bytes)
     poses = np.empty((n_quantised, 7))
     ux, uy = np.uint64(nx), np.uint64(ny)
     rest = codes // ux
@@ -359,5 +362,5 @@ def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask, Floats, n
     xyz += np.array([[ox], [oy], [oz]], np.float64)
     xyz *= LATTICE_M
     poses[:, :3] = xyz.T
-    poses[:, 3:] = rotations(unpack_words(view[at_rotations:at_escapes], ROTATION_BYTES))
+    poses[:, 3:] = rotations(words_at(padded, at_rotations, n_quantised, ROTATION_BYTES))
     return mask, poses, escapes
