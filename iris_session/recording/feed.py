@@ -89,6 +89,9 @@ class RecorderFeed:
         self._batch = Batch()
         self._batch_since = 0
         self._now = (0, 0)  # step and session time of the newest row
+        self._heard_ns = 0
+        #: Session time in which a recorder that has something to write has said nothing: it may hang.
+        self.silence_ns = 0
         self._presence: tuple[PresenceItem, ...] = ()
 
     @property
@@ -159,9 +162,11 @@ class RecorderFeed:
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
             self._enqueue(messages.encode_batch(batch), len(batch.rows))
         self._exchange()
+        self.silence_ns = self._now[1] - self._heard_ns if self._window else 0
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Hands over everything and waits until it is in the file. False: not all of it is, after `timeout_s`.
+        """Hands over everything and waits until it is in the file. False: not all of it is known to be there, after
+        `timeout_s`.
 
         Without a header nothing was recorded, and there is nothing to wait for. A second call does nothing.
         """
@@ -227,6 +232,7 @@ class RecorderFeed:
 
     def _take(self, status: RecorderStatus) -> None:
         self.stats.recorder = status
+        self._heard_ns = self._now[1]
         if status.instance != self._instance:
             self._instance = status.instance
             self.stats.recorders += 1

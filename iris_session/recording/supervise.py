@@ -83,7 +83,10 @@ class RecorderProcess:
             raise RecorderError(answer.removeprefix("failed: "))
 
     def restart(self) -> None:
-        """Begins the next part without waiting for it: look at `alive` and `failure` later, as after a crash."""
+        """Begins the next part without waiting for it: look at `alive` and `failure` later, as after a crash.
+
+        Raises `RecorderError` when the system gives no process, or no room for its log; it may be tried again.
+        """
         self._end(0.0)
         while os.path.exists(part_path(self.path, self.part)):
             self.part += 1
@@ -96,6 +99,12 @@ class RecorderProcess:
         return clean
 
     def _spawn(self) -> None:
+        try:
+            self._try_spawn()
+        except OSError as error:
+            raise RecorderError(f"the recorder cannot be started: {error.strerror or error}") from error
+
+    def _try_spawn(self) -> None:
         config = RecorderConfig(
             self.path,
             self.part,

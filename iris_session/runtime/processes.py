@@ -8,6 +8,7 @@ is tried at growing distances.
 from __future__ import annotations
 
 import datetime
+import logging
 import secrets
 from collections.abc import Callable
 from typing import Final
@@ -39,6 +40,10 @@ WATCH_PERIOD_NS: Final = 50_000_000
 RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
 #: A process that lived this long is taken as healthy again.
 HEALTHY_NS: Final = 30_000_000_000
+#: A recorder says something twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
+HANGING_NS: Final = 5_000_000_000
+
+_log = logging.getLogger(__name__)
 
 
 class _Watch:
@@ -85,6 +90,7 @@ class SessionProcesses:
         self.front: FrontProcess | None = None
         self._front_watch = _Watch()
         self._recorder_watch = _Watch()
+        self._recorder_hangs = False
         self._next_watch_ns = 0
         self._address = ""
 
@@ -161,12 +167,14 @@ class SessionProcesses:
             return
         self._next_watch_ns = now_ns + WATCH_PERIOD_NS
         if self.front is not None and not self.front.alive and self._front_watch.dead(now_ns):
-            self.front.restart()
-            stepper.post(Marker(request_id=0, text="the front process ended and was replaced"))
+            stepper.post(Marker(request_id=0, text=f"the front process ended and {_replaced(self.front.restart)}"))
         if self.recorder is not None and not self.recorder.alive and self._recorder_watch.dead(now_ns):
             failure = self.recorder.failure or "the recorder ended"
-            self.recorder.restart()
-            stepper.post(Marker(request_id=0, text=f"{failure}; it was replaced"))
+            stepper.post(Marker(request_id=0, text=f"{failure}; it {_replaced(self.recorder.restart)}"))
+        hangs = self.feed is not None and self.feed.silence_ns > HANGING_NS
+        if hangs and not self._recorder_hangs:
+            stepper.post(Marker(request_id=0, text="the recorder hangs: what it does not take waits on the disk"))
+        self._recorder_hangs = hangs
 
     @property
     def front_pid(self) -> int:
@@ -196,11 +204,21 @@ class SessionProcesses:
             self.front.close()
             self.front = None
         if self.feed is not None:
-            self.feed.close()
+            if not self.feed.close():
+                _log.error("the end of the recording is missing: the recorder did not write all of it in time")
             self.feed = None
         if self.recorder is not None:
             self.recorder.close()
             self.recorder = None
+
+
+def _replaced(restart: Callable[[], None]) -> str:
+    """Starts a process anew. One that cannot be started now (no memory, a full disk) ends no session."""
+    try:
+        restart()
+    except (FrontError, RecordingError) as error:
+        return f"is not replaced: {error}"
+    return "was replaced"
 
 
 def _scene_info(world: World) -> SceneInfo:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import zmq
 
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
@@ -64,7 +65,10 @@ class FrontProcess:
         return self.wait_ready(timeout_s)
 
     def restart(self) -> None:
-        """Replaces a front that died, on the same ports. Does not wait: `link.ports` is set when it is ready."""
+        """Replaces a front that died, on the same ports. Does not wait: `link.ports` is set when it is ready.
+
+        Raises `FrontError` when the system gives no process, or no room for its files; it may be tried again.
+        """
         if self._process is not None:
             self._process.kill()  # dead, or it reads nothing any more: no step waits for its answer
             self._process.wait()
@@ -95,6 +99,12 @@ class FrontProcess:
         raise FrontError(f"the front process was not ready after {timeout_s:g} s")
 
     def _spawn(self) -> None:
+        try:
+            self._try_spawn()
+        except (OSError, zmq.ZMQError) as error:
+            raise FrontError(f"the front process cannot be started: {error.strerror or error}") from error
+
+    def _try_spawn(self) -> None:
         self._generation += 1
         folder = Path(self._folder.name)
         endpoint = self.link.open(folder / f"front-{self._generation}")

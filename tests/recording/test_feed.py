@@ -170,6 +170,21 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
     assert not feed.close(0.0)
 
 
+def test_the_silence_of_a_recorder_that_has_something_to_write_is_measured(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
+    played[0].say(feed, 1, -1, -1)
+    steps(feed, 0, 100)
+    quiet_ns = feed.silence_ns
+    assert quiet_ns > 0
+    steps(feed, 100, 100)
+    assert feed.silence_ns > quiet_ns
+    played[0].say(feed, 1, 10, 9)
+    feed.flush()
+    assert feed.silence_ns == 0
+    played[0].say(feed, 1, 20, 19)
+    feed.row(make_row(ROOT, 200, 60_000_000_000, 0, [], b"d" * 16))  # the session itself stood still
+    assert feed.silence_ns == 0
+
+
 def test_a_spill_file_that_cannot_be_read_back_is_a_gap_and_not_the_end(played) -> None:  # type: ignore[no-untyped-def]
     recorder, endpoint, folder = played
     feed = RecorderFeed(endpoint, folder, window_bytes=2000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import signal
@@ -128,6 +129,29 @@ def test_a_killed_recorder_loses_no_row(tmp_path: Path) -> None:
     assert report.ok, report.line()
 
 
+def test_a_recorder_that_cannot_be_started_now_is_started_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        os.kill(process.pid, signal.SIGKILL)
+        wait_until(lambda: not process.alive)
+        with monkeypatch.context() as patch:
+            patch.setattr(subprocess, "Popen", _no_memory)
+            with pytest.raises(RecorderError, match="cannot be started: Cannot allocate memory"):
+                process.restart()
+        assert not process.alive
+        process.restart()
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert report.steps == 100
+
+
 def test_a_killed_recorder_leaves_all_but_a_quarter_second(tmp_path: Path) -> None:
     """Alone, without the part that comes after: what was handed over 0.25 s before the kill is in the file."""
     path = tmp_path / "session.rrd"
@@ -237,6 +261,10 @@ def test_a_full_disk_is_said_and_the_session_goes_on_elsewhere(tmp_path: Path) -
     report = verify(path, SmallCore)
     assert report.steps == 300
     assert report.ok, report.line()
+
+
+def _no_memory(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
 
 
 def _status(feed):  # type: ignore[no-untyped-def]

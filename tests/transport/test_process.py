@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -165,6 +166,26 @@ def test_a_crashed_front_is_replaced_on_the_same_ports_and_tokens_stay_valid(ses
     assert welcome.resumed
     assert welcome.participant_id == "p1"
     assert welcome.connection_epoch == 2
+
+
+def test_a_front_that_cannot_be_started_now_is_started_later(
+    session: FrontSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    ports = session.process.link.ports
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "Popen", refuse)
+        with pytest.raises(FrontError, match="cannot be started: Cannot allocate memory"):
+            session.process.restart()
+    assert not session.process.alive
+    session.process.restart()
+    session.pump(lambda: session.process.link.ports is not None, "new front")
+    assert session.process.link.ports == ports
 
 
 def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:
