@@ -229,6 +229,7 @@ class Controller:
         r, columns, (lower, upper) = self._states[i], self._columns[i], self._bounds
         goal = leader_goal(state, command.sources, self._joints.goal[columns], self._config)
         goal = np.minimum(np.maximum(goal, lower[columns]), upper[columns])
+        goal, state.clamped = self._reach.within(i, r, state.base, goal, self._box(i))
         r.ramping = ramping(r.ramping, float(np.abs(goal - self._joints.q[columns]).max()), self._config)
         self._set_cap(i)
         self._joints.aim(columns, goal, self._reach.interval(r, self._tick))

@@ -24,6 +24,7 @@ from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import RobotSpec
 
 _MAX_STALLS = 5  # solves in a row without progress after which a target counts as out of reach
+_WAYPOINTS, _HALVINGS = 8, 10  # how finely the way to a joint goal is searched for the edge of the workspace
 _PROGRESS = 0.02  # share of the remaining error that a solve must go to count as progress
 
 
@@ -63,6 +64,35 @@ class Reach:
     def tip(self, i: int, r: RobotState) -> PoseTuple:
         """`T_world_tip` of the joint goal: where the robot will stand when nothing else is asked of it."""
         return compose(r.T_world_root, self._arms[i].fk(self._joints.goal[self._columns[i]]))
+
+    def within(
+        self, i: int, r: RobotState, base: PoseTuple, goal: Floats, box: clutch.Box | None
+    ) -> tuple[Floats, bool]:
+        """The joint goal, or the last place on the way to it from the present one at which the tip is inside the
+        workspace `box`, widened to `base` where the robot was at the latch. True: it was cut short."""
+        if box is None:
+            return goal, False
+        start = self._joints.goal[self._columns[i]].copy()
+        low, high = 0.0, 0.0
+        for k in range(1, _WAYPOINTS + 1):
+            high = k / _WAYPOINTS
+            if not self._inside(i, r, base, start + high * (goal - start), box):
+                break
+            low = high
+        if low == 1.0:
+            return goal, False
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            if self._inside(i, r, base, start + middle * (goal - start), box):
+                low = middle
+            else:
+                high = middle
+        return start + low * (goal - start), True
+
+    def _inside(self, i: int, r: RobotState, base: PoseTuple, q: Floats, box: clutch.Box) -> bool:
+        p, b = compose(r.T_world_root, self._arms[i].fk(q))[0], base[0]
+        slack = self._config.position_tolerance
+        return all(min(box[0][k], b[k]) - slack <= p[k] <= max(box[1][k], b[k]) + slack for k in range(3))
 
     def solve(self, i: int, r: RobotState, state: clutch.Latch, tick: int) -> None:
         """One step from the last solution toward the target; the joints arrive about one sample later."""

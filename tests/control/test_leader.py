@@ -105,3 +105,21 @@ def test_the_ramp_has_hysteresis() -> None:
     config = ControlConfig()
     assert [ramping(False, 0.19, config), ramping(False, 0.21, config)] == [False, True]
     assert [ramping(True, 0.19, config), ramping(True, 0.01, config)] == [True, False]
+
+
+def test_a_leader_does_not_take_the_follower_out_of_its_workspace() -> None:
+    tip = rig().target()[0]
+    box = ((-2.0, -2.0, tip[2] - 0.02), (2.0, 2.0, 2.0))
+    made = Rig(iiwa_model(), [iiwa_spec()], ControlConfig(workspaces={"iiwa": box}), home=IIWA_HOME)
+    low = HOME + np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # the shoulder leans forward: the tip sinks
+    lowest = tip[2]
+    for k in range(400):
+        made.step(decision([lead(made, low, new=k % 7 == 0)]))
+        lowest = min(lowest, made.target()[0][2])
+    assert lowest == pytest.approx(tip[2] - 0.02, abs=1e-3)
+    assert lowest >= tip[2] - 0.02 - 1e-4
+    assert "workspace" in made.controller.status()[0].limits
+    for k in range(400):
+        made.step(decision([lead(made, HOME, new=k % 7 == 0)]))
+    assert made.data.ctrl == pytest.approx(HOME, abs=1e-6)
+    assert made.controller.status()[0].limits == ()
