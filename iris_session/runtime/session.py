@@ -46,8 +46,10 @@ from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
 from iris_session.runtime.user_loop import UserLoop
 
-#: Zero-tick steps while paused come at 100 Hz (DESIGN 5 asks for at least 50 Hz).
+#: Zero-tick steps while paused come at 100 Hz (at least 50 Hz, so that leases and heartbeats go on).
 PAUSED_STEP_S: Final = 0.01
+#: Most ticks of one step while paused: at 1 ms a tick, steps still come at 50 Hz.
+PAUSED_STEP_TICKS: Final = 10
 
 
 class Session:
@@ -82,6 +84,7 @@ class Session:
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
+        self._asked_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
 
     # --- life --------------------------------------------------------------------------------------------------------
@@ -141,6 +144,7 @@ class Session:
         pacer.pause(self.clock())  # what nobody asked to run is not late
 
     def _tick(self, stepper: Stepper, pacer: Pacer, now_ns: int) -> None:
+        self._asked_ticks = 0
         pacer.resume(now_ns)
         wait_ns = pacer.next_deadline_ns - now_ns
         if wait_ns > 0:
@@ -151,11 +155,16 @@ class Session:
         pacer.finished(self.clock())
 
     def _paused_step(self, stepper: Stepper, pacer: Pacer) -> None:
-        """Zero ticks, or as many as a director asked for in the step before."""
+        """Zero ticks, or some of those that a director asked for: few, so that an e-stop never waits for many."""
         assert stepper.last is not None
         pacer.pause(self.clock())
         time.sleep(PAUSED_STEP_S)
-        stepper.step(stepper.last.decision.step_ticks)
+        decision = stepper.last.decision
+        if decision.step_ticks or decision.reset:
+            self._asked_ticks = decision.step_ticks
+        n_ticks = min(self._asked_ticks, PAUSED_STEP_TICKS)
+        self._asked_ticks -= n_ticks
+        stepper.step(n_ticks)
 
     def stop(self) -> None:
         """Ends `run()` after the step in progress. May be called from another thread or a signal handler."""

@@ -14,6 +14,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig, ControlError
 from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.physics.scenes import scene_path
+from iris_session.protocol.client_messages import Control
 from iris_session.protocol.server_messages import EStopChanged, MarkerAdded, PauseChanged, SceneChanged
 
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
@@ -47,6 +48,19 @@ def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
     kinds = [type(body) for body in _bodies(session)]
     # The e-stop takes the urgent lane, before what was said with it.
     assert kinds == [EStopChanged, PauseChanged, PauseChanged, SceneChanged, EStopChanged]
+
+
+def test_ticks_asked_for_while_paused_are_taken_a_few_at_a_time(session: Session) -> None:
+    """An e-stop among them waits for one step, not for all of them."""
+    session.pause()
+    session.run(until=lambda: session.status().paused)
+    start, steps = session.status().tick, session.stepper.step_count
+    session.post(Control(request_id=0, action="step", ticks=35))
+    session.run(until=lambda: session.status().tick - start >= 35)
+    assert session.status().tick - start == 35
+    assert session.stepper.step_count - steps >= 5
+    session.run(seconds=0.05)
+    assert session.status().tick - start == 35
 
 
 def test_run_ends_after_its_seconds_and_from_another_thread(session: Session) -> None:
