@@ -1,4 +1,4 @@
-"""Bounds and policies of the session authority: every number of DESIGN section 5 as a field with its default."""
+"""Bounds and policies of the session authority: every number of its rules, as a field with its default."""
 
 from __future__ import annotations
 

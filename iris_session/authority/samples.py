@@ -1,4 +1,4 @@
-"""Which samples count: every check of DESIGN 5.3, each with its typed reason, and what a rejection does.
+"""Which samples count: every check of docs/protocol.md section 6 with its typed reason, and what a rejection does.
 
 A rejection rearms only the latches of the sending participant's own device on the targets it names and holds. An old
 `seq` is only counted. NaN and infinity may arrive in any float: they are compared so that they fail.

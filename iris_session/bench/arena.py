@@ -27,7 +27,7 @@ from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.scheduling import quiet_collector
 from iris_session.runtime.session import Session
 
-#: DESIGN section 11: at most four clients in one process.
+#: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
 WARM_UP_S: Final = 3.0
 Log = dict[str, NDArray[Any]]

@@ -12,7 +12,7 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import BenchReport, bar
 from iris_session.physics.scenes import free_bodies_scene
 
-#: DESIGN section 11: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
+#: The bar is stated under input: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
 SENDERS = 8
 
 

@@ -1,7 +1,7 @@
 """What reaches the authority: one `Entry` per input of a step, exactly as it is journaled.
 
 Entries are made by the front (after schema and limit checks), or by the process that owns the session (`HOST`).
-They hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see DESIGN section 5.
+They hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see docs/architecture.md, "One step".
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ from iris_session.runtime.stepper import Stepper
 #: Silence of the user's loop after which zero-tick steps begin, and their distance.
 IDLE_AFTER_NS: Final = 20_000_000
 IDLE_PERIOD_S: Final = 0.01
-#: Silence after which robots must be clutched again (the freshness bound of samples, DESIGN 5.3). The authority cannot
-#: see it, because zero-tick steps go on meanwhile.
+#: Silence after which robots must be clutched again (the freshness bound of samples). The authority cannot see it,
+#: because zero-tick steps go on meanwhile.
 GAP_NS: Final = 150_000_000
 
 

@@ -33,6 +33,8 @@ def test_a_holder_sets_the_scale_of_its_robot_and_everybody_sees_it() -> None:
     t = Table()
     anna = t.operator("left")
     anna.engage("left")
+    t.step()
+    t.step()
     assert t.command().scale == 1.0
     reply = anna.asks(SetScale(5, ("left",), 0.25))
     assert (reply.ok, reply.leases[0].target, reply.leases[0].scale) == (True, "left", 0.25)

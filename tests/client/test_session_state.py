@@ -67,6 +67,20 @@ def synced() -> SessionMirror:
     return mirror
 
 
+def test_the_scale_of_a_robot_is_followed_until_its_lease_changes() -> None:
+    mirror = synced()
+    lease = Lease("left", "robot", "exclusive", "p1", 3)
+    for seq, body, scale in (
+        (1, LeaseChanged(lease, "acquired"), 1.0),
+        (2, ScaleChanged("left", 0.25, "p2"), 0.25),
+        (3, ScaleChanged("right", 0.5, "p2"), 0.25),
+        (4, LeaseChanged(lease, "assigned", "p1"), 1.0),
+    ):
+        mirror.apply_event(event(seq, body))
+        assert mirror.leases["left"].scale == scale
+        assert list(mirror.leases) == ["left"]
+
+
 @given(st.lists(bodies, max_size=30), st.data())
 @settings(max_examples=150, deadline=None)
 def test_any_joining_moment_and_any_loss_end_in_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
