@@ -30,8 +30,13 @@ REFRESH_S: Final = 0.5
 QUIET: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
+def printable(text: str) -> str:
+    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def event_line(event: Event) -> str:
-    """One event as one line of text."""
+    """One event as one line of printable text."""
     body = msgspec.to_builtins(event.body)
     kind = body.pop("event")
     info = body.pop("participant", None)
@@ -47,7 +52,7 @@ def event_line(event: Event) -> str:
         lease = body.pop("lease")
         body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
     text = " ".join(f"{key}={value}" for key, value in body.items() if value not in ("", None))
-    return f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}"
+    return printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
 
 class LiveView:
@@ -114,7 +119,7 @@ def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableT
         delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
         name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [lost]")
         cells = (name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
-        table.add_row(*map(Text, cells))  # names are people's words, never markup
+        table.add_row(*(Text(printable(cell)) for cell in cells))  # names are people's words, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
     footer = (

@@ -102,3 +102,8 @@ def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyP
     assert view.skipped == 4
     os.close(write)
     assert json.dumps(session.as_dict())
+
+
+def test_nothing_that_a_stranger_wrote_reaches_the_terminal_as_a_command() -> None:
+    line = event_line(Event(1, 0, 0, MarkerAdded("p1", "a\x1b[2Jb\nc\u202ed")))
+    assert line.endswith("text=a\ufffd[2Jb\ufffdc\ufffdd")
