@@ -44,7 +44,11 @@ class Client(SceneView, Requests, Sampling):
 
         with Client("127.0.0.1:7721", role="agent", name="policy", devices=("target",)) as client:
             client.acquire(["left"])
-            client.send_sample("target", pose, robots=["left"], clutch=True)
+            client.wait_for(lambda c: c.tip_pose("left") is not None)
+            target = client.tip_pose("left")  # T_world_tip: move it
+            for i in range(90):  # the clutch must be seen open once; after 150 ms without a sample the robot holds
+                client.send_sample("target", target, robots=["left"], clutch=i > 0)
+                client.poll(1 / 60)
     """
 
     def __init__(

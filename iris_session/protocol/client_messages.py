@@ -137,8 +137,8 @@ class SetMode(Message, frozen=True, tag="set_mode"):
 class SetScale(Message, frozen=True, tag="set_scale"):
     """A holder or director sets how far robots move as the hand moves: 1 as far, 0.1 a tenth. No names: all of ours.
 
-    Translations and twists are scaled, rotations, joints and device `target` are not. The scale is that of the present
-    holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
+    Translation is scaled (that of twists too); rotation, joints and device `target` are not. The scale is that of the
+    present holder: the next one begins at 1. Changing it while engaged moves nothing by itself.
     """
 
     request_id: Count
