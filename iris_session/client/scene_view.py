@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import time
 from typing import Any
 
@@ -24,6 +25,7 @@ class SceneView:
     """Everything is in the world frame. Nothing here waits or sends."""
 
     connection: Connection
+    _lock: threading.RLock
     _state: SceneState | None
 
     @property
@@ -44,7 +46,8 @@ class SceneView:
     @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:
         """Heads and hands of everyone by `(participant, device)`."""
-        return self.connection.stream.presence
+        with self._lock:
+            return self.connection.stream.presence
 
     @property
     def alignment(self) -> Alignment | None:

@@ -26,6 +26,8 @@ STALLED_NS: Final = 50_000_000  # not drained for this long: what is queued may 
 QUEUED_NS: Final = 60_000_000  # a frame published this long ago waited in a queue ...
 FLUSH_NS: Final = 150_000_000  # ... but after this long without a fresher one it is the newest there is (slow link)
 
+PRESENCE_WAITING: Final = 8  # presence messages that may wait to be looked at; decoding several at once is cheaper
+
 
 @dataclass(frozen=True, slots=True)
 class SceneState:
@@ -43,7 +45,10 @@ class SceneState:
 
 @dataclass(slots=True)
 class StateCounters:
-    """Where state frames went. Every frame that came is either `delivered` or counted in exactly one other field."""
+    """Where state frames went. Every frame that came is either `delivered` or counted in exactly one other field.
+
+    Presence is counted when it is decoded, at most `PRESENCE_WAITING` messages later.
+    """
 
     delivered: int = 0
     superseded: int = 0  # a newer one was there in the same drain
@@ -69,8 +74,9 @@ class StateStream:
 
     def __init__(self) -> None:
         self.counters = StateCounters()
-        self.presence: dict[tuple[str, str], PresenceItem] = {}
-        self.presence_ns = 0
+        self._presence: dict[tuple[str, str], PresenceItem] = {}
+        self._presence_ns = 0
+        self._presence_waiting: list[bytes] = []
         self.scene_epoch = 0
         self.wants_snapshot = False
         self._decoder: RigidDecoder | None = None
@@ -80,8 +86,9 @@ class StateStream:
     def reset(self) -> None:
         """Another connection: frames may be numbered anew, nothing held is of use."""
         self._decoder = None
-        self.presence = {}
-        self.presence_ns = 0
+        self._presence = {}
+        self._presence_ns = 0
+        self._presence_waiting = []
         self.wants_snapshot = False
 
     def load_keyframe(self, state_seq: int, poses: Poses) -> None:
@@ -103,7 +110,7 @@ class StateStream:
         for frames in messages:
             self.counters.bytes_received += sum(map(len, frames))
             if frames[0] == TOPIC_PRESENCE and len(frames) == 2:
-                self._take_presence(frames[1])
+                self._presence_waiting.append(frames[1])
             elif frames[0] == TOPIC_RIGID and len(frames) == 3:
                 try:
                     header = decode_state_header(frames[1])
@@ -118,12 +125,22 @@ class StateStream:
                 self.counters.malformed += 1
             else:
                 self.counters.unknown_topic += 1
-        return None if newest is None else self._decode(*newest, now_ns)
+        state = None if newest is None else self._decode(*newest, now_ns)
+        if len(self._presence_waiting) >= PRESENCE_WAITING:
+            self._take_presence()
+        return state
+
+    @property
+    def presence(self) -> dict[tuple[str, str], PresenceItem]:
+        """Heads and hands of everyone by `(participant, device)`. Decoded when looked at: the scene goes first."""
+        self._take_presence()
+        return self._presence
 
     def forget_presence(self, participant: str) -> None:
         """This participant left: nothing of it is shown any more."""
-        for key in [key for key in self.presence if key[0] == participant]:
-            del self.presence[key]
+        presence = self.presence
+        for key in [key for key in presence if key[0] == participant]:
+            del presence[key]
 
     def _decode(self, header: StateHeader, payload: bytes, now_ns: int) -> SceneState | None:
         if now_ns < self._flush_until:
@@ -156,18 +173,20 @@ class StateStream:
         poses.flags.writeable = False
         return SceneState(header, poses, now_ns, now_ns - header.session_time)
 
-    def _take_presence(self, data: bytes) -> None:
-        try:
-            presence = decode_presence(data)
-        except ProtocolError:
-            self.counters.malformed += 1
-            return
-        if presence.session_time < self.presence_ns:
-            self.counters.out_of_order += 1
-            return
-        self.counters.presence += 1
-        self.presence_ns = presence.session_time
-        self.presence.update(((item.participant, item.device), item) for item in presence.items)
+    def _take_presence(self) -> None:
+        waiting, self._presence_waiting = self._presence_waiting, []
+        for data in waiting:
+            try:
+                presence = decode_presence(data)
+            except ProtocolError:
+                self.counters.malformed += 1
+                continue
+            if presence.session_time < self._presence_ns:
+                self.counters.out_of_order += 1
+                continue
+            self.counters.presence += 1
+            self._presence_ns = presence.session_time
+            self._presence.update(((item.participant, item.device), item) for item in presence.items)
 
 
 def poses_from_bytes(data: bytes, n_bodies: int) -> Poses | None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.state_stream import StateStream
+from iris_session.client.state_stream import PRESENCE_WAITING, StateStream
 from iris_session.protocol.codec import encode_presence, encode_state_header
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.server_messages import (
@@ -138,6 +138,16 @@ def test_presence_keeps_the_latest_per_device_and_forgets_who_left() -> None:
     assert set(stream.presence) == {("p2", "head")}
 
 
+def test_presence_that_nobody_looks_at_does_not_pile_up() -> None:
+    stream = StateStream()
+    message = [TOPIC_PRESENCE, encode_presence(Presence(10, 11, (PresenceItem("p1", "head", IDENTITY),)))]
+    for _ in range(2 * PRESENCE_WAITING - 1):
+        stream.drain([message], 12)
+    assert stream.counters.presence == PRESENCE_WAITING
+    assert set(stream.presence) == {("p1", "head")}
+    assert stream.counters.presence == 2 * PRESENCE_WAITING - 1
+
+
 @given(
     st.lists(st.lists(st.binary(max_size=60) | st.sampled_from([TOPIC_RIGID, TOPIC_PRESENCE]), min_size=1, max_size=4))
 )
@@ -147,6 +157,7 @@ def test_any_bytes_are_counted_and_harm_nothing(messages: list[list[bytes]]) -> 
     server.frame(0)
     server.join(stream)
     stream.drain(messages, MS)
+    assert stream.presence == {}
     counted = stream.counters
     assert counted.malformed + counted.unknown_topic + counted.superseded + counted.presence >= len(messages) - 1
     assert stream.drain([server.frame(2 * MS)], 3 * MS) is not None
