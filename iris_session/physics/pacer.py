@@ -7,7 +7,8 @@ Falling behind: overdue ticks are run one after the other, each still late by it
 caught up and the simulation stays on the wall clock. Catching up more than `max_backlog_ns` (1 s) would be seen as
 fast motion, so beyond it `skip_backlog` gives up the overdue ticks: they count as late, simulated time stays behind by
 them, and the grid stays where it is. It calls that `stalled` when no tick at all finished for that long (a suspended
-process): the caller journals the gap and robots hold until clutched again. Plain overload never stalls.
+process): the authority sees the same gap in session time, and robots hold until clutched again. Plain overload never
+stalls.
 """
 
 from __future__ import annotations

@@ -112,6 +112,7 @@ class Stress:
         self.people: list[Person] = []
         self.connections = 0
         self.moved = 0
+        self.held_ticks = [0] * len(self.config.robots)
         self.kinds: set[str] = set()
         for cast, robot in zip(CASTS, (0, 1, 1, 2, 3, 2), strict=True):
             self.enter(cast)
@@ -153,6 +154,7 @@ class Stress:
             next(p for p in self.people if p.connection == admitted.connection).id = admitted.participant_id
         if not any(e.body.__class__.__name__ == "SceneChanged" for e in outcome.decision.events):
             self.check_motion(*before, n_ticks)
+        self.check_holds([c.kind == "hold" for c in outcome.decision.commands], n_ticks)
         self.kinds |= {c.kind for c in outcome.decision.commands}
         self.moved += sum(c.kind != "hold" for c in outcome.decision.commands)
         assert not outcome.diverged
@@ -168,6 +170,14 @@ class Stress:
         joints = self.core.controller._joints
         assert (np.abs(joints.q - q) <= joints.velocity * joints.dt * n_ticks + 1e-9).all()
         assert (np.abs(joints.v - v) <= joints.acceleration * joints.dt * n_ticks + 1e-9).all()
+
+    def check_holds(self, holds: list[bool], n_ticks: int) -> None:
+        """A robot that holds for 0.2 s stands still: at 2.5 rad/s and 40 rad/s^2 it stops within 32 ticks."""
+        joints, columns = self.core.controller._joints, self.core.controller._columns
+        for i, hold in enumerate(holds):
+            self.held_ticks[i] = self.held_ticks[i] + n_ticks if hold else 0
+            if self.held_ticks[i] > 100:
+                assert not joints.v[columns[i]].any(), f"robot {i} moves after {self.held_ticks[i]} ticks of hold"
 
     def swap(self) -> None:
         """The session goes on in a fresh core."""
