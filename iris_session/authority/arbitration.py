@@ -44,7 +44,8 @@ def _remember(p: Participant, s: Sample, usable: bool) -> None:
     seen = p.seen.get(s.device)
     if seen is None:
         seen = p.seen[s.device] = DeviceState()
-    seen.seq, seen.capture_ns = s.seq, s.capture_ns
+    # Capture times that go back must not make time for a jump when they come forward again.
+    seen.seq, seen.capture_ns = s.seq, max(seen.capture_ns, s.capture_ns)
     if usable:
         seen.pose = s.pose if s.kind == SampleKind.POSE else None
         seen.q = tuple(map(float, s.q))

@@ -226,3 +226,13 @@ def test_a_rejected_device_does_not_speak_for_another_that_is_ready() -> None:
     assert t.hold() == "clutch_open"
     anna.sends("left", clutch=True)
     assert t.command().kind == "pose"
+
+
+def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
+    t = Table()
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.sends("left", clutch=True, age_ns=100 * MS)
+    assert t.command().kind == "pose"
+    anna.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
+    assert t.hold() == "rejected"
