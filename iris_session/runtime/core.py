@@ -41,7 +41,7 @@ _decode_config = msgspec.msgpack.Decoder(CoreConfig).decode
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
-    """What one step gave: the authority's decision, control's report, and the digest (16 bytes) of all of it."""
+    """What one step gave: decision of the authority, report of control, digest of all of it (16 bytes, or none)."""
 
     decision: Decision
     status: tuple[ControlStatus, ...]
@@ -76,8 +76,12 @@ class SessionCore:
         self.controller.reset(self.world.data)
         self._status: tuple[ControlStatus, ...] = ()
 
-    def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> StepOutcome:
+    def step(
+        self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"", *, digest: bool = True
+    ) -> StepOutcome:
         """One pass at session time `now_ns`, `n_ticks` >= 0 ticks of physics.
+
+        Without `digest` the outcome has an empty one: it takes a sixth of a step, and only a recording needs it.
 
         `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
         write `world.data.ctrl` for the caller to apply, and do not advance physics.
@@ -97,7 +101,7 @@ class SessionCore:
             if not plant and not self._tick():
                 break
         self._status = self.controller.status()
-        return StepOutcome(decision, self._status, self._digest(decision), world.diverged)
+        return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
 
     def _tick(self) -> bool:
         """One tick of physics; False when the state is no longer finite: physics then stands still until a reset."""

@@ -121,7 +121,7 @@ class Stepper:
         if self.step_count == 0:
             self._keyframe(now_ns)
         self._last_now_ns = now_ns
-        outcome = self.core.step(now_ns, entries, n_ticks, plant)
+        outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None)
         if self.on_entries is not None:
             self.on_entries(entries)
         if outcome.diverged and (self.last is None or not self.last.diverged):

@@ -54,11 +54,13 @@ def rotation_codes(q: Floats) -> Words:
     code = largest + 4 * (a + 6501 * (b + 6501 * c)): the index of the component of largest magnitude, and the other
     three in their order, with the sign that makes the largest positive, rounded to steps of sqrt(2) / 6500.
     """
-    rows = np.arange(len(q))
+    flat = q.ravel()  # `take` from it costs half of indexing with two arrays
+    rows = np.arange(0, 4 * len(q), 4)
     largest = np.abs(q).argmax(axis=1)
-    scale = np.where(q[rows, largest] < 0.0, -_PER_UNIT, _PER_UNIT)
+    scale = np.where(flat.take(rows + largest) < 0.0, -_PER_UNIT, _PER_UNIT)
     # No clipping: next to a component at least as large, none of a unit quaternion exceeds 1 / sqrt(2).
-    levels = np.rint(q[rows[:, None], _OTHERS[largest]] * scale[:, None]).astype(np.int64) + _HALF
+    sent = flat.take(rows[:, None] + _OTHERS.take(largest, axis=0))
+    levels = np.rint(sent * scale[:, None]).astype(np.int64) + _HALF
     packed = levels[:, 0] + ROTATION_LEVELS * (levels[:, 1] + ROTATION_LEVELS * levels[:, 2])
     codes: Words = (largest + 4 * packed).astype(np.uint64)
     return codes
