@@ -250,7 +250,8 @@ class Front:
             batch = self._coalescer.take() if self._coalescer else []
         elif self._coalescer.urgent and used < 2 * limit:
             batch = self._coalescer.take(urgent_only=True)
-        if self._tokens.changed and (batch or not self._stalled):
+        listens = self._downlink.heard_ns > 0 and not self._stalled
+        if self._tokens.changed and (batch or listens):
             self._link.send_multipart((link.HANDBACK, self._tokens.blob()), zmq.DONTWAIT)
         if batch:
             self._link.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
