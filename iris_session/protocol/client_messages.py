@@ -127,7 +127,7 @@ class Assign(Message, frozen=True, tag="assign"):
 
 
 class SetMode(Message, frozen=True, tag="set_mode"):
-    """A director changes the lease mode of a robot, and the blending weights in mode `shared`."""
+    """A director changes the lease mode of a robot. Blending weights (mode `shared`) come with each `Acquire`."""
 
     request_id: Count
     robot: Name

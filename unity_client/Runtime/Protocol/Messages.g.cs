@@ -1733,7 +1733,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// A director changes the lease mode of a robot, and the blending weights in mode shared.
+    /// A director changes the lease mode of a robot. Blending weights (mode shared) come with each Acquire.
     /// </summary>
     public sealed class SetMode : ClientMessage
     {

@@ -438,7 +438,7 @@ export interface Assign {
   participant?: string;
 }
 
-/** A director changes the lease mode of a robot, and the blending weights in mode `shared`. */
+/** A director changes the lease mode of a robot. Blending weights (mode `shared`) come with each `Acquire`. */
 export interface SetMode {
   type: "set_mode";
   request_id: number;
