@@ -20,6 +20,9 @@ ZAP_DOMAIN = b"iris"
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
 CONTROL_BUFFER_BYTES = 131_072
+#: As plain integers: operations on the enumerations take longer than asking the socket.
+_EVENTS = int(zmq.EVENTS)
+_POLLIN = int(zmq.POLLIN)
 #: Connections that were opened and say nothing take a file descriptor each.
 FILE_DESCRIPTORS = 4096
 
@@ -90,7 +93,7 @@ def host_in_address(host: str) -> str:
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
     """Whether a message waits. Cheaper than to poll, or to receive and catch `Again`."""
-    return bool(int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+    return bool(socket.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
 def bound_port(bound: zmq.Socket[bytes]) -> int:
