@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from iris_session.protocol.names import AssignmentPolicy, LeaseMode
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 class CommandError(Exception):
@@ -50,6 +54,30 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-record", action="store_true", help="record nothing")
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
+
+
+def scene_file(scene: str) -> Path:
+    """The file `scene`, or the packaged scene of that name."""
+    from iris_session.physics.scenes import scene_path
+
+    path = Path(scene)
+    if path.exists() or path.suffix:
+        return path
+    try:
+        return scene_path(scene)
+    except FileNotFoundError as error:
+        raise CommandError(f"{scene}: no such file, and {error}") from None
+
+
+def no_robots(model: mujoco.MjModel) -> str:
+    """One line about a model in which no robot was found: why, and what helps."""
+    from iris_session.physics.robots import MIN_JOINTS
+
+    has = f"the model has {model.nu} actuators and {model.njnt} joints" if model.nu else "the model has no actuators"
+    return (
+        f"no robots found, so people can only look and take objects: a robot is a chain of at least {MIN_JOINTS} "
+        f"actuated joints, and {has}"
+    )
 
 
 def print_json(value: dict[str, Any]) -> None:

@@ -25,6 +25,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--seed", type=int, default=0, help="of everything random: frames, noise, motion")
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person in detail")
     parser.add_argument("--seconds", type=float, help="at most this long")
+    parser.add_argument(
+        "--join-timeout", type=float, default=15.0, metavar="S", help="give up when no session lets us in (%(default)s)"
+    )
+    parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key (*.key_secret)")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.set_defaults(run=run)
 
@@ -38,9 +43,10 @@ def run(arguments: argparse.Namespace) -> int:
         f"seed={arguments.seed + i}"
         for i in range(arguments.count)
     ]
-    options = ["--address", arguments.address]
+    options = ["--address", arguments.address, "--join-timeout", str(arguments.join_timeout)]
+    options += ["--curve-server", arguments.curve_server, "--curve-key", arguments.curve_key]
     for headset in headsets:
         options += ["--headset", headset]
     if arguments.seconds is not None:
         options += ["--seconds", str(arguments.seconds)]
-    return main(options + (["--json"] if arguments.json else []))
+    return main(options + (["--json"] if arguments.json else []), "iris-session")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import sys
 
-from iris_session.cli.common import add_json, print_json
+from iris_session.cli.common import add_json, no_robots, print_json, scene_file
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -13,10 +13,10 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "robots",
         help="show the robots found in a model, as TOML to edit",
         description="Prints the robots found in a model. Edit the output and pass it as `serve --robots FILE`.",
-        epilog="example:\n  iris-session robots scene.xml > robots.toml",
+        epilog="examples:\n  iris-session robots scene.xml > robots.toml\n  iris-session robots handover",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("scene", help="MJCF or MJB file, or the name of a packaged scene")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -27,9 +27,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iris_session.physics import dump_robots_toml, find_objects, find_robots, load_model
 
-    model = load_model(arguments.scene)
+    model = load_model(scene_file(arguments.scene))
     robots = find_robots(model)
     objects = find_objects(model)
+    if not robots:
+        print(no_robots(model), file=sys.stderr)
     if arguments.json:
         print_json({"robots": msgspec.to_builtins(robots), "objects": msgspec.to_builtins(objects)})
     else:

@@ -7,7 +7,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import add_json, add_session_options, print_json
+from iris_session.cli.common import (
+    CommandError,
+    add_json,
+    add_session_options,
+    no_robots,
+    print_json,
+    scene_file,
+)
+from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
     from iris_session.runtime.config import SessionConfig
@@ -21,11 +29,19 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
+        "  iris-session serve handover --assign ann=left --assign bob=right\n"
         "  iris-session serve handover --seconds 30     (a scene that comes with the package)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a packaged scene")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
+    parser.add_argument(
+        "--assign",
+        action="append",
+        default=[],
+        metavar="NAME=ROBOT[,ROBOT]",
+        help="robots of a participant, repeatable; implies --assignment config",
+    )
     parser.add_argument("--seconds", type=float, help="stop after this many seconds")
     add_session_options(parser)
     add_json(parser)
@@ -40,7 +56,11 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     from iris_session.runtime.config import SessionConfig
 
     defaults = SessionConfig()
-    changes = {"policy": arguments.assignment, "default_mode": arguments.mode}
+    assigned = assignments(getattr(arguments, "assign", []))
+    policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
+    if assigned and policy != AssignmentPolicy.CONFIG:
+        raise CommandError(f"--assign goes with --assignment {AssignmentPolicy.CONFIG}, not with {policy}")
+    changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
     return SessionConfig(
         name=arguments.name or name,
@@ -54,18 +74,16 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     )
 
 
-def scene_file(scene: str) -> Path:
-    """The file `scene`, or the packaged scene of that name."""
-    from iris_session.cli.common import CommandError
-    from iris_session.physics.scenes import scene_path
-
-    path = Path(scene)
-    if path.exists() or path.suffix:
-        return path
-    try:
-        return scene_path(scene)
-    except FileNotFoundError as error:
-        raise CommandError(f"{scene}: no such file, and {error}") from None
+def assignments(given: list[str]) -> dict[str, tuple[str, ...]]:
+    """Participant name -> robots, from `NAME=ROBOT[,ROBOT]`; a name given twice has the robots of both."""
+    found: dict[str, tuple[str, ...]] = {}
+    for text in given:
+        name, _, robots = text.partition("=")
+        names = tuple(robot.strip() for robot in robots.split(","))
+        if not name or not all(names):
+            raise CommandError(f"--assign {text}: must be NAME=ROBOT[,ROBOT], for example ann=left")
+        found[name] = tuple(dict.fromkeys((*found.get(name, ()), *names)))
+    return found
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -82,6 +100,9 @@ def run(arguments: argparse.Namespace) -> int:
         out = sys.stderr if arguments.json else sys.stdout
         names = ", ".join(r.name for r in session.robots) or "none"
         print(f"session '{session.config.name}' on {session.address}, robots: {names}", file=out, flush=True)
+        if not session.robots:
+            tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
+            print(f"{no_robots(model)}; {tip}", file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
         view = LiveView(session, out, f"iris-session {session.config.name} on {session.address}")

@@ -10,29 +10,40 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.emulator.runner import run_headsets
+from iris_session.client import ClientError
+from iris_session.client.sockets import parse_address
+from iris_session.emulator.person import behaviour_of, curve_of
+from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
 #: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`.
 LISTS: Final = frozenset({"eye", "recentre_at_s"})
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Exit status 0 when nobody failed."""
+def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
+    """Exit status 0 when nobody failed, 1 when somebody did, 2 for unusable input. Errors begin with `prog`."""
     options = _parser().parse_args(argv)
     try:
         specs = _specs(options)
-    except (msgspec.MsgspecError, OSError, ValueError) as error:
-        print(f"emulator: {error}", file=sys.stderr)
+        parse_address(options.address)
+        for spec in specs:
+            behaviour_of(spec)
+            curve_of(spec)
+    except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
         return 2
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
     say = _say_json if options.json else _say_line
     try:
-        reports = run_headsets(options.address, specs, options.seconds, say, lambda: bool(stopped))
+        reports = run_headsets(
+            options.address, specs, options.seconds, say, lambda: bool(stopped), options.join_timeout
+        )
         for report in reports:
             say(report, final=True)
+            if report.failed:
+                print(f"{prog}: {report.name}: {report.failed}", file=sys.stderr)
     except BrokenPipeError:  # whoever started us is gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -45,6 +56,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person, see specs")
     parser.add_argument("--specs", default="", metavar="FILE", help="JSON list of HeadsetSpec, - for standard input")
     parser.add_argument("--seconds", type=float, default=None, help="at most this long")
+    parser.add_argument(
+        "--join-timeout", type=float, default=JOIN_TIMEOUT_S, metavar="S", help="give up when no session lets us in"
+    )
+    parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key, of everybody here")
     parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
     return parser
 
@@ -61,7 +77,9 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         specs.append(msgspec.convert(pairs, HeadsetSpec, strict=False))
     if not specs:
         raise ValueError("no headset: give --headset name=ann,behaviour=giver,robot=left or --specs FILE")
-    return specs
+    given = {"curve_server": options.curve_server, "curve_key": options.curve_key}
+    keys = {name: file for name, file in given.items() if file}
+    return [msgspec.structs.replace(spec, **keys) for spec in specs]
 
 
 def _read(path: str) -> bytes:

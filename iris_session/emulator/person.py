@@ -24,7 +24,7 @@ from anchors.pose import (
     quat_angle,
     quat_from_yaw,
 )
-from iris_session.client import Client, SceneState
+from iris_session.client import Client, CurveKeys, SceneState
 from iris_session.emulator.behaviours import Behaviour, HandInput, make_behaviour
 from iris_session.emulator.display import Display
 from iris_session.emulator.headset import Headset, look_at
@@ -53,6 +53,20 @@ CLUTCH_AGAIN: Final = frozenset(
 )  # fmt: skip
 
 
+def behaviour_of(spec: HeadsetSpec) -> Behaviour | None:
+    """The behaviour of one person, `None` for an observer. Raises `ValueError` naming what is available."""
+    if spec.behaviour == OBSERVER:
+        return None
+    return make_behaviour(spec.behaviour, spec.robot, spec.object, spec.partner, spec.device, spec.seed)
+
+
+def curve_of(spec: HeadsetSpec) -> CurveKeys | None:
+    """The CURVE keys of one person. Raises `IdentityError` for files that are no keys, `ValueError` for half a pair."""
+    if bool(spec.curve_server) != bool(spec.curve_key):
+        raise ValueError("the session's public key and our own secret key (curve_server, curve_key) go together")
+    return CurveKeys.from_files(spec.curve_server, spec.curve_key) if spec.curve_key else None
+
+
 class Person:
     """See the module docstring. `report` is kept up to date."""
 
@@ -61,17 +75,14 @@ class Person:
         self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
         self.headset = Headset(spec.model, spec.seed, start_ns)
         self.observer = spec.behaviour == OBSERVER
-        self.behaviour: Behaviour | None = None
-        if not self.observer:
-            self.behaviour = make_behaviour(
-                spec.behaviour, spec.robot, spec.object, spec.partner, spec.device, spec.seed
-            )
+        self.behaviour = behaviour_of(spec)
         self.client = Client(
             address,
             role=Role.OBSERVER if self.observer else Role.OPERATOR,
             name=spec.name,
             devices=(Device.HEAD,) if self.observer else (Device.HEAD, spec.device),
             identity=spec.identity_file or None,
+            curve=curve_of(spec),
             software="iris-session emulator",
             on_state=self._on_state,
             on_event=self._on_event,

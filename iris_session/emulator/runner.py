@@ -15,7 +15,7 @@ from iris_session.emulator.person import Person
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
 REPORT_PERIOD_NS: Final = 1_000_000_000
-JOIN_TIMEOUT_NS: Final = 15_000_000_000
+JOIN_TIMEOUT_S: Final = 15.0
 
 Report = Callable[[HeadsetReport], None]
 
@@ -26,11 +26,13 @@ def run_headsets(
     seconds: float | None = None,
     report: Report | None = None,
     stop: Callable[[], bool] = lambda: False,
+    join_timeout_s: float = JOIN_TIMEOUT_S,
 ) -> list[HeadsetReport]:
     """Runs all `specs` until everyone with a task has finished, `seconds` have passed, or `stop()` is true.
 
     `report`: called with each person's report at every change of phase and once a second. Returns the final reports,
-    in the order of `specs`. Raises nothing for a person who fails: `HeadsetReport.failed` says why.
+    in the order of `specs`. Raises nothing for a person who fails (whom no session let in within `join_timeout_s`,
+    for example): `HeadsetReport.failed` says why.
     """
     start = time.monotonic_ns()
     end = None if seconds is None else start + int(seconds * 1e9)
@@ -41,9 +43,12 @@ def run_headsets(
         while not stop():
             now = time.monotonic_ns()
             if (end is not None and now >= end) or _all_finished(people):
+                _give_up_joining(people, 0.0, now)
                 break
             for person in people:
                 _drive(person, person.client in ready)
+            _give_up_joining(people, join_timeout_s, now)
+            for person in people:
                 if report is not None:
                     _tell(person, told, report, now)
             wake = min(person.next_ns for person in people)
@@ -64,10 +69,15 @@ def _drive(person: Person, ready: bool) -> None:
         if not person.finished:
             person.fail(str(error), time.monotonic_ns())
         return
-    now = time.monotonic_ns()
-    person.step(now)
-    if person.report.phase == "join" and now - person.started_ns > JOIN_TIMEOUT_NS:
-        person.fail(f"no session let us in at {person.client.address}", now)
+    person.step(time.monotonic_ns())
+
+
+def _give_up_joining(people: Sequence[Person], timeout_s: float, now_ns: int) -> None:
+    for person in people:
+        waited_s = (now_ns - person.started_ns) * 1e-9
+        if person.report.phase == "join" and waited_s >= timeout_s:
+            text = f"no session let us in at {person.client.address} within {waited_s:.1f} s"
+            person.fail(f"{text}: is `iris-session serve` running there?", now_ns)
 
 
 def _all_finished(people: Sequence[Person]) -> bool:

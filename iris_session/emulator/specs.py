@@ -19,7 +19,8 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `eye`: where the head is while working [m, world]. `T_world_anchor`: where the sheet truly lies, which need not be
     what the session believes. `recentre_at_s`, `doff_at_s`, `don_at_s`: seconds after joining at which the tracking
     frame jumps, the headset is taken off, and put on again. `display_delay_s`: how old the picture is on purpose
-    (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts.
+    (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts. `curve_server`,
+    `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
     """
 
     name: str
@@ -42,6 +43,8 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     don_at_s: float | None = None
     phase_timeout_s: float = 30.0
     identity_file: str = ""
+    curve_server: str = ""
+    curve_key: str = ""
 
 
 class HeadsetReport(msgspec.Struct, kw_only=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.cli.main import build_parser, main
+from iris_session.cli.serve import session_config
 
 COMMANDS = ("demo", "serve", "verify", "emulate", "robots", "bench")
 
@@ -93,6 +95,16 @@ def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
         (["robots", "nothing.xml"], "nothing.xml"),
         (["verify", "nothing.rrd"], "nothing.rrd"),
         (["serve", "nothing"], "Available scenes: arm, handover"),
+        (["robots", "nothing"], "Available scenes: arm, handover"),
+        (["serve", "handover", "--assign", "ann"], "NAME=ROBOT[,ROBOT]"),
+        (["serve", "handover", "--assign", "ann=left,"], "NAME=ROBOT[,ROBOT]"),
+        (["serve", "handover", "--assign", "ann=left", "--assignment", "nearest"], "--assignment config"),
+        (["serve", "handover", "--assign", "ann=elbow", "--control-port", "0", "--state-port", "0"], "left"),
+        (["emulate", "--behaviour", "foo"], "giver, receiver, wander, idle, observer"),
+        (["emulate", "--behaviour", "giver"], "needs a partner"),
+        (["emulate", "nowhere:port"], "HOST:PORT"),
+        (["emulate", "--curve-key", "mine.key_secret"], "go together"),
+        (["emulate", "--curve-server", "its.key", "--curve-key", "mine.key_secret"], "its.key"),
         (["serve", "handover", "--seconds", "-1", "--control-port", "99999"], "99999"),
     ],
 )
@@ -110,6 +122,46 @@ def test_expected_errors_are_one_line(
     (line,) = err.strip().splitlines()
     assert line.startswith("iris-session: ")
     assert expected in line
+
+
+def test_robots_takes_the_name_of_a_packaged_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robots", "handover"]) == 0
+    assert capsys.readouterr().out.startswith("# 2 robots, 2 free objects: hammer, board")
+
+
+def test_emulated_people_whom_no_session_lets_in_have_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]  # somebody listens there, but it is no session
+        assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2", "--count", "2"]) == 1
+        errors = capsys.readouterr().err.splitlines()
+        assert [line.split(": ")[:2] for line in errors] == [["iris-session", "wander1"], ["iris-session", "wander2"]]
+        assert all(f"no session let us in at 127.0.0.1:{port} within 0.2 s" in line for line in errors)
+        assert main(["emulate", f"127.0.0.1:{port}", "--behaviour", "observer", "--seconds", "0.1"]) == 1
+        assert "no session let us in" in capsys.readouterr().err
+
+
+SERVE = ("--no-record", "--control-port", "0", "--state-port", "0", "--json")
+
+
+def test_a_model_without_robots_is_served_and_explained(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "ball.xml"
+    scene.write_text("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    assert main(["serve", str(scene), "--seconds", "0.1", *SERVE]) == 0
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("no robots found")]
+    assert "at least 3 actuated joints" in line
+    assert "the model has no actuators" in line
+    assert f"iris-session robots {scene}" in line
+    assert main(["robots", str(scene)]) == 0
+    assert "the model has no actuators" in capfd.readouterr().err
+
+
+def test_assigned_robots_reach_the_configuration() -> None:
+    options = ["--assign", "ann=left", "--assign", "bob=right,third", "--assign", "ann=right,left"]
+    config = session_config(build_parser().parse_args(["serve", "scene.xml", *options]), "scene")
+    assert config.authority.policy == "config"
+    assert config.authority.assignments == {"ann": ("left", "right"), "bob": ("right", "third")}
+    plain = session_config(build_parser().parse_args(["serve", "scene.xml"]), "scene")
+    assert (plain.authority.policy, plain.authority.assignments) == ("join-order", {})
 
 
 def test_serve_json_is_one_object_and_the_file_is_verified_as_text_and_json(

@@ -121,7 +121,8 @@ def test_who_gets_no_robot_says_why(session: LiveSession) -> None:
 
 def test_nobody_there_is_a_failure_not_an_exception() -> None:
     (report,) = run_headsets("127.0.0.1:1", [HeadsetSpec(name="ann")], seconds=0.3)
-    assert report.phase == "join"
+    assert report.phase == "failed"
+    assert "no session let us in at 127.0.0.1:1" in report.failed
     assert report.participant == ""
 
 

@@ -41,4 +41,4 @@ def make_behaviour(
             return Wander(robot, device, seed)
         case "idle":
             return Idle(robot, device)
-    raise ValueError(f"no behaviour '{name}'. Available behaviours: {', '.join(NAMES)}")
+    raise ValueError(f"no behaviour '{name}'. Available behaviours: {', '.join(NAMES)}, observer")
