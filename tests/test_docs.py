@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
@@ -149,6 +150,19 @@ def test_keys_of_the_network_page_work(tmp_path: Path, run_python: Callable[...,
     run_python(make)
     with served(tmp_path, "--curve-key", "keys/server.key_secret", "--curve-clients", "keys/clients") as address:
         assert re.search(r"\(\d+, 7\)", run_python(use.replace(f"{LAB_ADDRESS}:7721", address)))
+        (shown,) = (words for where, words in commands() if where.startswith("network.md:") and "emulate" in words)
+        words = [address if LAB_ADDRESS in word else word for word in shown]
+        words += ["--behaviour", "observer", "--seconds", "2", "--json"]
+        done = subprocess.run(
+            [sys.executable, "-m", "iris_session.cli.main", *words],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout.splitlines()[-1])["frames"] > 0
 
 
 @pytest.mark.e2e

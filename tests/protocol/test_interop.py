@@ -1,0 +1,94 @@
+"""Any MessagePack library reads our wire, and we read what it writes: the golden vectors go through `msgpack`, which
+shares no code with the encoder that made them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import msgspec
+import pytest
+
+from iris_session.protocol import codec
+from iris_session.protocol.server_messages import Beacon
+
+GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "golden.json").read_text())
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "client": codec.decode_client,
+    "server": codec.decode_server,
+    "state_header": codec.decode_state_header,
+    "presence": codec.decode_presence,
+    "beacon": lambda data: msgspec.msgpack.decode(data, type=Beacon),
+}
+VECTORS = [pytest.param(section, vector, id=vector["name"]) for section in DECODERS for vector in GOLDEN[section]]
+
+
+def same(packed: Any, value: Any) -> bool:
+    """Whether a value of MessagePack is the JSON value beside it, exactly."""
+    match packed:
+        case dict():
+            return (
+                isinstance(value, dict)
+                and list(packed) == list(value)
+                and all(same(packed[key], value[key]) for key in packed)
+            )
+        case list():
+            return isinstance(value, list) and len(packed) == len(value) and all(map(same, packed, value))
+        case bytes():
+            return isinstance(value, str) and base64.b64decode(value, validate=True) == packed
+        case float() if not math.isfinite(packed):
+            return value is None
+        case float():  # by its bits: -0.0 is not 0.0
+            return isinstance(value, float) and struct.pack(">d", packed) == struct.pack(">d", value)
+        case _:
+            return type(packed) is type(value) and bool(packed == value)
+
+
+def unpack(data: bytes) -> Any:
+    return msgpack.unpackb(data, raw=False, strict_map_key=True)
+
+
+def reordered(value: Any) -> Any:
+    """The same with the keys of every map in the opposite order: the tag comes last."""
+    if isinstance(value, dict):
+        return {key: reordered(item) for key, item in reversed(value.items())}
+    return [reordered(item) for item in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize(("section", "vector"), VECTORS)
+def test_another_library_reads_every_vector_and_writes_the_same_bytes(section: str, vector: dict[str, Any]) -> None:
+    """Shortest integers, floats of 64 bits, text and bytes apart: the encoding of every library by default."""
+    packed = unpack(bytes.fromhex(vector["hex"]))
+    assert same(packed, vector["value"])
+    assert msgpack.packb(packed, use_bin_type=True).hex() == vector["hex"]
+
+
+@pytest.mark.parametrize(("section", "vector"), VECTORS)
+def test_what_another_library_writes_is_read_in_any_order_of_keys(section: str, vector: dict[str, Any]) -> None:
+    data = bytes.fromhex(vector["hex"])
+    other: bytes = msgpack.packb(reordered(unpack(data)), use_bin_type=True)
+    assert DECODERS[section](other) == DECODERS[section](data)
+
+
+def test_vectors_of_other_encoders_are_messagepack() -> None:
+    """Fields that are missing or unknown, wide integers, short floats: all of it is readable elsewhere too."""
+    assert GOLDEN["decode_only"]
+    for vector in GOLDEN["decode_only"]:
+        version, epoch, _, message = unpack(bytes.fromhex(vector["hex"]))[:4]
+        assert [version, epoch, message["type"]] == [*vector["value"][:2], vector["value"][3]["type"]], vector["name"]
+
+
+def test_a_difference_would_be_seen() -> None:
+    pairs: list[tuple[Any, Any]] = [(1, 1.0), (0.0, -0.0), (True, 1), ("1", 1), ({"a": 1, "b": 2}, {"b": 2, "a": 1})]
+    for packed, value in pairs:
+        assert not same(packed, value)
+        assert same(packed, packed)
+    assert same(b"x", "eA==")
+    assert not same(b"x", "eQ==")
+    assert same(math.nan, None)
