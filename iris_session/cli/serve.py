@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,6 +87,11 @@ def assignments(given: list[str]) -> dict[str, tuple[str, ...]]:
     return found
 
 
+def session_name(path: Path) -> str:
+    """Default name of a session: that of its scene, with what a name cannot hold replaced."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).strip("._-")[:48] or "session"
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
     from iris_session.cli.live import LiveView
@@ -95,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = scene_file(arguments.scene)
     model = load_model(path)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, model)
-    session = Session(model, config=session_config(arguments, path.stem), robots=robots)
+    session = Session(model, config=session_config(arguments, session_name(path)), robots=robots)
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         names = ", ".join(r.name for r in session.robots) or "none"

@@ -152,7 +152,7 @@ class Session:
         else:
             pacer.skip_backlog(now_ns)
         stepper.step(1)
-        pacer.finished(self.clock())
+        stepper.lateness_ns = max(stepper.lateness_ns, pacer.finished(self.clock()))
 
     def _paused_step(self, stepper: Stepper, pacer: Pacer) -> None:
         """Zero ticks, or some of those that a director asked for: few, so that an e-stop never waits for many."""

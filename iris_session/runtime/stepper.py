@@ -60,6 +60,8 @@ class RecorderPort(Protocol):
 
     def decision(self, step: int, session_time: int, decision: Decision) -> None: ...
 
+    def metric(self, name: str, value: float) -> None: ...
+
     def take_gap(self) -> int: ...
 
 
@@ -93,6 +95,8 @@ class Stepper:
         self._next_keyframe_ns = 0
         self._chain = chain
         self.ledger = SessionLedger()
+        #: Worst lateness of a tick since the last published state, for the recording's plots. Set by the pacing loop.
+        self.lateness_ns = 0
         #: Called with what was published, and with the entries of every step: for measurements and tests.
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
@@ -122,6 +126,7 @@ class Stepper:
             self._keyframe(now_ns)
         self._last_now_ns = now_ns
         outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None)
+        end_ns = self.clock()
         if self.on_entries is not None:
             self.on_entries(entries)
         if outcome.diverged and (self.last is None or not self.last.diverged):
@@ -130,10 +135,10 @@ class Stepper:
             self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
+        self.publish(end_ns)
         self.ledger.follow(outcome.decision, outcome.status)
         if self.recorder is not None:
             self._record(self.recorder, now_ns, n_ticks, entries, plant)
-        self.publish()
         self.step_count += 1
         return outcome
 
@@ -145,9 +150,8 @@ class Stepper:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
         return host + entries if host else entries
 
-    def publish(self) -> None:
-        """Sends the rigid state when it is due: its time is now, the end of the tick."""
-        end_ns = self.clock()
+    def publish(self, end_ns: int) -> None:
+        """Sends the rigid state when it is due. `end_ns`: session time of the end of the tick it belongs to."""
         if self.last is None or end_ns < self._next_state_ns:
             return
         # Aims at a fixed rate; after a long gap it starts over instead of sending a burst.
@@ -164,6 +168,8 @@ class Stepper:
             self.on_state(header, self._poses)
         if self.recorder is not None:
             self.recorder.state(self.step_count, tick, sim_time, end_ns, self._poses, applied)
+            self.recorder.metric("lateness_ms", self.lateness_ns * 1e-6)
+            self.lateness_ns = 0
 
     def _record(
         self, recorder: RecorderPort, now_ns: int, n_ticks: int, entries: Sequence[Entry], plant: bytes

@@ -83,7 +83,7 @@ class UserLoop:
         with self._lock:
             if self._take_plant():
                 self._stepper.core.world.set_state_bytes(self._plant)
-            self._stepper.publish()
+            self._stepper.publish(self._stepper.clock())
             self._last_tick_ns = self._stepper.clock()
             self._follow_time()
             self._processes.watch(self._stepper)

@@ -53,6 +53,7 @@ class Recorder:
         self.rows: list[JournalRow] = []
         self.keyframes: list[Keyframe] = []
         self.states = 0
+        self.metrics: list[tuple[str, float]] = []
 
     def row(self, row: JournalRow) -> None:
         self.rows.append(row)
@@ -74,6 +75,9 @@ class Recorder:
 
     def decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
+
+    def metric(self, name: str, value: float) -> None:
+        self.metrics.append((name, value))
 
     def take_gap(self) -> int:
         gap, self.gap = self.gap, 0
@@ -215,3 +219,12 @@ def test_physics_that_diverges_pauses_the_session_and_is_told_once(rig: Rig) -> 
     assert not rig.stepper.paused
     assert rig.stepper.last is not None
     assert rig.stepper.last.diverged == ""
+
+
+def test_the_worst_lateness_between_two_states_is_recorded_once() -> None:
+    rig = Rig()
+    rig.stepper.lateness_ns = 3 * MS
+    rig.stepper.step(1)
+    rig.now_ns += 17 * MS
+    rig.stepper.step(1)
+    assert rig.recorder.metrics == [("lateness_ms", 3.0), ("lateness_ms", 0.0)]
