@@ -339,6 +339,8 @@ class Play:
             assert (c.kind == "hold") == (c.hold_reason != "") == (not c.sources)
             assert len(c.sources) <= 1 or self.state.robots[c.robot].mode == "shared"
             assert not c.sources or math.isclose(sum(s.weight for s in c.sources), 1.0)
+            assert not c.sources or c.scale == self.mirror.leases[c.robot].scale
+            assert 0.05 <= c.scale <= 5.0
             self.check_sources(c, sent)
             # With several holders the reason is that of one of them; the others' latches are their own.
             if c.hold_reason in REARMED and len(self.state.robots[c.robot].grants) == 1:
