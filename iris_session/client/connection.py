@@ -63,8 +63,6 @@ MAX_PENDING: Final = 64
 
 #: Refusals that pass: somebody who was in before keeps trying.
 TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
-
-
 #: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
 REPLACED: Final = "replaced"
 
