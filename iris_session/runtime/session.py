@@ -129,8 +129,9 @@ class Session:
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
         """
         stepper = self._make_stepper(user_owned=False)
-        end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
         with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
+            # Counted from here: collecting garbage in a large process takes longer than a short run.
+            end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
             pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
             while not self._stop.is_set():
                 now_ns = self.clock()
