@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from iris_session.cli.common import add_json, print_json
+from iris_session.cli.common import add_json, positive_seconds, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +25,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--operators", type=int, default=8, help="input: people who drive (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
     parser.add_argument("--observers", type=int, default=8, help="input: people who look (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="measured part (default: %(default)s)")
+    parser.add_argument("--seconds", type=positive_seconds, default=20.0, help="measured part (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
     crypto = parser.add_mutually_exclusive_group()
     crypto.add_argument("--curve", action="store_true", help="encrypted and authenticated")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,17 @@ def expected_errors() -> tuple[type[Exception], ...]:
     from iris_session.transport import FrontError
 
     return (SessionError, PhysicsError, ControlError, FrontError, RecordingError, ClientError)
+
+
+def positive_seconds(text: str) -> float:
+    """Type of options that take a duration [s]."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration: give seconds above 0, for example 30")
+    return seconds
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

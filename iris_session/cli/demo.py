@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import add_json, add_session_options, print_json
+from iris_session.cli.common import add_json, add_session_options, positive_seconds, print_json
 
 if TYPE_CHECKING:
     from iris_session.runtime.demo import DemoResult
@@ -26,7 +26,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("demo", choices=("handover",))
     parser.add_argument("--seed", type=int, default=0, help="of everything random in the emulated people")
-    parser.add_argument("--timeout", type=float, default=90.0, metavar="S", help="give up after this many seconds")
+    parser.add_argument(
+        "--timeout", type=positive_seconds, default=90.0, metavar="S", help="give up after this many seconds"
+    )
     add_session_options(parser)
     add_json(parser)
     parser.set_defaults(run=run, control_port=0, state_port=0)
@@ -56,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def summary(result: DemoResult) -> str:
     """The result as a few lines of text."""
-    lines = [f"demo {result.demo}: {'ok' if result.ok else 'FAILED'} after {result.seconds:.1f} s"]
+    outcome = "ok" if result.ok else "interrupted" if result.interrupted else "FAILED"
+    lines = [f"demo {result.demo}: {outcome} after {result.seconds:.1f} s"]
     lines += [
         f"  handover of {h.object}: {h.giver} -> {h.receiver} at {h.at_s:.1f} s, both held it for {h.duration_s:.2f} s"
         for h in result.handovers
@@ -67,6 +70,6 @@ def summary(result: DemoResult) -> str:
     ]
     lines.append(f"  late ticks {result.late_tick_share * 100:.3f} %, lateness p99 {result.lateness_ms_p99:.2f} ms")
     lines += [f"  state age p99 at {name}: {age:.1f} ms" for name, age in result.state_age_ms_p99.items()]
-    lines.append(f"  recording {result.recording}: {result.verification}")
+    lines.append(f"  recording {result.recording}: {result.verification}" if result.recording else "  not recorded")
     lines += [f"  problem: {problem}" for problem in result.problems]
     return "\n".join(lines)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from iris_session.cli.common import positive_seconds
+
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
@@ -24,7 +26,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--count", type=int, default=1, help="how many people with --behaviour")
     parser.add_argument("--seed", type=int, default=0, help="of everything random: frames, noise, motion")
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person in detail")
-    parser.add_argument("--seconds", type=float, help="at most this long")
+    parser.add_argument("--seconds", type=positive_seconds, help="at most this long")
     parser.add_argument(
         "--join-timeout", type=float, default=15.0, metavar="S", help="give up when no session lets us in (%(default)s)"
     )

@@ -13,6 +13,7 @@ from iris_session.cli.common import (
     add_json,
     add_session_options,
     no_robots,
+    positive_seconds,
     print_json,
     scene_file,
 )
@@ -43,7 +44,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="NAME=ROBOT[,ROBOT]",
         help="robots of a participant, repeatable; implies --assignment config",
     )
-    parser.add_argument("--seconds", type=float, help="stop after this many seconds")
+    parser.add_argument("--seconds", type=positive_seconds, help="stop after this many seconds")
     add_session_options(parser)
     add_json(parser)
     parser.set_defaults(run=run)

@@ -24,6 +24,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run(arguments: argparse.Namespace) -> int:
     """Verifies each file; the first problem of each is named with its step and entry."""
+    from iris_session.recording import Problem, RecordingError, VerifyReport
     from iris_session.runtime.verification import verify_recording
 
     reports = []
@@ -33,11 +34,17 @@ def run(arguments: argparse.Namespace) -> int:
         def show(done: int, total: int, path: Path = path) -> None:
             print(f"\r{path}: step {done} of {total}", end="" if done < total else "\n", file=sys.stderr)
 
-        report = verify_recording(path, show if progress else None)
+        try:
+            report = verify_recording(path, show if progress else None)
+        except RecordingError as error:  # one file that is none must not hide the others
+            report = VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))])
+            print(f"iris-session: {error}", file=sys.stderr)
+        else:
+            if not arguments.json:
+                print(f"{path}: {report.line()}")
         reports.append(report)
-        if not arguments.json:
-            print(f"{path}: {report.line()}")
     ok = all(report.ok for report in reports)
     if arguments.json:
         print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
-    return 0 if ok else 1
+    unreadable = all(p.kind == "unreadable" and p.step < 0 for report in reports for p in report.problems)
+    return 0 if ok else 2 if unreadable and len(reports) == 1 else 1

@@ -27,7 +27,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
         specs = _specs(options)
         parse_address(options.address)
         for spec in specs:
-            behaviour_of(spec)
+            behaviour_of(spec, spec.robot)
             curve_of(spec)
     except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
         print(f"{prog}: {error}", file=sys.stderr)

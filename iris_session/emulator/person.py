@@ -33,8 +33,8 @@ from iris_session.emulator.specs import OBSERVER, HeadsetReport, HeadsetSpec
 from iris_session.emulator.viewpoints import between, viewpoint_pose
 from iris_session.protocol.client_messages import Acquire, Sample
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlignmentKind, CommandKind, Device, HoldReason, Role
-from iris_session.protocol.server_messages import Event, Handover, Notice
+from iris_session.protocol.names import AlignmentKind, CommandKind, DenialReason, Device, HoldReason, Role
+from iris_session.protocol.server_messages import Event, Handover, Notice, Reply
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
@@ -53,11 +53,15 @@ CLUTCH_AGAIN: Final = frozenset(
 )  # fmt: skip
 
 
-def behaviour_of(spec: HeadsetSpec) -> Behaviour | None:
+#: Denials that no waiting mends.
+FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, DenialReason.UNKNOWN_VALUE})
+
+
+def behaviour_of(spec: HeadsetSpec, robot: str) -> Behaviour | None:
     """The behaviour of one person, `None` for an observer. Raises `ValueError` naming what is available."""
     if spec.behaviour == OBSERVER:
         return None
-    return make_behaviour(spec.behaviour, spec.robot, spec.object, spec.partner, spec.device, spec.seed)
+    return make_behaviour(spec.behaviour, robot, spec.object, spec.partner, spec.device, spec.seed)
 
 
 def curve_of(spec: HeadsetSpec) -> CurveKeys | None:
@@ -75,7 +79,9 @@ class Person:
         self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
         self.headset = Headset(spec.model, spec.seed, start_ns)
         self.observer = spec.behaviour == OBSERVER
-        self.behaviour = behaviour_of(spec)
+        #: What this person drives; empty until the session's policy has chosen, when the spec names none.
+        self.robot = spec.robot
+        self.behaviour = behaviour_of(spec, self.robot)
         self.client = Client(
             address,
             role=Role.OBSERVER if self.observer else Role.OPERATOR,
@@ -192,7 +198,7 @@ class Person:
             self.display.hands[hand.device] = hand.pose_world
             self._send_hand(hand, alignment, now_ns)
         if not sent:
-            rest = HandInput(self.spec.device, self.spec.robot, self.display.hands[self.spec.device], False, math.nan)
+            rest = HandInput(self.spec.device, self.robot, self.display.hands[self.spec.device], False, math.nan)
             self._send_hand(rest, alignment, now_ns)
 
     def _send_hand(self, hand: HandInput, alignment: Alignment, now_ns: int) -> None:
@@ -271,11 +277,11 @@ class Person:
         self.head = between(self._head_from, self._head_to, fraction)
 
     def _acquire(self, now_ns: int) -> None:
-        if self.client.lease_version(self.spec.robot) is not None:
+        if self.robot and self.client.lease_version(self.robot) is not None:
             self._request = None
             self._enter("work", now_ns)
         elif self._request is None and now_ns >= self._retry_ns:
-            number = self.client.submit(Acquire(0, (self.spec.robot,), wait=True))
+            number = self.client.submit(Acquire(0, (self.robot,) if self.robot else (), wait=True))
             self._request = (self.client.connection.generation, number)
         elif self._request is not None:
             generation, number = self._request
@@ -283,15 +289,25 @@ class Person:
             if reply is not None or generation != self.client.connection.generation:
                 self._request = None  # answered, or asked on a connection that is gone
                 self._retry_ns = now_ns + int(RETRY_S * 1e9)
-            if reply is not None and reply.denial is not None:
-                self._refused_because = f"{reply.denial.reason}: {reply.denial.message} {reply.denial.advice}"
+            if reply is not None:
+                self._answered(reply, now_ns)
+
+    def _answered(self, reply: Reply, now_ns: int) -> None:
+        """A robot of the policy's choice, or a no: for good, or until the next try."""
+        if reply.denial is not None:
+            self._refused_because = f"{reply.denial.reason}: {reply.denial.message}; {reply.denial.advice}"
+            if reply.denial.reason in FOR_GOOD:
+                self.fail(self._refused_because, now_ns)
+        elif not self.robot and reply.leases:
+            self.robot = reply.leases[0].target
+            self.behaviour = behaviour_of(self.spec, self.robot)
 
     def _fall_back(self, now_ns: int) -> None:
         """What was won can be lost: the alignment with a jump or a new session, the robot to somebody else."""
         if self.report.phase in ("watch", "acquire", "work") and self._alignment() is None:
             self._viewpoint = 0
             self._enter("look", now_ns)
-        elif self.report.phase == "work" and self.client.lease_version(self.spec.robot) is None:
+        elif self.report.phase == "work" and self.client.lease_version(self.robot) is None:
             self._enter("acquire", now_ns)
 
     def _scheduled(self, now_ns: int) -> None:

@@ -21,7 +21,7 @@ from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.physics.scenes import scene_path
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.session import Session
-from iris_session.runtime.status import HandoverStatus
+from iris_session.runtime.status import HandoverStatus, SessionStatus
 from iris_session.runtime.verification import verify_recording
 
 #: How often the reports of the emulated people are read [ns].
@@ -159,15 +159,7 @@ def run_handover(
     reports = {name: report for emulator in emulators for name, report in emulator.reports.items()}
     # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
-    problems = ["interrupted before its end"] if interrupted else []
-    problems += [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
-    problems += [
-        f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
-        for name, r in reports.items()
-        if not (r.done or r.failed)
-    ]
-    if not status.handovers:
-        problems.append("the detector saw no handover by contact alone")
+    problems = ["interrupted before its end"] if interrupted else _problems(reports, status, timeout_s)
     if verified is False:
         problems.append(verification)
     return DemoResult(
@@ -190,6 +182,19 @@ def run_handover(
         problems=tuple(problems),
         interrupted=interrupted,
     )
+
+
+def _problems(reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
+    """Why this was no handover; empty when it was one."""
+    problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
+    problems += [
+        f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
+        for name, r in reports.items()
+        if not (r.done or r.failed)
+    ]
+    if not status.handovers:
+        problems.append("the detector saw no handover by contact alone")
+    return problems
 
 
 def _verify(recording: Path | None) -> tuple[bool | None, str]:

@@ -105,7 +105,7 @@ def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
         (["emulate", "nowhere:port"], "HOST:PORT"),
         (["emulate", "--curve-key", "mine.key_secret"], "go together"),
         (["emulate", "--curve-server", "its.key", "--curve-key", "mine.key_secret"], "its.key"),
-        (["serve", "handover", "--seconds", "-1", "--control-port", "99999"], "99999"),
+        (["serve", "handover", "--seconds", "1", "--control-port", "99999"], "99999"),
     ],
 )
 def test_expected_errors_are_one_line(
@@ -194,3 +194,22 @@ def test_a_reader_that_goes_away_is_no_traceback(tmp_path: Path) -> None:
     os.close(write)
     assert "Traceback" not in done.stderr
     assert done.returncode == 1
+
+
+@pytest.mark.parametrize("seconds", ["-1", "0", "nan", "soon"])
+def test_a_duration_is_above_zero(seconds: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["serve", "handover", "--seconds", seconds])
+    assert ended.value.code == 2
+    assert "is not a duration" in capsys.readouterr().err
+
+
+def test_one_file_that_is_no_recording_does_not_hide_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.rrd", "b.rrd"):
+        (tmp_path / name).write_text("not a recording")
+    assert main(["verify", str(tmp_path / "a.rrd"), str(tmp_path / "b.rrd")]) == 1
+    errors = capsys.readouterr().err
+    assert "a.rrd" in errors
+    assert "b.rrd" in errors

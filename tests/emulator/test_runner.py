@@ -119,6 +119,17 @@ def test_who_gets_no_robot_says_why(session: LiveSession) -> None:
     assert report.phase == "failed"
 
 
+def test_who_names_no_robot_gets_one_of_the_policy_and_drives_it(session: LiveSession) -> None:
+    specs = [HeadsetSpec(name="ann", behaviour="wander", **QUICK)]
+    reports: list[str] = []
+
+    def driving() -> bool:
+        return any(phase.startswith("work/") for phase in reports)
+
+    (report,) = run_headsets(session.address, specs, 30.0, lambda r: reports.extend(r.phases), driving)
+    assert driving(), report
+
+
 def test_nobody_there_is_a_failure_not_an_exception() -> None:
     (report,) = run_headsets("127.0.0.1:1", [HeadsetSpec(name="ann")], seconds=0.3)
     assert report.phase == "failed"
