@@ -209,7 +209,7 @@ class Person:
             hand.device,
             pose,
             now_ns,
-            robots=(hand.robot,),
+            robots=(hand.robot,) if self.client.lease_version(hand.robot) is not None else (),
             clutch=self._clutch(hand, now_ns),
             gripper=None if math.isnan(hand.gripper) else hand.gripper,
         )
