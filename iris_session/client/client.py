@@ -11,12 +11,12 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Self
 
 import zmq
 
 from iris_session.client.connection import Connection
-from iris_session.client.errors import ClientError, DeniedError, NotConnectedError, RequestTimeoutError
+from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.identity import Identity
 from iris_session.client.requests import Requests
 from iris_session.client.sampling import Sampling
@@ -24,10 +24,11 @@ from iris_session.client.scene_view import SceneView
 from iris_session.client.sockets import ClientSockets, CurveKeys, parse_address
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
+from iris_session.client.values import checked_bytes, names_of
 from iris_session.client.waiting import milliseconds
 from iris_session.protocol.client_messages import ClientMessage, Hello
 from iris_session.protocol.names import AlignmentKind, Role
-from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault, Reply
+from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault
 
 #: Roles that have no headset, so nothing to align.
 UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER})
@@ -48,7 +49,7 @@ class Client(SceneView, Requests, Sampling):
             target = client.tip_pose("left")  # T_world_tip: move it
             for i in range(90):  # the clutch must be seen open once; after 150 ms without a sample the robot holds
                 client.send_sample("target", target, robots=["left"], clutch=i > 0)
-                client.poll(1 / 60)
+                client.sleep(1 / 60)
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Client(SceneView, Requests, Sampling):
         *,
         role: str = Role.OPERATOR,
         name: str = "",
-        devices: Sequence[str] = (),
+        devices: str | Sequence[str] = (),
         capabilities: Sequence[str] = (),
         alignment: str | None = None,
         identity: Identity | str | os.PathLike[str] | None = None,
@@ -80,18 +81,20 @@ class Client(SceneView, Requests, Sampling):
             role=role,
             name=name or role,
             software=software,
-            devices=tuple(devices),
+            devices=names_of("devices", devices),
             # The session keeps our alignment over a lost connection only while this `run` lasts.
             capabilities=(*capabilities, f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
             join_code=join_code,
         )
+        checked_bytes(hello)
         self.connection = Connection(hello, identity)
         self.on_state = on_state
         self.on_event = on_event
         self.on_feedback = on_feedback
         self.feedback: dict[str, Feedback] = {}
         self._state: SceneState | None = None
+        self._session_id = ""
         self._seq = {}
         self._generation = 0
         self._sockets = ClientSockets(host, port, curve)
@@ -160,7 +163,7 @@ class Client(SceneView, Requests, Sampling):
         True when anything came or the connection's phase changed. Raises `RefusedError` after the session refused us
         for good.
         """
-        if self._thread is not None and threading.current_thread() is not self._thread:
+        if not self._polls_here:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
         deadline = time.monotonic_ns() + int(timeout_s * 1e9)
         while True:
@@ -172,6 +175,12 @@ class Client(SceneView, Requests, Sampling):
         if self.connection.failure is not None:
             raise self.connection.failure
         return progressed
+
+    def sleep(self, seconds: float) -> None:
+        """Polls for the whole time, where `poll` returns as soon as anything came: for the pace of a loop."""
+        if self._polls_here:
+            self.poll()
+        self.wait_for(lambda client: False, seconds)
 
     def poll_state(self) -> bool:
         """Only takes the state that waits, and hands it to `on_state`; everything else is left to `poll`.
@@ -205,7 +214,7 @@ class Client(SceneView, Requests, Sampling):
             remaining = deadline - time.monotonic()
             if remaining <= 0.0:
                 return False
-            if self._thread is None or threading.current_thread() is self._thread:
+            if self._polls_here:
                 self.poll(remaining)
                 continue
             with self._changed:
@@ -215,6 +224,10 @@ class Client(SceneView, Requests, Sampling):
                     raise self.connection.failure
                 self._changed.wait(min(remaining, 0.1))
         return True
+
+    @property
+    def _polls_here(self) -> bool:
+        return self._thread is None or threading.current_thread() is self._thread
 
     @property
     def ready(self) -> bool:
@@ -248,50 +261,10 @@ class Client(SceneView, Requests, Sampling):
             self._send_soon()
             return queued
 
-    def submit(self, message: Any) -> int:
-        """Sends a message that has a `request_id` (which is filled in) without waiting; `answer` has the reply."""
-        with self._lock:
-            request_id = self.connection.request(message)
-            self._send_soon()
-            return request_id
-
-    def answer(self, request_id: int) -> Reply | None:
-        """The reply to a submitted request, once; `None` while there is none. Look at its `denial`."""
-        with self._lock:
-            return self.connection.take_reply(request_id)
-
-    def request(self, message: Any, timeout_s: float = DEFAULT_TIMEOUT_S) -> Reply:
-        """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
-
-        Raises `DeniedError`, `RequestTimeoutError`, or `NotConnectedError` when the connection is lost meanwhile.
-        """
-        with self._lock:
-            generation = self.connection.generation
-            request_id = self.submit(message)
-        replies: list[Reply] = []
-
-        def answered(client: Client) -> bool:
-            reply = client.answer(request_id)
-            if reply is not None:
-                replies.append(reply)
-            return reply is not None or client.connection.generation != generation or not client.connection.joined
-
-        self.wait_for(answered, timeout_s)
-        with self._lock:
-            self.connection.forget(request_id)
-        kind = type(message).__name__
-        if not replies:
-            if self.connection.generation != generation or not self.connection.joined:
-                raise NotConnectedError(f"connection lost while waiting for the answer to {kind}")
-            raise RequestTimeoutError(f"no answer to {kind} within {timeout_s:g} s")
-        if replies[0].denial is not None:
-            raise DeniedError(replies[0].denial)
-        return replies[0]
-
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _send_soon(self) -> None:
-        if self._thread is None or threading.current_thread() is self._thread:
+        if self._polls_here:
             self._flush()
         else:
             self._sockets.wake()
@@ -315,6 +288,8 @@ class Client(SceneView, Requests, Sampling):
             for message in inbox:
                 if isinstance(message, Feedback):
                     self.feedback[message.robot] = message
+            if self.feedback and not self.connection.joined:
+                self.feedback = {}  # nobody tells what the robots do now
         for message in inbox:
             self._call_back(message)
         return progressed
@@ -334,6 +309,8 @@ class Client(SceneView, Requests, Sampling):
         for frames in messages:
             self.connection.receive(frames, now_ns)
         if self.connection.joined and self.connection.welcome is not None:
+            if self.connection.welcome.session_id != self._session_id:
+                self._session_id, self._state = self.connection.welcome.session_id, None
             self._sockets.open_state(self.connection.welcome.endpoints.state)
         return bool(messages)
 

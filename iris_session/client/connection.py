@@ -19,18 +19,18 @@ import msgspec
 from iris_session.client.clock import ClockSync
 from iris_session.client.errors import NotConnectedError, RefusedError, VersionError
 from iris_session.client.identity import Identity
+from iris_session.client.outgoing import Outgoing
 from iris_session.client.session_state import SessionMirror
 from iris_session.client.state_stream import StateStream, poses_from_bytes
 from iris_session.client.status import ConnectionCounters, Phase
+from iris_session.client.values import checked_bytes
 from iris_session.protocol.client_messages import (
     Bye,
     ClientMessage,
     ClockPing,
-    EStop,
     GetSnapshot,
     Heartbeat,
     Hello,
-    Release,
     Sample,
     TrackingEpoch,
     envelope,
@@ -38,7 +38,7 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.common import Lease
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.names import DenialReason, RefusalCode
+from iris_session.protocol.names import DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import (
     ClockPong,
     Event,
@@ -57,12 +57,13 @@ BACKOFF_MAX_NS: Final = 2_000_000_000
 STEADY_NS: Final = 1_000_000_000
 SNAPSHOT_RETRY_NS: Final = 500_000_000
 SILENT_HEARTBEATS: Final = 4  # this many heartbeat periods without a word from the front: the connection is gone
-MAX_OUTGOING: Final = 256
 MAX_INBOX: Final = 1024
 MAX_PENDING: Final = 64
 
 #: Refusals that pass: somebody who was in before keeps trying.
 TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
+#: Faults about a message of ours that the session could not read: whoever waits for its answer waits in vain.
+NOT_TAKEN: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LARGE})
 #: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
 REPLACED: Final = "replaced"
 
@@ -77,6 +78,7 @@ class Connection:
         self.generation = 0
         self.welcome: Welcome | None = None
         self.failure: RefusedError | None = None
+        self.not_taken: ProtocolFault | None = None  # the newest fault of `NOT_TAKEN`
         self.stalled = False
         self.worn = True
         self.tracking_epoch = 0
@@ -85,7 +87,7 @@ class Connection:
         self.stream = StateStream()
         self.counters = ConnectionCounters()
         self.inbox: deque[Event | Feedback | ProtocolFault] = deque()
-        self._outgoing: deque[tuple[bool, bytes]] = deque()
+        self._outgoing = Outgoing(self.counters)
         self._pending: set[int] = set()
         self._replies: dict[int, Reply] = {}
         self._granted: dict[str, Lease] = {}
@@ -165,24 +167,30 @@ class Connection:
     # --- sending ------------------------------------------------------------------------------------------------------
 
     def send(self, message: ClientMessage) -> bool:
-        """Queues a message. Samples are never kept: false (and counted) when there is no connection."""
+        """Queues a message. Samples are never kept: false (and counted) when there is no connection.
+
+        Raises `InvalidMessageError` when the protocol does not take it, connected or not.
+        """
+        data = checked_bytes(message, self.connection_epoch)
         if not self.joined:
             if isinstance(message, Sample):
                 self.counters.samples_not_sent += 1
                 return False
             raise NotConnectedError(self.describe())
-        return self._queue(message)
+        return self._outgoing.push(message, data)
 
     def request(self, message: Any) -> int:
         """Queues a request under a fresh `request_id`, which is returned."""
         if not self.joined:
             raise NotConnectedError(self.describe())
         request_id = self._next_request
+        message = msgspec.structs.replace(message, request_id=request_id)
+        data = checked_bytes(message, self.connection_epoch)
         self._next_request += 1
         if len(self._pending) >= MAX_PENDING:
             self._pending.discard(min(self._pending))
         self._pending.add(request_id)
-        self._queue(msgspec.structs.replace(message, request_id=request_id))
+        self._outgoing.push(message, data)
         return request_id
 
     def take_reply(self, request_id: int) -> Reply | None:
@@ -196,15 +204,11 @@ class Connection:
 
     def peek_outgoing(self) -> tuple[bool, bytes] | None:
         """The next message to send: (may be dropped when the socket is full, bytes)."""
-        return self._outgoing[0] if self._outgoing else None
+        return self._outgoing.peek()
 
     def pop_outgoing(self, *, sent: bool) -> None:
         """The message of `peek_outgoing` is done with: sent, or dropped."""
-        self._outgoing.popleft()
-        if sent:
-            self.counters.sent += 1
-        else:
-            self.counters.samples_not_sent += 1
+        self._outgoing.pop(sent=sent)
 
     def lease_version(self, target: str) -> int | None:
         """Our fencing token for `target`, by events or by a reply that came before its event."""
@@ -289,7 +293,9 @@ class Connection:
     def _fault(self, fault: ProtocolFault, now_ns: int) -> None:
         self.counters.faults[fault.code] = self.counters.faults.get(fault.code, 0) + 1
         self._deliver(fault)
-        if fault.code in ("stalled", "recovered"):
+        if fault.code in NOT_TAKEN:
+            self.not_taken = fault
+        elif fault.code in ("stalled", "recovered"):
             self.stalled = fault.code == "stalled"
         elif fault.code == "dropped" and fault.message.endswith(REPLACED):
             advice = "give every client that runs at the same time an identity of its own"
@@ -374,7 +380,7 @@ class Connection:
         hello = msgspec.structs.replace(
             self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
         )
-        self._outgoing.append((False, encode_client(envelope(hello))))
+        self._outgoing.push(hello, encode_client(envelope(hello)))
 
     def _wait(self, now_ns: int) -> None:
         self.phase = Phase.WAITING
@@ -382,18 +388,5 @@ class Connection:
         self._retry_at = now_ns + self._backoff_ns
         self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)
 
-    def _queue(self, message: ClientMessage) -> bool:
-        droppable = isinstance(message, Sample)
-        if len(self._outgoing) >= MAX_OUTGOING:
-            urgent = isinstance(message, EStop | Release | Bye)
-            lost_sample = self._outgoing.pop()[0] if urgent else droppable
-            self.counters.samples_not_sent += lost_sample
-            self.counters.outgoing_dropped += not lost_sample
-            if not urgent:
-                return False
-        item = (droppable, encode_client(envelope(message, self.connection_epoch)))
-        if isinstance(message, EStop | Release):
-            self._outgoing.appendleft(item)
-        else:
-            self._outgoing.append(item)
-        return True
+    def _queue(self, message: ClientMessage) -> None:
+        self._outgoing.push(message, encode_client(envelope(message, self.connection_epoch)))

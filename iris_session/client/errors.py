@@ -6,6 +6,7 @@
     |   +-- VersionError       it speaks other protocol versions: `supported_versions`
     +-- DeniedError            the session said no to one request: `denial` (reason, holder, advice); nothing changed
     +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect
+    +-- InvalidMessageError    what was to be sent is not of the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
 
 Bytes that a server sends and that do not fit the protocol never raise: they are counted in `Client.counters`.
@@ -21,6 +22,11 @@ class ClientError(Exception):
     """Base of all errors of the client."""
 
 
+def joined(*parts: str) -> str:
+    """Those that say something, as one line."""
+    return "; ".join(part for part in parts if part)
+
+
 class NotConnectedError(ClientError):
     """There is no connection to a session."""
 
@@ -29,8 +35,7 @@ class RefusedError(ClientError):
     """The session refused `hello`. `code` is a `RefusalCode` or a `DenialReason`."""
 
     def __init__(self, refused: Refused) -> None:
-        advice = f" {refused.advice}" if refused.advice else ""
-        super().__init__(f"refused ({refused.code}): {refused.message}{advice}")
+        super().__init__(f"refused ({refused.code}): {joined(refused.message, refused.advice)}")
         self.code = refused.code
         self.message = refused.message
         self.advice = refused.advice
@@ -48,14 +53,18 @@ class DeniedError(ClientError):
     """The session denied a request, and changed nothing."""
 
     def __init__(self, denial: Denial) -> None:
-        who = f" (holder: {denial.holder_name or denial.holder})" if denial.holder else ""
-        advice = f" {denial.advice}" if denial.advice else ""
-        super().__init__(f"denied ({denial.reason}): {denial.message}{who}{advice}")
+        name = denial.holder_name or denial.holder
+        who = "" if not name or name in denial.message.split() else f"held by {name}"
+        super().__init__(f"denied ({denial.reason}): {joined(denial.message, who, denial.advice)}")
         self.denial = denial
 
 
 class RequestTimeoutError(ClientError, TimeoutError):
     """No answer came in time. The request may still take effect: look at the leases before asking again."""
+
+
+class InvalidMessageError(ClientError, ValueError):
+    """The protocol does not take this message, or a value cannot be what its field needs. Nothing was sent."""
 
 
 class IdentityError(ClientError):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Self
+
+import msgspec
 
 from anchors.pose import PoseTuple
 from iris_session.client.connection import Connection
+from iris_session.client.errors import DeniedError, InvalidMessageError, NotConnectedError, RequestTimeoutError
+from iris_session.client.values import names_of, pose_of, text_of
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
@@ -26,7 +31,7 @@ from iris_session.protocol.client_messages import (
     SetScale,
     TrackingEpoch,
 )
-from iris_session.protocol.common import Lease, Pose, Target
+from iris_session.protocol.common import Denial, Lease, Pose, Target
 from iris_session.protocol.names import AnchorKind, TargetKind
 from iris_session.protocol.server_messages import Reply
 
@@ -35,9 +40,13 @@ class Requests:
     """Mixin of `Client`: everything a participant can ask for."""
 
     connection: Connection
+    _lock: threading.RLock
 
     @abstractmethod
-    def request(self, message: Any, timeout_s: float = 5.0) -> Reply: ...
+    def wait_for(self, condition: Callable[[Self], bool], timeout_s: float = 5.0) -> bool: ...
+
+    @abstractmethod
+    def _send_soon(self) -> None: ...
 
     @abstractmethod
     def send(self, message: ClientMessage) -> bool: ...
@@ -48,11 +57,62 @@ class Requests:
     @abstractmethod
     def lease_version(self, target: str) -> int | None: ...
 
+    def submit(self, message: Any) -> int:
+        """Sends a message that has a `request_id` (which is filled in) without waiting; `answer` has the reply."""
+        with self._lock:
+            request_id = self.connection.request(message)
+            self._send_soon()
+            return request_id
+
+    def answer(self, request_id: int) -> Reply | None:
+        """The reply to a submitted request, once; `None` while there is none. Look at its `denial`."""
+        with self._lock:
+            return self.connection.take_reply(request_id)
+
+    def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
+        """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
+
+        Raises `DeniedError`, `RequestTimeoutError`, `InvalidMessageError` when the protocol does not take it, or
+        `NotConnectedError` when the connection is lost meanwhile.
+        """
+        with self._lock:
+            generation = self.connection.generation
+            fault_before = self.connection.not_taken
+            request_id = self.submit(message)
+        replies: list[Reply] = []
+
+        def answered(client: Requests) -> bool:
+            reply = client.answer(request_id)
+            if reply is not None:
+                replies.append(reply)
+            lost = client.connection.generation != generation or not client.connection.joined
+            return reply is not None or client.connection.not_taken is not fault_before or lost
+
+        self.wait_for(answered, timeout_s)
+        with self._lock:
+            self.connection.forget(request_id)
+        kind = type(message).__name__
+        if not replies:
+            if self.connection.generation != generation or not self.connection.joined:
+                raise NotConnectedError(f"connection lost while waiting for the answer to {kind}")
+            if self.connection.not_taken is not fault_before and self.connection.not_taken is not None:
+                raise InvalidMessageError(f"{kind} was not taken: {self.connection.not_taken.message}")
+            raise RequestTimeoutError(f"no answer to {kind} within {timeout_s:g} s")
+        if replies[0].denial is not None:
+            raise DeniedError(self._with_name(replies[0].denial))
+        return replies[0]
+
+    def _with_name(self, denial: Denial) -> Denial:
+        holder = self.connection.mirror.participants.get(denial.holder)
+        if holder is None or denial.holder_name:
+            return denial
+        return msgspec.structs.replace(denial, holder_name=holder.name)
+
     def acquire(
         self,
-        robots: Sequence[str] = (),
+        robots: str | Iterable[str] = (),
         *,
-        objects: Sequence[str] = (),
+        objects: str | Iterable[str] = (),
         wait: bool = False,
         weight: float = 1.0,
         timeout_s: float = 5.0,
@@ -63,10 +123,13 @@ class Requests:
         consent in mode `request`: `RequestTimeoutError` after `timeout_s` leaves us in the queue, `release()` leaves
         it. `weight`: share in mode `shared`.
         """
-        return self.request(Acquire(0, tuple(robots), tuple(objects), wait, weight), timeout_s).leases
+        return self.request(
+            Acquire(0, names_of("robots", robots), names_of("objects", objects), wait, weight), timeout_s
+        ).leases
 
     def release(self, *names: str) -> None:
         """Gives robots and objects back; without names all, and leaves every queue. Denied for what is not ours."""
+        names = names_of("release", names)
         leases = self.connection.mirror.leases
         kinds = [leases[name].kind if name in leases else TargetKind.ROBOT for name in names]
         tokens = [self.lease_version(name) or 0 for name in names]
@@ -80,29 +143,32 @@ class Requests:
         """Answers a `ConsentRequested` event."""
         self.request(Consent(0, consent_id, grant))
 
-    def assign(self, robots: Sequence[str], participant: str = "") -> tuple[Lease, ...]:
+    def assign(self, robots: str | Iterable[str], participant: str = "") -> tuple[Lease, ...]:
         """Director: gives robots to a participant, or frees them."""
-        return self.request(Assign(0, tuple(robots), participant)).leases
+        return self.request(Assign(0, names_of("robots", robots), participant)).leases
 
     def set_mode(self, robot: str, mode: str) -> None:
         """Director: changes the lease mode of a robot."""
         self.request(SetMode(0, robot, mode))
 
-    def set_scale(self, robots: Sequence[str] = (), scale: float = 1.0) -> tuple[Lease, ...]:
+    def set_scale(self, robots: str | Iterable[str] = (), scale: float = 1.0) -> tuple[Lease, ...]:
         """How far robots that we hold move as our hand moves: 1 as far, 0.1 a tenth. Without names, all that we hold.
 
         A director may set it for whoever holds them. Back to 1 with the next holder. Raises `DeniedError`: not ours, or
         out of range.
         """
-        return self.request(SetScale(0, tuple(robots), scale)).leases
+        return self.request(SetScale(0, names_of("robots", robots), scale)).leases
 
-    def place_alignment(self, participant: str, T_world_tracking: PoseTuple, *, offset: bool = False) -> None:
+    def place_alignment(self, participant: str, T_world_tracking: PoseTuple | Pose, *, offset: bool = False) -> None:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""
-        self.request(PlaceAlignment(0, participant, Pose(*T_world_tracking), offset))
+        self.request(PlaceAlignment(0, participant, pose_of("T_world_tracking", T_world_tracking), offset))
 
-    def estop(self, reason: str = "") -> None:
-        """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop."""
-        self.send(EStop(reason))
+    def estop(self, reason: object = "") -> None:
+        """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop.
+
+        `reason`: anything; its text is cut to what the protocol takes. Raises only `NotConnectedError`.
+        """
+        self.send(EStop(text_of(reason)))
 
     def clear_estop(self) -> None:
         """Ends the e-stop; robots hold until clutched again."""
@@ -130,7 +196,7 @@ class Requests:
     def observe(
         self,
         anchor_id: str,
-        T_tracking_anchor: PoseTuple,
+        T_tracking_anchor: PoseTuple | Pose,
         *,
         kind: str = AnchorKind.QR,
         capture_ns: int | None = None,
@@ -144,7 +210,7 @@ class Requests:
             Observation(
                 anchor_id=anchor_id,
                 kind=kind,
-                T_tracking_anchor=Pose(*T_tracking_anchor),
+                T_tracking_anchor=pose_of("T_tracking_anchor", T_tracking_anchor),
                 capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
                 tracking_epoch=self.connection.tracking_epoch,
                 viewpoint_id=viewpoint_id,

@@ -58,6 +58,11 @@ class SceneView:
         """Session time now [ns], by our estimate; its error is at most `clock_error_ns()`."""
         return self.connection.clock.session_ns(time.monotonic_ns())
 
+    def data_age_ns(self) -> int | None:
+        """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason. `None`: no scene yet."""
+        state = self._state
+        return None if state is None else self.session_now_ns() - state.header.session_time
+
     def clock_error_ns(self) -> int:
         """Bound of the error of `session_now_ns()` [ns]."""
         return self.connection.clock.error_bound_ns(time.monotonic_ns())

@@ -49,8 +49,11 @@ class CurveKeys:
         return cls(server_public, public, secret)
 
 
-def parse_address(address: str) -> tuple[str, int]:
+def parse_address(address: object) -> tuple[str, int]:
     """`host`, `host:port`, `[ipv6]:port` or the same after `tcp://`, as `(host, port)`."""
+    if not isinstance(address, str):
+        example = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
+        raise ClientError(f"address {address!r} is a {type(address).__name__}, not text like {example!r}")
     text = address.removeprefix("tcp://").rstrip("/")
     host, separator, port = text.rpartition(":")
     if not separator or (text.count(":") > 1 and not text.startswith("[")) or text.endswith("]"):

@@ -12,12 +12,12 @@ from iris_session.client.connection import (
     BACKOFF_MAX_NS,
     HELLO_TIMEOUT_NS,
     MAX_INBOX,
-    MAX_OUTGOING,
     MAX_PENDING,
     Connection,
 )
 from iris_session.client.errors import NotConnectedError, VersionError
 from iris_session.client.identity import Identity
+from iris_session.client.outgoing import MAX_OUTGOING
 from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import (
     Acquire,

@@ -1,0 +1,112 @@
+"""What people pass to the client, as what the protocol takes: names, numbers, poses, and bytes that were checked.
+
+Whatever cannot be converted raises `InvalidMessageError` at once, in one line that names the field.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from anchors.pose import PoseTuple
+from iris_session.client.errors import InvalidMessageError
+from iris_session.protocol.client_messages import ClientMessage, envelope
+from iris_session.protocol.codec import decode_client, encode_client
+from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.errors import ProtocolError
+
+POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
+#: Where msgspec says that an error is: after the three fields of the envelope before the message.
+_PLACE: Final = re.compile(r" - at `\$\[3\]\.?([^`]*)`$")
+
+
+def checked_bytes(message: ClientMessage, connection_epoch: int = 0) -> bytes:
+    """The encoded envelope of `message`, decoded once as the session will do. Raises `InvalidMessageError`."""
+    kind = type(message).__name__
+    try:
+        data = encode_client(envelope(message, connection_epoch))
+        decode_client(data)
+    except ProtocolError as error:
+        text = str(error).removeprefix(f"{kind.lower()}: ")
+        place = _PLACE.search(text)
+        where = f"{place[1]}: " if place and place[1] else ""
+        raise InvalidMessageError(f"{kind} cannot be sent: {where}{_PLACE.sub('', text)}") from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidMessageError(f"{kind} cannot be sent: {_unencodable(message) or error}") from None
+    return data
+
+
+def _unencodable(message: ClientMessage) -> str:
+    """The first field that MessagePack cannot carry."""
+    for name, value in msgspec.structs.asdict(message).items():
+        try:
+            msgspec.msgpack.encode(value)
+        except (TypeError, ValueError, OverflowError):
+            return f"{name}: {type(value).__name__} {str(value)[:40]!r} is not of a type that the protocol has"
+    return ""
+
+
+def text_of(value: object) -> str:
+    """Any value as a `Text`: what stops robots must not fail for want of a good reason."""
+    try:
+        text = str(value)
+    except Exception:  # whatever the object's own conversion raises
+        text = type(value).__name__
+    return text.encode("utf-8", "replace").decode("utf-8")[:MAX_TEXT]
+
+
+def names_of(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
+    """Names as a tuple; a bare string is one name."""
+    if isinstance(names, str):
+        return (names,)
+    found = tuple(names) if isinstance(names, Iterable) else (names,)
+    for name in found:
+        if not isinstance(name, str):
+            raise InvalidMessageError(f"{field}: expected names, got {str(name)[:40]} of type {type(name).__name__}")
+    return found
+
+
+def numbers(field: str, values: Iterable[float], length: int | None = None) -> tuple[float, ...]:
+    """Numbers, or an array (n,), as floats."""
+    try:
+        found = tuple(v if type(v) is float else _number(v) for v in values)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or (length is not None and len(found) != length):
+        wanted = "numbers" if length is None else f"{length} numbers"
+        raise InvalidMessageError(f"{field}: expected {wanted}, got {_shown(values)}")
+    return found
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str | bytes) or np.ndim(value):
+        raise TypeError
+    return float(value)
+
+
+def pose_of(field: str, pose: PoseTuple | Pose | Iterable[Any]) -> Pose:
+    """`((x, y, z), (w, x, y, z))` of tuples, lists or arrays, or a `Pose`."""
+    if isinstance(pose, Pose):
+        return pose
+    try:
+        p, q = pose
+        return Pose(numbers(field, p, 3), numbers(field, q, 4))  # type: ignore[arg-type]  # lengths are checked
+    except (TypeError, ValueError):  # InvalidMessageError is one too
+        raise InvalidMessageError(f"{field}: expected {POSE_FORM}, got {_shown(pose)}") from None
+
+
+def plain(value: Any) -> Any:
+    """A NumPy scalar as the number or truth value that it is."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _shown(value: Any) -> str:
+    size = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
+    if not size and isinstance(value, list | tuple):
+        size = f" of length {len(value)}"
+    text = " ".join(repr(value).split())
+    return f"{type(value).__name__}{size}: {text if len(text) <= 100 else text[:97] + '...'}"
