@@ -1,0 +1,227 @@
+"""What people get wrong: it is taken as it was meant, or raises at once in one line that names the field."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from anchors.pose import PoseTuple
+from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
+from iris_session.client.values import checked_bytes, names_of, numbers, pose_of, text_of
+from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
+from iris_session.protocol.codec import decode_client
+from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.names import FaultCode, SampleKind
+from iris_session.protocol.server_messages import ProtocolFault
+from tests.client.harness import LiveSession
+
+Join = Callable[..., Client]
+HERE: PoseTuple = ((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
+
+
+class Unspeakable:
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
+@pytest.mark.parametrize("reason", [5, None, "x" * 5000, "\ud800", "\U0001f6d1" * 600, Unspeakable(), ["a", 1]])
+def test_an_estop_fits_the_protocol_whatever_its_reason_is(reason: object) -> None:
+    message = decode_client(checked_bytes(EStop(text_of(reason)))).message
+    assert isinstance(message, EStop)
+    assert len(message.reason) <= 512
+
+
+def test_an_estop_with_a_number_for_a_reason_stops(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ann.estop(5)
+    assert ann.wait_for(lambda c: c.mirror.estop)
+    assert not ann.connection.counters.faults
+
+
+def test_requests_that_cannot_be_sent_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+    ann = join(role="director")
+    calls: list[tuple[str, Callable[[], object]]] = [
+        (r"robots: .*names", lambda: ann.acquire([5])),  # type: ignore[list-item]
+        (r"robots: .*names", lambda: ann.acquire(5)),  # type: ignore[arg-type]
+        (r"ticks: .*int", lambda: ann.control("step", "ten")),  # type: ignore[arg-type]
+        (r"ticks: .*>= 0", lambda: ann.control("step", -1)),
+        (r"text: .*512", lambda: ann.marker("x" * 600)),
+        (r"robots\[0\]: .*64", lambda: ann.acquire(["x" * 65])),
+        (r"release: .*names", lambda: ann.release(["left"])),  # type: ignore[arg-type]
+        (r"Marker.*text: .*surrog|Marker.*text: str", lambda: ann.marker("\ud800")),
+        (r"T_world_tracking: .*\(x, y, z\)", lambda: ann.place_alignment("p1", (1.0, 2.0))),  # type: ignore[arg-type]
+    ]
+    sent = ann.connection.counters.sent
+    started = time.monotonic()
+    for text, call in calls:
+        with pytest.raises(InvalidMessageError, match=text) as raised:
+            call()
+        assert isinstance(raised.value, ClientError)
+        assert isinstance(raised.value, ValueError)
+        assert "\n" not in str(raised.value)
+    assert time.monotonic() - started < 4.0  # none of them waited for its timeout of 5 s
+    assert ann.connection.counters.sent - sent < len(calls)
+    assert ann.acquire("left")[0].target == "left"
+
+
+def test_samples_that_cannot_be_sent_raise_at_once_and_name_the_field(session: LiveSession, join: Join) -> None:
+    ann = join(devices="target")
+    assert ann.connection.hello.devices == ("target",)
+    bad: list[tuple[str, tuple[object, ...], dict[str, object]]] = [
+        ("gripper: .*float", ("target", HERE), {"gripper": "closed"}),
+        (r"pose: expected \(\(x, y, z\), \(w, x, y, z\)\), got str", ("target", "up"), {}),
+        ("pose: expected .*length 7", ("target", [1, 2, 3, 1, 0, 0, 0]), {}),
+        (r"pose: expected .*shape \(7,\)", ("target", np.zeros(7)), {}),
+        ("pose: expected", ("target", ((1, 2), (1, 0, 0, 0))), {}),
+        ("pose: expected", ("target", ((1, 2, None), (1, 0, 0, 0))), {}),
+        ("twist: expected 6 numbers.*length 3", ("target",), {"twist": (1, 2, 3)}),
+        ("q: expected numbers", ("joints",), {"q": ["a"]}),
+        ("q: expected numbers", ("joints",), {"q": 5}),
+        ("clutch: .*bool", ("target", HERE), {"clutch": "yes"}),
+        ("device", (5, HERE), {}),
+        ("robots: no robot 'lift'.*left, right", ("target", HERE), {"robots": "lift"}),
+        ("objects: no object 'axe'.*hammer", ("target", HERE), {"objects": ["axe"]}),
+    ]
+    for text, arguments, fields in bad:
+        with pytest.raises(InvalidMessageError, match=text) as raised:
+            ann.send_sample(*arguments, **fields)  # type: ignore[arg-type]
+        assert "\n" not in str(raised.value)
+    ann.marker("after")
+    assert not session.kinds(Sample)
+    assert not ann.connection.counters.faults
+
+
+def test_arrays_and_numpy_scalars_are_taken(session: LiveSession, join: Join) -> None:
+    ann = join(devices=("target", "joints"))
+    p, q = np.array([0.1, 0.2, 0.3], dtype=np.float32), np.array([1, 0, 0, 0])
+    assert ann.send_sample("target", (p, q), clutch=np.bool_(True), gripper=np.float32(0.5), buttons=np.int64(3))
+    assert ann.send_sample("target", Pose(*HERE))
+    sample = ann.make_sample("joints", q=np.array([0.5, 1.0]), qd=np.zeros(2))
+    assert (sample.q, sample.qd) == ((0.5, 1.0), (0.0, 0.0))
+    assert ann.make_sample("target", twist=np.arange(6)).twist == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    ann.observe("table", (p, q))
+    assert ann.wait_for(lambda c: len(session.kinds(Sample)) == 2)
+    taken = session.kinds(Sample)[0].message
+    assert isinstance(taken, Sample)
+    assert taken.pose is not None
+    assert taken.pose.p == pytest.approx(HERE[0])
+    assert (taken.clutch, taken.gripper, taken.buttons) == (True, 0.5, 3)
+    assert not ann.connection.counters.faults
+
+
+def test_the_kind_follows_from_what_is_given(session: LiveSession, join: Join) -> None:
+    ann = join()
+    assert ann.make_sample("target", HERE).kind == SampleKind.POSE
+    assert ann.make_sample("joints", q=(1.0,)).kind == SampleKind.JOINTS
+    assert ann.make_sample("joints", q=np.zeros(7)).kind == SampleKind.JOINTS
+    assert ann.make_sample("target", twist=[0.0] * 6).kind == SampleKind.TWIST
+    assert ann.make_sample("target", HERE, q=(1.0,), kind=SampleKind.POSE).kind == SampleKind.POSE
+
+
+def test_one_name_is_one_name_and_what_is_not_ours_is_counted(session: LiveSession, join: Join) -> None:
+    ann = join()
+    assert ann.make_sample("target", HERE, robots="left").targets == ()
+    assert ann.counters()["control"]["samples_without_lease"] == 1
+    ann.acquire("left")
+    assert [t.name for t in ann.make_sample("target", HERE, robots="left").targets] == ["left"]
+    assert ann.counters()["control"]["samples_without_lease"] == 1
+    assert names_of("robots", "left") == ("left",)
+    assert names_of("robots", (n for n in ("a", "b"))) == ("a", "b")
+
+
+def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -> None:
+    ann = join()
+    session.pause_steps(True)  # no answer comes
+    ann.connection.not_taken = ProtocolFault(FaultCode.MALFORMED, "an older one")
+    told: list[bool] = []
+
+    def tell(_: Client) -> bool:
+        if not told:
+            told.append(True)
+            ann.connection._fault(ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns())
+        return False
+
+    polling, ann.poll = ann.poll, lambda timeout_s=0.0: tell(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
+    with pytest.raises(InvalidMessageError, match="Acquire was not taken: acquire: robots is wrong"):
+        ann.request(Acquire(0, ("left",)), timeout_s=30.0)
+    session.pause_steps(False)
+
+
+def test_a_session_that_stands_or_is_dead_is_visible(session: LiveSession, join: Join) -> None:
+    ann = join(role="agent", devices="target")
+    ann.acquire("left")
+    assert ann.wait_for(lambda c: c.state is not None and "left" in c.feedback)
+    assert ann.wait_for(lambda c: (c.data_age_ns() or 0) < 100_000_000)
+    session.pause_steps(True)
+    assert ann.wait_for(lambda c: (c.data_age_ns() or 0) > 400_000_000)
+    assert ann.ready
+    os.kill(session.front.pid, signal.SIGKILL)
+    assert ann.wait_for(lambda c: not c.ready)
+    assert ann.feedback == {}
+    before = ann.data_age_ns()
+    assert before is not None
+    ann.sleep(0.05)
+    assert (ann.data_age_ns() or 0) >= before + 50_000_000
+    session.pause_steps(False)
+    assert ann.wait_for(lambda c: c.ready and "left" in c.feedback, 10.0)
+    assert ann.wait_for(lambda c: (c.data_age_ns() or 10**9) < 200_000_000)
+
+
+def test_there_is_no_age_before_the_first_scene(session: LiveSession, join: Join) -> None:
+    assert join(connect=False).data_age_ns() is None
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+def test_sleep_polls_for_the_whole_time(session: LiveSession, join: Join, threaded: bool) -> None:
+    states: list[object] = []
+    ann = join(on_state=states.append)
+    ann.start() if threaded else None
+    assert ann.wait_for(lambda c: c.state is not None)
+    states.clear()
+    started = time.monotonic()
+    ann.sleep(0.3)
+    assert time.monotonic() - started >= 0.3
+    assert len(states) >= 2
+    ann.sleep(-1.0)
+
+
+def test_denials_read_as_a_sentence(session: LiveSession, join: Join) -> None:
+    ann, bob = join(), join("bob")
+    ann.acquire("left")
+    assert bob.wait_for(lambda c: c.mirror.leases["left"].holder == ann.participant_id)
+    with pytest.raises(DeniedError) as held:
+        bob.acquire("left")
+    assert str(held.value).startswith("denied (held): left is held by ann; ask the holder to release it")
+    assert str(held.value).count("ann") == 1
+    with pytest.raises(DeniedError) as not_ours:
+        bob.release("left")
+    assert str(not_ours.value) == "denied (not_holder): you do not hold left; held by ann"
+    assert not_ours.value.denial.holder == ann.participant_id
+    assert str(DeniedError(Denial("role", "no"))) == "denied (role): no"
+
+
+@pytest.mark.parametrize("address", [7721, None, ("127.0.0.1", 7721), b"127.0.0.1:7721"])
+def test_an_address_of_another_type_is_told_in_one_line(address: object) -> None:
+    with pytest.raises(ClientError, match=r"address .* not text like '127\.0\.0\.1:7721'") as raised:
+        Client(address)  # type: ignore[arg-type]
+    assert "\n" not in str(raised.value)
+
+
+def test_a_hello_that_cannot_be_sent_raises_when_the_client_is_made() -> None:
+    for settings in ({"name": 5}, {"devices": 5}, {"devices": [5]}, {"role": None, "name": "x"}):
+        with pytest.raises(InvalidMessageError, match=r"name|role|devices"):
+            Client("127.0.0.1:1", **settings)  # type: ignore[arg-type]
+
+
+def test_a_message_reads_back_as_what_was_said() -> None:
+    for message in (Acquire(1, ("left",)), Control(2, "pause"), Marker(3, "x"), PlaceAlignment(4, "p1", Pose(*HERE))):
+        envelope = decode_client(checked_bytes(message, 7))
+        assert (envelope.message, envelope.connection_epoch) == (message, 7)
+    observation = Observation("table", "qr", pose_of("T", [list(HERE[0]), list(HERE[1])]), 1, 0)
+    assert decode_client(checked_bytes(observation)).message == observation
+    assert numbers("q", range(3)) == (0.0, 1.0, 2.0)
