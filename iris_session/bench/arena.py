@@ -24,7 +24,6 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.scheduling import quiet_collector
 from iris_session.runtime.session import Session
 
 #: The bars are stated for at most four clients in one process.
@@ -145,28 +144,24 @@ def _run(
     session.run(seconds=60.0, until=_every(0.05, session.clock, lambda: _all_ready(waiting)))
     if waiting:
         raise RuntimeError("the clients did not join within 60 s")
-    progress("warm-up")
-    with quiet_collector():
-        session.run(seconds=WARM_UP_S)
-        begin = session.clock() + 50_000_000
-        end = begin + round(seconds * 1e9)
-        for process in processes:
-            process.window(begin, end)
-        truth: dict[int, NDArray[np.float64]] = {}
-        received: dict[tuple[int, str], list[tuple[int, int]]] = {}
-        if keep_poses:
-            session.stepper.on_state = lambda header, poses: _keep(truth, header, poses)
-        session.stepper.on_entries = lambda entries: _note(received, entries)
-        cpu = _cpu(session)
-        connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
-        progress(f"measuring {seconds:g} s")
-        session.run(seconds=(end - session.clock()) * 1e-9)
-        cpu_share = (_cpu(session) - cpu) / seconds
-        stats = session.lateness()
-        session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    progress(f"warm-up, then measuring {seconds:g} s")
+    truth: dict[int, NDArray[np.float64]] = {}
+    received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    if keep_poses:
+        session.stepper.on_state = lambda header, poses: _keep(truth, header, poses)
+    session.stepper.on_entries = lambda entries: _note(received, entries)
+    connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
+    begin = session.clock() + round(WARM_UP_S * 1e9)
+    end = begin + round(seconds * 1e9)
+    for process in processes:
+        process.window(begin, end)
+    meter = _Meter(session, begin, end)
+    session.run(until=meter.passed)
+    stats, cpu_share = meter.result()
+    session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
     logs = {name: log for process in processes for name, log in process.result().items()}
     status = session.status()
-    assert stats is not None
     ledger = session.stepper.ledger
     return Measured(
         seconds,
@@ -180,6 +175,35 @@ def _run(
         {names[p]: c for c, p in connections.items()},
         status.drops,
     )
+
+
+class _Meter:
+    """Reads lateness and processor time at both ends of the window, inside the one run that holds it."""
+
+    def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
+        self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
+        self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
+        self._readings: list[tuple[PacerStats, float]] = []
+
+    def passed(self) -> bool:
+        """Whether the window is over; for `Session.run(until=...)`."""
+        now = self._session.clock()
+        if now >= (self._end_ns if self._readings else self._begin_ns):
+            stats = self._session.lateness()
+            assert stats is not None
+            self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))
+        return len(self._readings) == 2
+
+    def result(self) -> tuple[PacerStats, float]:
+        """Ticks of the window (percentiles: warm-up too), and CPU of authority and front as a share of one core."""
+        if len(self._readings) < 2:
+            raise RuntimeError("the session ended before the window was over")
+        (before, cpu0), (after, cpu1) = self._readings
+        ticks, late = after.ticks - before.ticks, after.late - before.late
+        stats = after._replace(
+            ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
+        )
+        return stats, (cpu1 - cpu0) / ((self._end_ns - self._begin_ns) * 1e-9)
 
 
 def _all_ready(waiting: list[_ClientProcess]) -> bool:
@@ -211,15 +235,6 @@ def _note(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Seque
         if isinstance(entry.message, Sample):
             key = (entry.connection, entry.message.device)
             received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
-
-
-def _cpu(session: Session) -> float:
-    """CPU seconds of authority and front so far."""
-    total = 0.0
-    for pid in (os.getpid(), session.processes.front_pid):
-        times = psutil.Process(pid).cpu_times()
-        total += times.user + times.system
-    return total
 
 
 def _keys(folder: Path) -> dict[str, str]:
