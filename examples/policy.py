@@ -47,8 +47,7 @@ def main(address: str, seconds: float) -> None:
             target = (x + radius * math.cos(angle), y + radius * math.sin(angle), z)
             client.send_sample("target", (target, q), robots=[robot], clutch=may_close(client, robot))
             due += period_ns
-            while client.session_now_ns() < due:
-                client.poll((due - client.session_now_ns()) * 1e-9)
+            client.sleep((due - client.session_now_ns()) * 1e-9)
         feedback = client.feedback.get(robot)
         rejected = dict(feedback.rejected) if feedback is not None else {}
         moved = client.tip_pose(robot)

@@ -9,10 +9,9 @@ from typing import Any, Self
 
 import msgspec
 
-from anchors.pose import PoseTuple
 from iris_session.client.connection import Connection
 from iris_session.client.errors import DeniedError, InvalidMessageError, NotConnectedError, RequestTimeoutError
-from iris_session.client.values import names_of, pose_of, text_of
+from iris_session.client.values import PoseLike, names_of, pose_of, text_of
 from iris_session.protocol.client_messages import (
     Acquire,
     Assign,
@@ -31,7 +30,7 @@ from iris_session.protocol.client_messages import (
     SetScale,
     TrackingEpoch,
 )
-from iris_session.protocol.common import Denial, Lease, Pose, Target
+from iris_session.protocol.common import Denial, Lease, Target
 from iris_session.protocol.names import AnchorKind, TargetKind
 from iris_session.protocol.server_messages import Reply
 
@@ -159,7 +158,7 @@ class Requests:
         """
         return self.request(SetScale(0, names_of("robots", robots), scale)).leases
 
-    def place_alignment(self, participant: str, T_world_tracking: PoseTuple | Pose, *, offset: bool = False) -> None:
+    def place_alignment(self, participant: str, T_world_tracking: PoseLike, *, offset: bool = False) -> None:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""
         self.request(PlaceAlignment(0, participant, pose_of("T_world_tracking", T_world_tracking), offset))
 
@@ -196,7 +195,7 @@ class Requests:
     def observe(
         self,
         anchor_id: str,
-        T_tracking_anchor: PoseTuple | Pose,
+        T_tracking_anchor: PoseLike,
         *,
         kind: str = AnchorKind.QR,
         capture_ns: int | None = None,

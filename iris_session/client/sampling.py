@@ -7,12 +7,11 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, Final
 
-from anchors.pose import PoseTuple
 from iris_session.client.connection import Connection
 from iris_session.client.errors import InvalidMessageError
-from iris_session.client.values import names_of, numbers, plain, pose_of
+from iris_session.client.values import PoseLike, names_of, numbers, plain, pose_of
 from iris_session.protocol.client_messages import ClientMessage, Sample
-from iris_session.protocol.common import Alignment, Pose, Target
+from iris_session.protocol.common import Alignment, Target
 from iris_session.protocol.names import SampleKind, TargetKind
 
 #: Fields of `Sample` that are lists of numbers, and how many.
@@ -36,7 +35,7 @@ class Sampling:
     @abstractmethod
     def alignment(self) -> Alignment | None: ...
 
-    def send_sample(self, device: str, pose: PoseTuple | Pose | None = None, **fields: Any) -> bool:
+    def send_sample(self, device: str, pose: PoseLike | None = None, **fields: Any) -> bool:
         """Makes one sample of `device` with `make_sample` and sends it. False: dropped (no connection), and counted.
 
         Raises `InvalidMessageError` for values that the protocol does not take, in one line that names the field.
@@ -46,7 +45,7 @@ class Sampling:
     def make_sample(
         self,
         device: str,
-        pose: PoseTuple | Pose | None = None,
+        pose: PoseLike | None = None,
         *,
         robots: str | Iterable[str] = (),
         objects: str | Iterable[str] = (),

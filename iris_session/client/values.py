@@ -6,19 +6,22 @@ Whatever cannot be converted raises `InvalidMessageError` at once, in one line t
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from anchors.pose import PoseTuple
 from iris_session.client.errors import InvalidMessageError
 from iris_session.protocol.client_messages import ClientMessage, envelope
 from iris_session.protocol.codec import decode_client, encode_client
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.errors import ProtocolError
 
+Numbers = Sequence[float] | NDArray[Any]
+#: `((x, y, z) [m], (w, x, y, z))` of tuples, lists or arrays, or a `Pose`.
+PoseLike = Pose | tuple[Numbers, Numbers]
 POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
 #: Where msgspec says that an error is: after the three fields of the envelope before the message.
 _PLACE: Final = re.compile(r" - at `\$\[3\]\.?([^`]*)`$")
@@ -88,7 +91,7 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def pose_of(field: str, pose: PoseTuple | Pose | Iterable[Any]) -> Pose:
+def pose_of(field: str, pose: PoseLike) -> Pose:
     """`((x, y, z), (w, x, y, z))` of tuples, lists or arrays, or a `Pose`."""
     if isinstance(pose, Pose):
         return pose
