@@ -59,7 +59,10 @@ class SceneView:
         return self.connection.clock.session_ns(time.monotonic_ns())
 
     def data_age_ns(self) -> int | None:
-        """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason. `None`: no scene yet."""
+        """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason. `None`: no scene yet.
+
+        A paused session goes on sending: `state.header.sim_time` tells that physics stands.
+        """
         state = self._state
         return None if state is None else self.session_now_ns() - state.header.session_time
 
