@@ -298,4 +298,9 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if status:  # Rerun would wait at its exit, again, for a file that cannot be written
+        os._exit(status)
+    sys.exit(status)
