@@ -1,4 +1,5 @@
-"""Anchors: detection, controller anchors, alignment, constellations, drift, camera extrinsics, printable sheets.
+"""Geometry of anchors: rigid transforms (`pose`), and the alignment of a headset by anchors of known pose (`alignment`,
+`robust`).
 
-Pure geometry (numpy, scipy, OpenCV), usable without the server; imports nothing of iris_session.
+Pure, usable without the server; imports nothing of iris_session.
 """

@@ -2,12 +2,11 @@
 
 First useful form: 4 degrees of freedom (yaw and translation; headset frames and the world are gravity-aligned to about
 0.2 deg), robust against wrong detections, with a covariance that counts what is systematic within one viewpoint once.
-Pure: time and observations are passed in, nothing is read.
+Pure: time and observations are passed in, nothing is read. How observations are merged and solved: `anchors.robust`.
 
-Two stages. (1) Observations of one anchor from one viewpoint share half of their variance, so they are merged into one
-by a robust mean with covariance `S * (1/2 + 1/(2 n))`. (2) Merged observations are solved together by iteratively
-reweighted Gauss-Newton over (yaw, x, y, z): the position of each anchor and its yaw are the residuals, weights are
-those of Tukey's biweight (a redescending loss: mirrored poses get weight zero; Huber 2009, section 4.8).
+Noise models are optimistic, so both stages check them against what is left over: residuals larger than stated widen
+the covariance (Birge ratio: chi-square per degree of freedom). Where no majority agrees there is no result: fewer than
+`min_agreeing` of one viewpoint's observations, or two viewpoints that chi-square tells apart at 99.9 %.
 """
 
 from __future__ import annotations
@@ -18,13 +17,15 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_yaw, quat_rotate
+from anchors.robust import Array, Merged, merge, solve, wrap_angle
 
-Array = NDArray[np.float64]
-
-_TUKEY: Final = 4.685  # 95 % efficiency for Gaussian noise
+_CHI2_4_999: Final = 18.467  # 99.9 % quantile of chi-square with 4 degrees of freedom
+_CONTRADICT: Final = (
+    "observations contradict each other: did the sheet move, or the headset lose tracking? hold still, look at the "
+    "sheet again"
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,9 @@ class AlignmentConfig:
 
     `position_sigma_m` and `rotation_sigma_rad` are used per axis when an observation carries no covariance.
     `tilt_sigma_rad`: how far a headset's vertical may be off. `max_error_m`: the stated p95 at the anchor above which
-    the estimate is refused. `max_observations`: the oldest are forgotten (counted in `forgotten`).
+    the estimate is refused. `max_observations`: the oldest are forgotten (counted in `forgotten`), as are those older
+    than the newest by more than `max_age_ns` (`outdated`): tracking drifts. `min_agreeing`: share of one viewpoint's
+    observations that must agree. `size_tolerance`: by what share a sheet may measure otherwise than it should.
     """
 
     position_sigma_m: float = 0.005
@@ -43,7 +46,10 @@ class AlignmentConfig:
     max_error_m: float = 0.03
     min_observations: int = 5
     max_observations: int = 600
+    max_age_ns: int = 600 * 1_000_000_000
     max_iterations: int = 20
+    min_agreeing: float = 0.6
+    size_tolerance: float = 0.03
 
 
 @dataclass(frozen=True)
@@ -69,21 +75,13 @@ class AlignmentEstimate:
 class _Observation:
     anchor_id: str
     viewpoint_id: int
+    capture_ns: int
+    size_m: float
     p_tracking_anchor: Array  # (3,)
     T_world_tracking_yaw: float
     tilt_rad: float
     position_var: float  # per axis [m^2]
     yaw_var: float  # [rad^2]
-
-
-@dataclass(frozen=True)
-class _Merged:
-    p_world_anchor: Array
-    p_tracking_anchor: Array
-    yaw: float
-    position_var: float
-    yaw_var: float
-    n: int
 
 
 def position_error_p95(covariance: tuple[float, ...], pivot_world: Vec3, point_world: Vec3) -> float:
@@ -113,22 +111,24 @@ def position_error_p95(covariance: tuple[float, ...], pivot_world: Vec3, point_w
     return math.sqrt(scale * chi2)
 
 
-def wrap_angle(a: float) -> float:
-    """Angle in (-pi, pi]."""
-    return math.remainder(a, 2.0 * math.pi)
-
-
 @dataclass
 class AlignmentEstimator:
-    """Collects observations of one headset; `estimate()` solves what is there. A new `tracking_epoch` starts anew."""
+    """Collects observations of one headset; `estimate()` solves what is there. A new `tracking_epoch` starts anew.
+
+    `anchors`: `T_world_anchor`. `sizes`: edge of the printed sheets [m], of those whose size is known.
+    """
 
     anchors: Mapping[str, PoseTuple]
     config: AlignmentConfig = field(default_factory=AlignmentConfig)
+    sizes: Mapping[str, float] = field(default_factory=dict)
     tracking_epoch: int = 0
     unknown_anchors: int = 0
     stale_epochs: int = 0
     invalid: int = 0
     forgotten: int = 0
+    outdated: int = 0
+    wrong_size: int = 0
+    _misprint: str = ""
     _observations: list[_Observation] = field(default_factory=list)
 
     def add(
@@ -142,7 +142,8 @@ class AlignmentEstimator:
         size_m: float = 0.0,
         covariance: tuple[float, ...] = (),
     ) -> bool:
-        """Takes one observation. False when it is not used: unknown anchor, older epoch, or not a rigid transform."""
+        """Takes one observation. False when it is not used: unknown anchor, older epoch, not a rigid transform, or a
+        sheet of another size than it should have. `size_m` 0: not measured."""
         T_world_anchor = self.anchors.get(anchor_id)
         if T_world_anchor is None:
             self.unknown_anchors += 1
@@ -158,13 +159,36 @@ class AlignmentEstimator:
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
             self._observations.clear()
+            self._misprint = ""
+        if not self._is_of_size(anchor_id, size_m):
+            return False
+        self._forget_outdated(capture_ns)
         yaw, tilt = _yaw_and_tilt(T_world_anchor, (p, (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)))
         position_var, yaw_var = self._variances(covariance, quality)
         if len(self._observations) >= self.config.max_observations:
             del self._observations[0]
             self.forgotten += 1
-        self._observations.append(_Observation(anchor_id, viewpoint_id, np.array(p), yaw, tilt, position_var, yaw_var))
+        self._observations.append(
+            _Observation(anchor_id, viewpoint_id, capture_ns, size_m, np.array(p), yaw, tilt, position_var, yaw_var)
+        )
         return True
+
+    def _is_of_size(self, anchor_id: str, size_m: float) -> bool:
+        """A sheet printed too large is seen too near: its pose is off by the same share."""
+        size = self.sizes.get(anchor_id, 0.0)
+        if size <= 0.0 or not size_m > 0.0 or abs(size_m - size) <= self.config.size_tolerance * size:
+            return True
+        self.wrong_size += 1
+        self._misprint = (
+            f"sheet '{anchor_id}' measures {size_m * 1e3:.0f} mm, not {size * 1e3:.0f} mm: printed at the wrong scale?"
+        )
+        return False
+
+    def _forget_outdated(self, capture_ns: int) -> None:
+        """What comes last counts, also when the sender's clock was set in between."""
+        kept = [o for o in self._observations if abs(capture_ns - o.capture_ns) <= self.config.max_age_ns]
+        self.outdated += len(self._observations) - len(kept)
+        self._observations = kept
 
     def _variances(self, covariance: tuple[float, ...], quality: float) -> tuple[float, float]:
         default = (self.config.position_sigma_m**2, self.config.rotation_sigma_rad**2)
@@ -180,12 +204,20 @@ class AlignmentEstimator:
     def estimate(self) -> AlignmentEstimate:
         """Solves all observations of the current epoch. Cost grows with their number, bounded by the configuration."""
         if len(self._observations) < self.config.min_observations:
-            return self._refusal("look at the anchor sheet for a few seconds, from about half a metre")
-        merged = self._merge()
-        yaw, t_world, weights, H = _solve(merged, self.config.max_iterations)
+            return self._refusal(
+                self._misprint or "look at the anchor sheet for a few seconds, from about half a metre"
+            )
+        merged, dropped = self._merge()
+        yaw, t_world, weights, H, chi2 = solve(merged, self.config.max_iterations)
         used = [m for m, w in zip(merged, weights, strict=True) if w > 0.05]
-        if sum(m.n for m in used) < self.config.min_observations:
-            return self._refusal("the observations of the anchor contradict each other: step closer, hold still")
+        n_groups = len(merged) + dropped
+        if 2 * len(used) <= n_groups or sum(m.n for m in used) < self.config.min_observations:
+            return self._refusal(_CONTRADICT)
+        if len(merged) == 2 and chi2 > _CHI2_4_999:  # with two there is no majority to trust
+            return self._refusal(_CONTRADICT)
+        # Never narrower: that so few residuals happen to be small proves nothing.
+        freedom = 4.0 * float(np.sum(weights)) - 4.0
+        H = H / max(1.0, chi2 / freedom if freedom > 0.0 else 1.0)
         T_world_tracking: PoseTuple = (
             (float(t_world[0]), float(t_world[1]), float(t_world[2])),
             quat_from_yaw(yaw),
@@ -200,6 +232,8 @@ class AlignmentEstimator:
             refused, advice = True, f"the error would be {error * 1e3:.0f} mm: step closer to the sheet"
         elif tilt > self.config.tilt_warning_rad:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
+        else:
+            advice = self._size_advice()
         return AlignmentEstimate(
             T_world_tracking,
             self.tracking_epoch,
@@ -213,36 +247,38 @@ class AlignmentEstimator:
             advice,
         )
 
-    def _merge(self) -> list[_Merged]:
+    def _size_advice(self) -> str:
+        """Warns about a sheet that is seen in several sizes; single measurements that are off do not count."""
+        sizes: dict[str, list[float]] = {}
+        for o in self._observations:
+            if o.size_m > 0.0 and math.isfinite(o.size_m):
+                sizes.setdefault(o.anchor_id, []).append(o.size_m)
+        for anchor_id, seen in sizes.items():
+            low, high = np.quantile(seen, (0.1, 0.9))
+            if high - low > self.config.size_tolerance * low:
+                return (
+                    f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"
+                )
+        return self._misprint
+
+    def _merge(self) -> tuple[list[Merged], int]:
+        """One merged observation per anchor and viewpoint, and the number of those whose observations do not agree."""
         groups: dict[tuple[str, int], list[_Observation]] = {}
         for o in self._observations:
             groups.setdefault((o.anchor_id, o.viewpoint_id), []).append(o)
         merged = []
         for (anchor_id, _), group in groups.items():
-            p = np.array([o.p_tracking_anchor for o in group])
-            yaws = np.array([o.T_world_tracking_yaw for o in group])
-            position_var = float(np.mean([o.position_var for o in group]))
-            yaw_var = float(np.mean([o.yaw_var for o in group]))
-            centre = np.median(p, axis=0)
-            yaw0 = _circular_median(yaws)
-            dy = np.array([wrap_angle(float(y) - yaw0) for y in yaws])
-            w = _tukey(np.linalg.norm(p - centre, axis=1) / math.sqrt(3.0 * position_var))
-            w = w * _tukey(np.abs(dy) / math.sqrt(yaw_var))
-            total = float(np.sum(w))
-            if total < 1.0:
-                continue
-            share = 0.5 + 0.5 / total  # half of each variance is common to the viewpoint
-            merged.append(
-                _Merged(
-                    np.array(self.anchors[anchor_id][0]),
-                    (w @ p) / total,
-                    yaw0 + float(w @ dy) / total,
-                    position_var * share,
-                    yaw_var * share,
-                    int(np.count_nonzero(w > 0.05)),
-                )
+            one = merge(
+                np.array(self.anchors[anchor_id][0]),
+                np.array([o.p_tracking_anchor for o in group]),
+                np.array([o.T_world_tracking_yaw for o in group]),
+                float(np.mean([o.position_var for o in group])),
+                float(np.mean([o.yaw_var for o in group])),
+                self.config.min_agreeing,
             )
-        return merged
+            if one is not None:
+                merged.append(one)
+        return merged, len(groups) - len(merged)
 
     def _covariance(self, H: Array, pivot: Array, t_world: Array) -> tuple[float, ...]:
         """6x6 at the pivot from the 4x4 information `H` over (yaw about the origin of tracking, x, y, z)."""
@@ -273,58 +309,3 @@ def _yaw_and_tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> tu
     up = quat_rotate(q, (0.0, 0.0, 1.0))
     tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
     return wrap_angle(yaw), tilt
-
-
-def _circular_median(angles: Array) -> float:
-    """The angle among `angles` with the least sum of absolute differences: unharmed by a minority of outliers."""
-    candidates = angles if len(angles) <= 64 else angles[:: len(angles) // 64]
-    differences = np.abs((candidates[:, None] - angles[None, :] + math.pi) % (2.0 * math.pi) - math.pi)
-    return float(candidates[int(np.argmin(np.sum(differences, axis=1)))])
-
-
-def _tukey(standardized: Array) -> Array:
-    """Tukey's biweight of residuals in units of their sigma."""
-    u = np.minimum(np.abs(standardized) / _TUKEY, 1.0)
-    return np.asarray((1.0 - u * u) ** 2, dtype=np.float64)
-
-
-def _solve(merged: list[_Merged], max_iterations: int) -> tuple[float, Array, Array, Array]:
-    """Robust Gauss-Newton over (yaw, t). Returns yaw, t_world (3,), weights (m,), information H (4, 4)."""
-    if not merged:
-        return 0.0, np.zeros(3), np.zeros(0), np.eye(4)
-    p_w = np.array([m.p_world_anchor for m in merged])
-    p_t = np.array([m.p_tracking_anchor for m in merged])
-    yaws = np.array([m.yaw for m in merged])
-    ip = 1.0 / np.array([m.position_var for m in merged])
-    iy = 1.0 / np.array([m.yaw_var for m in merged])
-    yaw = _circular_median(yaws)
-    t = np.median(p_w - _rotate_z(yaw, p_t), axis=0)
-    weights = np.ones(len(merged))
-    H = np.eye(4)
-    for _ in range(max_iterations):
-        turned = _rotate_z(yaw, p_t)
-        r_p = p_w - turned - t
-        r_y = np.array([wrap_angle(float(y) - yaw) for y in yaws])
-        distance2 = np.sum(r_p * r_p, axis=1) * ip + r_y * r_y * iy
-        if len(merged) > 2:  # with two there is no majority to trust
-            weights = _tukey(np.sqrt(distance2 / 4.0))
-        d = np.stack([-turned[:, 1], turned[:, 0], np.zeros(len(merged))], axis=1)  # d(turned)/d(yaw)
-        wp, wy = weights * ip, weights * iy
-        H = np.zeros((4, 4))
-        H[0, 0] = np.sum(wp * np.sum(d * d, axis=1)) + np.sum(wy)
-        H[0, 1:] = H[1:, 0] = wp @ d
-        H[1:, 1:] = np.eye(3) * np.sum(wp)
-        H += np.eye(4) * 1e-9
-        g = np.concatenate([[np.sum(wp * np.sum(d * r_p, axis=1)) + np.sum(wy * r_y)], wp @ r_p])
-        step = np.linalg.solve(H, g)
-        yaw = wrap_angle(yaw + float(step[0]))
-        t = t + step[1:]
-        if float(np.max(np.abs(step))) < 1e-10:
-            break
-    return yaw, t, weights, H
-
-
-def _rotate_z(yaw: float, points: Array) -> Array:
-    """Points (n, 3) turned about Z by `yaw`."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], axis=1)

@@ -2,7 +2,7 @@
 
 A pose `T_a_b` is a pair `(p, q)`: position `p` of frame b in a [m] and unit quaternion `q = (w, x, y, z)` that turns
 vectors of b into a. Every function is a pure float computation in a fixed order, so results are reproducible bit for
-bit on one machine. The numpy twin for batches and covariances is `anchors.se3`.
+bit on one machine.
 """
 
 from __future__ import annotations
