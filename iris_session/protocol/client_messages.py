@@ -11,16 +11,13 @@ from typing import Annotated
 
 import msgspec
 
-from iris_session.protocol.common import Count, Name, Nanoseconds, Pose, Target, Text
+from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Target, Text
 from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.security import Pair, RemoveParticipant
+from iris_session.protocol.status import ClientReport, GetStatus
 
 Joints = Annotated[tuple[float, ...], msgspec.Meta(max_length=64)]
 Targets = Annotated[tuple[Target, ...], msgspec.Meta(max_length=8)]
-Names = Annotated[tuple[Name, ...], msgspec.Meta(max_length=32)]
-
-
-class Message(msgspec.Struct, frozen=True, tag_field="type"):
-    """Base of all tagged messages."""
 
 
 class Hello(Message, frozen=True, tag="hello"):
@@ -91,6 +88,15 @@ class Sample(Message, frozen=True, tag="sample"):
     hand_joints: Annotated[tuple[float, ...], msgspec.Meta(max_length=182)] = ()
     q: Joints = ()
     qd: Joints = ()
+
+
+class Samples(Message, frozen=True, tag="samples"):
+    """Samples of several devices that were taken together, such as head and both controllers at a display frame.
+
+    Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+    """
+
+    samples: Annotated[tuple[Sample, ...], msgspec.Meta(max_length=8)]
 
 
 class Acquire(Message, frozen=True, tag="acquire"):
@@ -228,6 +234,7 @@ ClientMessage = (
     | ClockPing
     | GetSnapshot
     | Sample
+    | Samples
     | Acquire
     | Release
     | Consent
@@ -243,6 +250,10 @@ ClientMessage = (
     | ClearEStop
     | Control
     | Marker
+    | Pair
+    | RemoveParticipant
+    | GetStatus
+    | ClientReport
 )
 
 

@@ -12,12 +12,16 @@ from typing import Final, TypeVar, get_args
 
 import msgspec
 
-from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage, Message
+from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage
+from iris_session.protocol.common import EventBody, Message
+from iris_session.protocol.decoding import BAD_BYTES, Bytes
+from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.limits import (
     LIMITS,
     MAX_BEACON_BYTES,
     MAX_CLIENT_BYTES,
+    MAX_INTRODUCTION_BYTES,
     MAX_PRESENCE_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
@@ -25,8 +29,6 @@ from iris_session.protocol.limits import (
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
-    Beacon,
-    EventBody,
     EventKind,
     Presence,
     ServerEnvelope,
@@ -34,7 +36,6 @@ from iris_session.protocol.server_messages import (
     StateHeader,
 )
 
-Bytes = bytes | bytearray | memoryview
 T = TypeVar("T")
 
 
@@ -57,6 +58,10 @@ class _Version(msgspec.Struct, array_like=True):
 
 class _BeaconVersion(msgspec.Struct):
     protocol: int
+
+
+class _IntroductionVersion(msgspec.Struct):
+    beacon: _BeaconVersion
 
 
 class _Event(msgspec.Struct, frozen=True):
@@ -88,14 +93,16 @@ _client: Final = msgspec.msgpack.Decoder(ClientEnvelope)
 _server: Final = msgspec.msgpack.Decoder(ServerEnvelope)
 _version: Final = msgspec.msgpack.Decoder(_Version)
 _beacon_version: Final = msgspec.msgpack.Decoder(_BeaconVersion)
+_introduction_version: Final = msgspec.msgpack.Decoder(_IntroductionVersion)
 _client_tags: Final = msgspec.msgpack.Decoder(_ClientTags)
 _server_tags: Final = msgspec.msgpack.Decoder(_ServerTags)
 _state_header: Final = msgspec.msgpack.Decoder(StateHeader)
 _presence: Final = msgspec.msgpack.Decoder(Presence)
 _beacon: Final = msgspec.msgpack.Decoder(Beacon)
+_introduction: Final = msgspec.msgpack.Decoder(Introduction)
 
-#: What `msgspec` raises for bytes of a stranger: schema and syntax (`DecodeError`), text that is not UTF-8, nesting.
-_BAD_BYTES: Final = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError)
+#: Bytes of the length before an introduction.
+INTRODUCTION_PREFIX: Final = 4
 
 
 def encode_client(envelope: ClientEnvelope) -> bytes:
@@ -108,7 +115,7 @@ def decode_client(data: Bytes) -> ClientEnvelope:
     _check_size("message", data, MAX_CLIENT_BYTES)
     try:
         envelope = _client.decode(data)
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise _explain(error, data, _client_tags, CLIENT_TYPES) from None
     if envelope.version != PROTOCOL_VERSION:
         raise VersionError(envelope.version)
@@ -127,7 +134,7 @@ def decode_server(data: Bytes) -> ServerEnvelope:
     _check_size("message", data, MAX_SERVER_BYTES)
     try:
         envelope = _server.decode(data)
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise _explain(error, data, _server_tags, SERVER_TYPES) from None
     if envelope.version != PROTOCOL_VERSION:
         raise VersionError(envelope.version)
@@ -140,7 +147,7 @@ def peek_version(data: Bytes) -> int:
     """Protocol version of an envelope whose other elements may be of any schema. Raises `MalformedError`."""
     try:
         return _version.decode(data).version
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise MalformedError(
             f"no envelope: {error}; expected a MessagePack array that starts with the version"
         ) from None
@@ -176,18 +183,48 @@ def decode_beacon(data: Bytes) -> Beacon:
     _check_size("beacon", data, MAX_BEACON_BYTES)
     try:
         version = _beacon_version.decode(data).protocol
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise MalformedError(f"no beacon: {error}") from None
     if version != PROTOCOL_VERSION:
         raise VersionError(version)
     return _decode("beacon", _beacon, data, MAX_BEACON_BYTES)
 
 
+def encode_introduction(introduction: Introduction) -> bytes:
+    """Everything that is written to a TCP connection on the introduction's port: length (uint32, big-endian), body."""
+    body = _encoder.encode(introduction)
+    return len(body).to_bytes(INTRODUCTION_PREFIX, "big") + body
+
+
+def decode_introduction(data: Bytes) -> Introduction | None:
+    """Inverse of `encode_introduction`; `None` while `data`, as received so far, is only its beginning.
+
+    Raises `VersionError`, `TooLargeError` or `MalformedError`.
+    """
+    if len(data) < INTRODUCTION_PREFIX:
+        return None
+    length = int.from_bytes(data[:INTRODUCTION_PREFIX], "big")
+    if length > MAX_INTRODUCTION_BYTES:
+        raise TooLargeError("introduction", length, MAX_INTRODUCTION_BYTES)
+    body = data[INTRODUCTION_PREFIX:]
+    if len(body) < length:
+        return None
+    if len(body) > length:
+        raise MalformedError(f"no introduction: {len(body) - length} bytes after its end")
+    try:
+        version = _introduction_version.decode(body).beacon.protocol
+    except BAD_BYTES as error:
+        raise MalformedError(f"no introduction: {error}") from None
+    if version != PROTOCOL_VERSION:
+        raise VersionError(version)
+    return _decode("introduction", _introduction, body, MAX_INTRODUCTION_BYTES)
+
+
 def _decode(what: str, decoder: msgspec.msgpack.Decoder[T], data: Bytes, limit: int) -> T:
     _check_size(what, data, limit)
     try:
         return decoder.decode(data)
-    except _BAD_BYTES as error:
+    except BAD_BYTES as error:
         raise MalformedError(f"no {what}: {error}") from None
 
 
@@ -211,7 +248,7 @@ def _explain(
         return VersionError(version)
     try:
         message = tags.decode(data).message
-    except _BAD_BYTES:
+    except BAD_BYTES:
         return MalformedError(str(error))
     if message.type and message.type not in known:
         return MalformedError(f"unknown message type {message.type[:64]!r}, expected one of {', '.join(known)}")

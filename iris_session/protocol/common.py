@@ -1,4 +1,4 @@
-"""Value types shared by messages, entries and views: poses, targets, leases, denials."""
+"""Bases of all messages, and value types shared by messages, entries and views: poses, targets, leases, denials."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ Name = Annotated[str, msgspec.Meta(max_length=64)]
 MAX_TEXT = 512
 #: Free text shown to a person.
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+#: A few names: devices, robots, roles.
+Names = Annotated[tuple[Name, ...], msgspec.Meta(max_length=32)]
 #: Any counter, epoch, version or nanosecond count. Fits an int64 in every client language.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
@@ -19,6 +21,14 @@ Nanoseconds = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 Vec3 = tuple[float, float, float]
 #: Unit quaternion `[w, x, y, z]`.
 Quat = tuple[float, float, float, float]
+
+
+class Message(msgspec.Struct, frozen=True, tag_field="type"):
+    """Base of all tagged messages."""
+
+
+class EventBody(msgspec.Struct, frozen=True, tag_field="event"):
+    """Base of all event bodies."""
 
 
 class Pose(msgspec.Struct, frozen=True, array_like=True):

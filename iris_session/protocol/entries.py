@@ -23,7 +23,6 @@ from iris_session.protocol.client_messages import (
     Grasp,
     Heartbeat,
     Marker,
-    Message,
     Observation,
     PlaceAlignment,
     Release,
@@ -32,7 +31,9 @@ from iris_session.protocol.client_messages import (
     SetScale,
     TrackingEpoch,
 )
-from iris_session.protocol.common import Count, Name, Nanoseconds, Pose, Text
+from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text
+from iris_session.protocol.decoding import decoder
+from iris_session.protocol.security import RemoveParticipant
 
 #: Connection number of the process that owns the session (its Python API). It acts with the rights of a director.
 HOST: Final = 0
@@ -43,6 +44,7 @@ class Join(Message, frozen=True, tag="join"):
 
     `resume_of`: participant id whose resume token the front has verified, else empty.
     `gateway`: connection of the gateway that speaks for this one, else 0.
+    `roles`: what the key may join as; empty: any role.
     """
 
     key_id: Name
@@ -54,6 +56,7 @@ class Join(Message, frozen=True, tag="join"):
     alignment: Name = "measured"
     resume_of: Name = ""
     gateway: Count = 0
+    roles: Names = ()
 
 
 class Lost(Message, frozen=True, tag="lost"):
@@ -102,6 +105,23 @@ class RecordingGap(Message, frozen=True, tag="recording_gap"):
     rows: Count
 
 
+class Audit(Message, frozen=True, tag="audit"):
+    """Something that concerns security, seen by the front (host only); fields as in `Audited`."""
+
+    kind: Name
+    subject: Name = ""
+    name: Name = ""
+    address: Name = ""
+    detail: Text = ""
+    count: Count = 1
+
+
+class SessionResumed(Message, frozen=True, tag="session_resumed"):
+    """The session goes on from a keyframe of an earlier recording, after `gap_ns` (host only)."""
+
+    gap_ns: Nanoseconds
+
+
 EntryMessage = (
     Join
     | Lost
@@ -129,6 +149,9 @@ EntryMessage = (
     | StalledGap
     | FrontRestarted
     | RecordingGap
+    | RemoveParticipant
+    | Audit
+    | SessionResumed
 )
 
 
@@ -149,8 +172,8 @@ class Entry(msgspec.Struct, frozen=True, array_like=True):
 URGENT: Final = (EStop, Release, Lost, Bye)
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(Entry)
-_list_decoder = msgspec.msgpack.Decoder(list[Entry])
+_decode = decoder(Entry)
+_decode_list = decoder(list[Entry])
 
 
 def encode_entry(entry: Entry) -> bytes:
@@ -160,7 +183,7 @@ def encode_entry(entry: Entry) -> bytes:
 
 def decode_entry(data: bytes) -> Entry:
     """Inverse of `encode_entry`. Raises `msgspec.DecodeError` (or its subclass `ValidationError`)."""
-    return _decoder.decode(data)
+    return _decode(data)
 
 
 def encode_entries(entries: list[Entry]) -> bytes:
@@ -169,5 +192,5 @@ def encode_entries(entries: list[Entry]) -> bytes:
 
 
 def decode_entries(data: bytes) -> list[Entry]:
-    """Inverse of `encode_entries`."""
-    return _list_decoder.decode(data)
+    """Inverse of `encode_entries`. Raises `msgspec.DecodeError`."""
+    return _decode_list(data)

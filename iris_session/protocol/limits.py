@@ -27,15 +27,17 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Hello,
     Marker,
-    Message,
     Observation,
     PlaceAlignment,
     Release,
     Sample,
+    Samples,
     SetMode,
     SetScale,
     TrackingEpoch,
 )
+from iris_session.protocol.common import Message
+from iris_session.protocol.security import Pair, Paired, RemoveParticipant
 from iris_session.protocol.server_messages import (
     ClockPong,
     Event,
@@ -46,6 +48,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
+from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, StatusReport
 
 
 class Limit(msgspec.Struct, frozen=True):
@@ -69,6 +72,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         ClockPing: Limit(512, 20, 40),
         GetSnapshot: Limit(512, 2, 10),
         Sample: Limit(8_000, 600, 200),
+        Samples: Limit(48_000, 200, 100),
         Acquire: _REQUEST,
         Release: _REQUEST,
         Consent: _REQUEST,
@@ -84,6 +88,10 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         ClearEStop: Limit(512, 5, 10),
         Control: Limit(1_000, 20, 40),
         Marker: Limit(4_000, 20, 40),
+        Pair: Limit(1_000, 1, 5),
+        RemoveParticipant: _REQUEST,
+        GetStatus: Limit(512, 4, 8),
+        ClientReport: Limit(1_000, 4, 8),
     }
 )
 #: Largest message of any type from a client: what the socket may take at all (`ZMQ_MAXMSGSIZE`).
@@ -100,6 +108,9 @@ SERVER_LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Feedback: Limit(64_000),
         Event: Limit(64_000),
         Snapshot: Limit(32_000_000),
+        Paired: Limit(8_000),
+        StatusReport: Limit(4_000_000),
+        DeliveryBudget: Limit(4_000),
     }
 )
 MAX_SERVER_BYTES: Final = max(limit.max_bytes for limit in SERVER_LIMITS.values())
@@ -107,6 +118,8 @@ MAX_STATE_HEADER_BYTES: Final = 128_000
 MAX_PRESENCE_BYTES: Final = 256_000
 #: One UDP datagram without fragmentation on Ethernet.
 MAX_BEACON_BYTES: Final = 1_400
+#: What a session says of itself over TCP, without the length before it.
+MAX_INTRODUCTION_BYTES: Final = 4_000
 
 
 class RateLimiter:

@@ -134,6 +134,7 @@ class HoldReason:
     DISCONNECTED: Final = "disconnected"
     GAP: Final = "gap"  # the session stood still; clutch again
     SCENE_CHANGED: Final = "scene_changed"  # reset or new epoch; clutch again
+    INTERVENTION: Final = "intervention"  # mode `priority`, told to the agent: a human has the robot
     REARM: Final = "rearm"  # engagement ended (release, takeover, new tracking epoch); clutch again
 
 
@@ -160,6 +161,7 @@ class RejectReason:
     QUOTA: Final = "quota"
     DEVICE: Final = "device"  # device not declared in hello, or does not fit the kind
     LEADER_APART: Final = "leader_apart"
+    KIND_MISMATCH: Final = "kind"  # others drive this shared robot by samples of another kind
 
 
 class DenialReason:
@@ -200,6 +202,8 @@ class RefusalCode:
     GATEWAY_ONLY: Final = "gateway_only"
     RESUME_TOKEN: Final = "resume_token"
     FULL: Final = "full"
+    UNPAIRED: Final = "unpaired"  # the key is not on the allow-list: pair first
+    CODE: Final = "code"  # a join code that is wrong, used, expired, or was tried too often
 
 
 class FaultCode:
@@ -214,6 +218,7 @@ class FaultCode:
     STALLED: Final = "stalled"  # the session does not step: robots hold
     RECOVERED: Final = "recovered"
     SESSION_ENDED: Final = "session_ended"
+    REVOKED: Final = "revoked"  # the key was taken off the allow-list, or a director removed the participant
 
 
 class EpisodeAction:
@@ -232,3 +237,39 @@ class ControlAction:
     STEP: Final = "step"
     RESET: Final = "reset"
     ALL: Final = frozenset({"pause", "resume", "step", "reset"})
+
+
+class AuditKind:
+    """What an `Audited` event tells."""
+
+    PAIRED: Final = "paired"
+    CODE_REFUSED: Final = "code_refused"
+    CODE_EXHAUSTED: Final = "code_exhausted"  # too many wrong attempts: the code is void
+    KEY_REFUSED: Final = "key_refused"  # an unknown key tried to do more than pair
+    KEY_REVOKED: Final = "key_revoked"
+    ROLE_REFUSED: Final = "role_refused"
+    REMOVED: Final = "removed"
+    GATEWAY_REFUSED: Final = "gateway_refused"  # `on_behalf_of` from somebody who is no gateway
+    TOKEN_REFUSED: Final = "token_refused"
+    FLOOD: Final = "flood"  # a client sends more than its limits for seconds
+
+
+class BudgetClass:
+    """How much media a client gets, from everything to nothing. State and control come whatever the class."""
+
+    FULL: Final = "full"
+    HALF: Final = "half"
+    QUARTER: Final = "quarter"
+    NONE: Final = "none"
+
+
+class LateCause:
+    """Where the time of a late tick went."""
+
+    SCHEDULER: Final = "scheduler"  # the process did not run when it wanted to
+    PHYSICS: Final = "physics"
+    CONTROL: Final = "control"
+    AUTHORITY: Final = "authority"
+    OUTPUT: Final = "output"  # sending state, decisions, and to the recorder
+    SUPERVISION: Final = "supervision"  # starting a process anew
+    OWNER: Final = "owner"  # the user's loop

@@ -1,18 +1,32 @@
 """Messages from the session to a client, version 1. The tag field is `type`; events carry their kind in `event`.
 
-On the control channel every one of them travels inside a `ServerEnvelope`. Everything is in the world frame:
-right-handed, Z up, metres, `[w, x, y, z]`.
+On the control channel each is inside a `ServerEnvelope`. World frame: right-handed, Z up, metres, `[w, x, y, z]`.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import msgspec
 
-from iris_session.protocol.client_messages import Message
-from iris_session.protocol.common import Alignment, Applied, Count, Denial, Lease, Name, Nanoseconds, Pose, Text
+from iris_session.protocol.common import (
+    Alignment,
+    Count,
+    Denial,
+    EventBody,
+    Lease,
+    Message,
+    Name,
+    Nanoseconds,
+    Pose,
+    Text,
+)
 from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.security import Audited, Paired
+from iris_session.protocol.state_channel import TOPIC_PRESENCE as TOPIC_PRESENCE  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.state_channel import TOPIC_RIGID as TOPIC_RIGID  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.state_channel import Presence as Presence  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.state_channel import PresenceItem as PresenceItem  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.state_channel import StateHeader as StateHeader  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
 class Endpoints(msgspec.Struct, frozen=True):
@@ -53,10 +67,15 @@ class Refused(Message, frozen=True, tag="refused"):
 
 
 class ProtocolFault(Message, frozen=True, tag="protocol_fault"):
-    """A message that could not be taken, or what has become of the session. `code`: `FaultCode`."""
+    """A message that could not be taken, or what has become of the session. `code`: `FaultCode`.
+
+    `reason`: with `dropped` and `revoked`, why the session let this connection go: `replaced` (another connection
+    resumed this participant: joining again would take it back), `removed`, `revoked`, `expired`, ...
+    """
 
     code: Name
     message: Text
+    reason: Name = ""
 
 
 class ClockPong(Message, frozen=True, tag="clock_pong"):
@@ -125,10 +144,6 @@ class BodyInfo(msgspec.Struct, frozen=True, array_like=True):
 
 
 # --- events: the shared history, numbered without gaps by `event_seq` -----------------------------------------------
-
-
-class EventBody(msgspec.Struct, frozen=True, tag_field="event"):
-    """Base of all event bodies."""
 
 
 class ParticipantJoined(EventBody, frozen=True, tag="participant_joined"):
@@ -253,17 +268,21 @@ class SamplesRejected(EventBody, frozen=True, tag="samples_rejected"):
 
 
 class Gap(EventBody, frozen=True, tag="gap"):
-    """`kind`: `stalled` (no step for `duration_ns`) or `recording` (rows lost; verification restarts)."""
+    """`kind`: `stalled` (no step for so long), `recording` (`rows` are lost), `resumed` (from an earlier recording)."""
 
     kind: Name
     duration_ns: Nanoseconds
+    rows: Count = 0
 
 
 class Notice(EventBody, frozen=True, tag="notice"):
-    """Something an operator should read. `level`: info, warning, error."""
+    """Something an operator should read. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
+    `DenialReason` of a refusal that answers no request (of an alignment)."""
 
     level: Name
     text: Text
+    participant: Name = ""
+    reason: Name = ""
 
 
 EventKind = (
@@ -286,6 +305,7 @@ EventKind = (
     | SamplesRejected
     | Gap
     | Notice
+    | Audited
 )
 
 
@@ -301,8 +321,8 @@ class Event(Message, frozen=True, tag="event"):
 class Snapshot(Message, frozen=True, tag="snapshot"):
     """Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
 
-    Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
-    `state_seq`.
+    In the step of a reset `tick` and `sim_time` are still those before it. Bulk frame 1 (added by the front): float64
+    (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
     """
 
     request_id: Count
@@ -323,7 +343,19 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     state_seq: Count = 0
 
 
-ServerMessage = Welcome | Refused | ProtocolFault | ClockPong | Reply | Feedback | Event | Snapshot
+ServerMessage = (
+    Welcome
+    | Refused
+    | ProtocolFault
+    | ClockPong
+    | Reply
+    | Feedback
+    | Event
+    | Snapshot
+    | Paired
+    | StatusReport
+    | DeliveryBudget
+)
 
 
 class ServerEnvelope(msgspec.Struct, frozen=True, array_like=True):
@@ -332,62 +364,3 @@ class ServerEnvelope(msgspec.Struct, frozen=True, array_like=True):
     version: int
     connection_epoch: Count
     message: ServerMessage
-
-
-# --- state channel ----------------------------------------------------------------------------------------------------
-
-
-class StateHeader(msgspec.Struct, frozen=True, array_like=True):
-    """First payload frame of a rigid-state message; topic frame before it, encoded poses after it.
-
-    `session_time`: end of the tick that this state belongs to. `published_ns`: session time when handed to the socket.
-    `base_seq`: a client that holds any frame >= `base_seq` of this `scene_epoch` has every body within the bound after
-    this one; an older client asks for a snapshot. `ticks` are counted within the epoch.
-    """
-
-    scene_epoch: Count
-    scene_revision: Count
-    tick: Count
-    sim_time: float
-    session_time: Nanoseconds
-    published_ns: Nanoseconds
-    state_seq: Count
-    base_seq: Count
-    applied: tuple[Applied, ...] = ()
-
-
-class PresenceItem(msgspec.Struct, frozen=True, array_like=True):
-    """A device of a participant in the world. Only of participants that are aligned."""
-
-    participant: Name
-    device: Name
-    pose: Pose
-    capture_ns: Nanoseconds = 0
-
-
-class Presence(msgspec.Struct, frozen=True, array_like=True):
-    """Message on topic `presence`: heads and hands of everyone, latest value."""
-
-    session_time: Nanoseconds
-    published_ns: Nanoseconds
-    items: tuple[PresenceItem, ...]
-
-
-class Beacon(msgspec.Struct, frozen=True):
-    """UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned."""
-
-    protocol: Annotated[int, msgspec.Meta(ge=0)]
-    session_id: Name
-    session_name: Name
-    kind: Name
-    host: Name
-    control: Count
-    state: Count
-    media: Count
-    assets: Count
-    web: Count
-    key_fingerprint: Name = ""
-
-
-TOPIC_RIGID = b"rigid"
-TOPIC_PRESENCE = b"presence"

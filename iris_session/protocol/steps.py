@@ -82,10 +82,14 @@ class Admitted(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Dropped(msgspec.Struct, frozen=True, array_like=True):
-    """The authority is done with a connection (replaced by a resume, expired, said bye): the front closes it."""
+    """The authority is done with a connection (replaced by a resume, expired, said bye): the front closes it.
+
+    `key_id`: of a key that a director has revoked; `connection` is `HOST` then when nobody was connected with it.
+    """
 
     connection: Count
     reason: Name
+    key_id: Name = ""
 
 
 class Decision(msgspec.Struct, frozen=True):

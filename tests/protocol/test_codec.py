@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, envelope
 from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MAX_ERROR_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.generate.examples import extreme, full, least
-from iris_session.protocol.limits import LIMITS, MAX_CLIENT_BYTES, MAX_SERVER_BYTES
-from iris_session.protocol.server_messages import Beacon, Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
+from iris_session.protocol.limits import LIMITS, MAX_CLIENT_BYTES, MAX_INTRODUCTION_BYTES, MAX_SERVER_BYTES
+from iris_session.protocol.server_messages import Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
 
 pack = msgspec.msgpack.encode
 MAKES = (full, least, extreme)
@@ -57,6 +58,31 @@ def test_state_channel_round_trips(make: object) -> None:
 def test_beacon_round_trips() -> None:
     beacon = msgspec.structs.replace(full(Beacon), protocol=1)
     assert codec.decode_beacon(codec.encode_beacon(beacon)) == beacon
+
+
+def test_introduction_round_trips_and_waits_for_its_end() -> None:
+    beacon = msgspec.structs.replace(full(Beacon), protocol=1)
+    introduction = msgspec.structs.replace(full(Introduction), beacon=beacon)
+    data = codec.encode_introduction(introduction)
+    assert codec.decode_introduction(data) == introduction
+    assert codec.decode_introduction(bytearray(data)) == introduction
+    assert [codec.decode_introduction(data[:n]) for n in range(len(data))] == [None] * len(data)
+    with pytest.raises(MalformedError, match="after its end"):
+        codec.decode_introduction(data + b"x")
+    with pytest.raises(TooLargeError):
+        codec.decode_introduction((MAX_INTRODUCTION_BYTES + 1).to_bytes(4, "big"))
+    later = msgspec.structs.replace(introduction, beacon=msgspec.structs.replace(beacon, protocol=7))
+    with pytest.raises(VersionError):
+        codec.decode_introduction(codec.encode_introduction(later))
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_on_the_port_of_the_introduction_raise_anything_else(data: bytes) -> None:
+    for said in (data, len(data).to_bytes(4, "big") + data):
+        try:
+            codec.decode_introduction(said)
+        except ProtocolError:
+            continue
 
 
 def test_non_finite_floats_pass_to_the_authority() -> None:

@@ -49,6 +49,8 @@ def test_client_messages_survive_as_entries(kind: type[msgspec.Struct], make: ob
         entries.ExternalReset(),
         entries.StalledGap(12),
         entries.FrontRestarted(),
+        entries.Audit("key_refused", "ab12", "Ada", "10.0.0.7", "pair", 3),
+        entries.SessionResumed(5_000_000_000),
         entries.RecordingGap(7),
     ],
     ids=lambda message: type(message).__name__,
@@ -61,6 +63,7 @@ def test_internal_messages_survive_as_entries(message: entries.EntryMessage) -> 
 
 def test_every_internal_message_was_tried() -> None:
     names = {"Join", "Lost", "AlignmentProposal", "ExternalReset", "StalledGap", "FrontRestarted", "RecordingGap"}
+    names |= {"Audit", "SessionResumed"}
     assert {kind.__name__ for kind in INTERNAL} == names
 
 

@@ -14,10 +14,11 @@ import pytest
 from anchors.pose import Quat, Vec3, quat_normalize, quat_rotate
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import ClientEnvelope
+from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.generate import rigid_reference
 from iris_session.protocol.generate.conversions import from_three, from_unity, to_three, to_unity
-from iris_session.protocol.server_messages import Beacon, Presence, ServerEnvelope, StateHeader
+from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from tests.streams.poses import random_poses
 
@@ -102,9 +103,9 @@ def test_reference_and_encoder_agree_on_escapes() -> None:
 
 def test_reference_refuses_codes_of_no_rotation() -> None:
     with pytest.raises(ValueError, match="no rotation"):
-        rigid_reference.decode_rotation(4 * 6501**3)
+        rigid_reference.decode_rotation((16383, 8191, 8191))
     with pytest.raises(ValueError, match="no rotation"):
-        rigid_reference.decode_rotation(0)
+        rigid_reference.decode_rotation((0, 0, 0))
 
 
 def test_conversions_turn_vectors_like_poses() -> None:

@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from iris_session.protocol import codec
-from iris_session.protocol.server_messages import Beacon
+from iris_session.protocol.discovery import Beacon
 
 GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "golden.json").read_text())
 DECODERS: dict[str, Callable[[bytes], Any]] = {

@@ -67,7 +67,8 @@ public static class Wire
     public const string TopicPresence = "{server_messages.TOPIC_PRESENCE.decode()}";
     public const int RigidFormat = {rigid_reference.FORMAT};
     public const double RigidLatticeM = {rigid_reference.LATTICE_M!r};
-    public const int RigidRotationLevels = {rigid_reference.ROTATION_LEVELS};
+    public const int RigidPositionBits = {rigid_reference.POSITION_BITS};
+    public const int RigidRotationCentre = {rigid_reference.ROTATION_CENTRE};
 }}"""
 
 

@@ -16,11 +16,11 @@ import msgspec
 
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, envelope
+from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.generate import conversions, rigid_reference
 from iris_session.protocol.generate.examples import extreme, full, least
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
-    Beacon,
     Event,
     Presence,
     ServerEnvelope,
@@ -172,7 +172,7 @@ def _rigid() -> Iterator[dict[str, Any]]:
         "one body": (1, {0: poses[3]}, {}),
         "room of 10 x 10 x 3 m": (5, dict(enumerate(poses)), {}),
         "two of nineteen": (19, {7: poses[1], 18: poses[2]}, {}),
-        "seven bytes a position": (2, dict(enumerate(wide)), {}),
+        "wide: farther apart than 16 m": (2, dict(enumerate(wide)), {}),
         "escapes": (12, {3: poses[3]}, {0: nan, 11: (1e9, 0.0, -1e9, *poses[1][3:])}),
     }
     for name, (n_bodies, quantised, escaped) in frames.items():

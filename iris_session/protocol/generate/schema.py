@@ -13,7 +13,7 @@ from typing import Any, Final, get_args
 
 import msgspec
 
-from iris_session.protocol import client_messages, common, names, server_messages
+from iris_session.protocol import client_messages, common, discovery, names, server_messages, status
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,10 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.ParticipantInfo,
         server_messages.RobotInfo,
         server_messages.BodyInfo,
+        status.Quantiles,
+        status.ParticipantReport,
+        status.RobotReport,
+        status.RecorderReport,
     ),
     "client": UNIONS["ClientMessage"],
     "server": UNIONS["ServerMessage"],
@@ -87,7 +91,8 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.StateHeader,
         server_messages.PresenceItem,
         server_messages.Presence,
-        server_messages.Beacon,
+        discovery.Beacon,
+        discovery.Introduction,
     ),
 }
 
@@ -123,6 +128,15 @@ _ENUMS: Final[dict[str, str]] = {
     "SamplesRejected.reason": "RejectReason",
     "PresenceItem.device": "Device",
     "Beacon.kind": "SessionKind",
+    "Paired.roles": "Role",
+    "Audited.kind": "AuditKind",
+    "DeliveryBudget.budget_class": "BudgetClass",
+    "ParticipantReport.role": "Role",
+    "ParticipantReport.alignment": "AlignmentKind",
+    "ParticipantReport.budget_class": "BudgetClass",
+    "RobotReport.mode": "LeaseMode",
+    "RobotReport.state": "CommandKind",
+    "RobotReport.hold_reason": "HoldReason",
 }
 
 _SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {

@@ -45,7 +45,8 @@ def _constants() -> str:
             f"export const RIGID_FORMAT = {rigid_reference.FORMAT};",
             "/** Edge of the position lattice [m]. */",
             f"export const RIGID_LATTICE_M = {rigid_reference.LATTICE_M!r};",
-            f"export const RIGID_ROTATION_LEVELS = {rigid_reference.ROTATION_LEVELS};",
+            f"export const RIGID_POSITION_BITS = {rigid_reference.POSITION_BITS};",
+            f"export const RIGID_ROTATION_CENTRE = {rigid_reference.ROTATION_CENTRE};",
         ]
     )
 

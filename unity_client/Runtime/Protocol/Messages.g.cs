@@ -13,9 +13,10 @@ namespace IrisSession.Protocol
         public const int Version = 1;
         public const string TopicRigid = "rigid";
         public const string TopicPresence = "presence";
-        public const int RigidFormat = 1;
-        public const double RigidLatticeM = 0.0001068115234375;
-        public const int RigidRotationLevels = 6501;
+        public const int RigidFormat = 2;
+        public const double RigidLatticeM = 6.103515625e-05;
+        public const int RigidPositionBits = 18;
+        public const int RigidRotationCentre = 8191;
     }
 
     /// <summary>
@@ -151,6 +152,7 @@ namespace IrisSession.Protocol
         public const string Disconnected = "disconnected";
         public const string Gap = "gap";
         public const string SceneChanged = "scene_changed";
+        public const string Intervention = "intervention";
         public const string Rearm = "rearm";
     }
 
@@ -179,6 +181,7 @@ namespace IrisSession.Protocol
         public const string Quota = "quota";
         public const string Device = "device";
         public const string LeaderApart = "leader_apart";
+        public const string KindMismatch = "kind";
     }
 
     /// <summary>
@@ -223,6 +226,8 @@ namespace IrisSession.Protocol
         public const string GatewayOnly = "gateway_only";
         public const string ResumeToken = "resume_token";
         public const string Full = "full";
+        public const string Unpaired = "unpaired";
+        public const string Code = "code";
     }
 
     /// <summary>
@@ -239,6 +244,7 @@ namespace IrisSession.Protocol
         public const string Stalled = "stalled";
         public const string Recovered = "recovered";
         public const string SessionEnded = "session_ended";
+        public const string Revoked = "revoked";
     }
 
     /// <summary>
@@ -263,6 +269,48 @@ namespace IrisSession.Protocol
         public const string Resume = "resume";
         public const string Step = "step";
         public const string Reset = "reset";
+    }
+
+    /// <summary>
+    /// What an Audited event tells.
+    /// </summary>
+    public static class AuditKind
+    {
+        public const string Paired = "paired";
+        public const string CodeRefused = "code_refused";
+        public const string CodeExhausted = "code_exhausted";
+        public const string KeyRefused = "key_refused";
+        public const string KeyRevoked = "key_revoked";
+        public const string RoleRefused = "role_refused";
+        public const string Removed = "removed";
+        public const string GatewayRefused = "gateway_refused";
+        public const string TokenRefused = "token_refused";
+        public const string Flood = "flood";
+    }
+
+    /// <summary>
+    /// How much media a client gets, from everything to nothing. State and control come whatever the class.
+    /// </summary>
+    public static class BudgetClass
+    {
+        public const string Full = "full";
+        public const string Half = "half";
+        public const string Quarter = "quarter";
+        public const string None = "none";
+    }
+
+    /// <summary>
+    /// Where the time of a late tick went.
+    /// </summary>
+    public static class LateCause
+    {
+        public const string Scheduler = "scheduler";
+        public const string Physics = "physics";
+        public const string Control = "control";
+        public const string Authority = "authority";
+        public const string Output = "output";
+        public const string Supervision = "supervision";
+        public const string Owner = "owner";
     }
 
     /// <summary>The bytes are not MessagePack, or not a message of the schema.</summary>
@@ -684,7 +732,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 21 messages, told apart by the field "type".</summary>
+    /// <summary>One of 26 messages, told apart by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -700,6 +748,7 @@ namespace IrisSession.Protocol
                 case ClockPing.TagName: return ClockPing.Read(reader);
                 case GetSnapshot.TagName: return GetSnapshot.Read(reader);
                 case Sample.TagName: return Sample.Read(reader);
+                case Samples.TagName: return Samples.Read(reader);
                 case Acquire.TagName: return Acquire.Read(reader);
                 case Release.TagName: return Release.Read(reader);
                 case Consent.TagName: return Consent.Read(reader);
@@ -715,12 +764,16 @@ namespace IrisSession.Protocol
                 case ClearEStop.TagName: return ClearEStop.Read(reader);
                 case Control.TagName: return Control.Read(reader);
                 case Marker.TagName: return Marker.Read(reader);
+                case Pair.TagName: return Pair.Read(reader);
+                case RemoveParticipant.TagName: return RemoveParticipant.Read(reader);
+                case GetStatus.TagName: return GetStatus.Read(reader);
+                case ClientReport.TagName: return ClientReport.Read(reader);
             }
             throw new WireException("unknown type " + tag);
         }
     }
 
-    /// <summary>One of 8 messages, told apart by the field "type".</summary>
+    /// <summary>One of 11 messages, told apart by the field "type".</summary>
     public abstract class ServerMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -738,12 +791,15 @@ namespace IrisSession.Protocol
                 case Feedback.TagName: return Feedback.Read(reader);
                 case Event.TagName: return Event.Read(reader);
                 case Snapshot.TagName: return Snapshot.Read(reader);
+                case Paired.TagName: return Paired.Read(reader);
+                case StatusReport.TagName: return StatusReport.Read(reader);
+                case DeliveryBudget.TagName: return DeliveryBudget.Read(reader);
             }
             throw new WireException("unknown type " + tag);
         }
     }
 
-    /// <summary>One of 19 messages, told apart by the field "event".</summary>
+    /// <summary>One of 20 messages, told apart by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
         public abstract string Tag { get; }
@@ -772,6 +828,7 @@ namespace IrisSession.Protocol
                 case SamplesRejected.TagName: return SamplesRejected.Read(reader);
                 case Gap.TagName: return Gap.Read(reader);
                 case Notice.TagName: return Notice.Read(reader);
+                case Audited.TagName: return Audited.Read(reader);
             }
             throw new WireException("unknown event " + tag);
         }
@@ -1249,6 +1306,282 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Median and 99th percentile [ms] over the last seconds; null where nothing was measured.
+    /// </summary>
+    public sealed class Quantiles : WireValue
+    {
+        public double P50 = 0.0;
+        public double P99 = 0.0;
+
+        public static Quantiles Read(WireReader reader)
+        {
+            Quantiles value = new Quantiles();
+            int n = reader.ReadArrayHeader();
+            if (n < 2) throw new WireException("Quantiles of " + n + " elements, expected 2");
+            value.P50 = reader.ReadDouble();
+            value.P99 = reader.ReadDouble();
+            for (int i = 2; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(2);
+            writer.Write(P50);
+            writer.Write(P99);
+        }
+    }
+
+    /// <summary>
+    /// One participant, as the session sees it. Times in *_ns are durations until now, -1 for never.
+    ///
+    /// capture_to_receive: device to front. state_age: end of tick to application, as its client reports it.
+    /// alignment_void_ns: since the tracking frame jumped and voided the alignment, -1 for not so.
+    /// lost: why the front lost its connection (silent, closed, slow, ...), empty while connected.
+    /// rejected: samples by reason, drops: messages thrown away, both since it joined. reported: its client reports.
+    /// </summary>
+    public sealed class ParticipantReport : WireValue
+    {
+        public string Id = "";
+        public string Name = "";
+        public string Role = "";
+        public bool Connected = false;
+        public string Address = "";
+        public string Software = "";
+        public bool Worn = true;
+        public long HeardNs = -1;
+        public string Alignment = "none";
+        public long AlignmentAgeNs = -1;
+        public long AlignmentVoidNs = -1;
+        public double AlignmentErrorM = 0.0;
+        public long TrackingEpoch = 0;
+        public string[] Holds = new string[0];
+        public string[] WaitsFor = new string[0];
+        public double SamplesPerS = 0.0;
+        public Quantiles CaptureToReceive = null;
+        public Quantiles StateAge = null;
+        public double MissedShare = 0.0;
+        public double RttMs = 0.0;
+        public double BytesPerS = 0.0;
+        public string BudgetClass = "";
+        public Dictionary<string, long> Rejected = new Dictionary<string, long>();
+        public long Drops = 0;
+        public bool Reported = false;
+        public string Lost = "";
+
+        public static ParticipantReport Read(WireReader reader)
+        {
+            ParticipantReport value = new ParticipantReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "id": value.Id = reader.ReadString(); seen |= 1u; break;
+                    case "name": value.Name = reader.ReadString(); seen |= 2u; break;
+                    case "role": value.Role = reader.ReadString(); seen |= 4u; break;
+                    case "connected": value.Connected = reader.ReadBool(); seen |= 8u; break;
+                    case "address": value.Address = reader.ReadString(); break;
+                    case "software": value.Software = reader.ReadString(); break;
+                    case "worn": value.Worn = reader.ReadBool(); break;
+                    case "heard_ns": value.HeardNs = reader.ReadLong(); break;
+                    case "alignment": value.Alignment = reader.ReadString(); break;
+                    case "alignment_age_ns": value.AlignmentAgeNs = reader.ReadLong(); break;
+                    case "alignment_void_ns": value.AlignmentVoidNs = reader.ReadLong(); break;
+                    case "alignment_error_m": value.AlignmentErrorM = reader.ReadDouble(); break;
+                    case "tracking_epoch": value.TrackingEpoch = reader.ReadLong(); break;
+                    case "holds": value.Holds = reader.ReadStrings(); break;
+                    case "waits_for": value.WaitsFor = reader.ReadStrings(); break;
+                    case "samples_per_s": value.SamplesPerS = reader.ReadDouble(); break;
+                    case "capture_to_receive": value.CaptureToReceive = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
+                    case "state_age": value.StateAge = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
+                    case "missed_share": value.MissedShare = reader.ReadDouble(); break;
+                    case "rtt_ms": value.RttMs = reader.ReadDouble(); break;
+                    case "bytes_per_s": value.BytesPerS = reader.ReadDouble(); break;
+                    case "budget_class": value.BudgetClass = reader.ReadString(); break;
+                    case "rejected": value.Rejected = reader.ReadCounts(); break;
+                    case "drops": value.Drops = reader.ReadLong(); break;
+                    case "reported": value.Reported = reader.ReadBool(); break;
+                    case "lost": value.Lost = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 15u) != 15u) throw new WireException("missing field of ParticipantReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(26);
+            writer.Write("id");
+            writer.Write(Id);
+            writer.Write("name");
+            writer.Write(Name);
+            writer.Write("role");
+            writer.Write(Role);
+            writer.Write("connected");
+            writer.Write(Connected);
+            writer.Write("address");
+            writer.Write(Address);
+            writer.Write("software");
+            writer.Write(Software);
+            writer.Write("worn");
+            writer.Write(Worn);
+            writer.Write("heard_ns");
+            writer.Write(HeardNs);
+            writer.Write("alignment");
+            writer.Write(Alignment);
+            writer.Write("alignment_age_ns");
+            writer.Write(AlignmentAgeNs);
+            writer.Write("alignment_void_ns");
+            writer.Write(AlignmentVoidNs);
+            writer.Write("alignment_error_m");
+            writer.Write(AlignmentErrorM);
+            writer.Write("tracking_epoch");
+            writer.Write(TrackingEpoch);
+            writer.Write("holds");
+            writer.Write(Holds);
+            writer.Write("waits_for");
+            writer.Write(WaitsFor);
+            writer.Write("samples_per_s");
+            writer.Write(SamplesPerS);
+            writer.Write("capture_to_receive");
+            writer.Write(CaptureToReceive);
+            writer.Write("state_age");
+            writer.Write(StateAge);
+            writer.Write("missed_share");
+            writer.Write(MissedShare);
+            writer.Write("rtt_ms");
+            writer.Write(RttMs);
+            writer.Write("bytes_per_s");
+            writer.Write(BytesPerS);
+            writer.Write("budget_class");
+            writer.Write(BudgetClass);
+            writer.Write("rejected");
+            writer.Write(Rejected);
+            writer.Write("drops");
+            writer.Write(Drops);
+            writer.Write("reported");
+            writer.Write(Reported);
+            writer.Write("lost");
+            writer.Write(Lost);
+        }
+    }
+
+    /// <summary>
+    /// One robot: who has it, what it does, and why it holds.
+    /// </summary>
+    public sealed class RobotReport : WireValue
+    {
+        public string Name = "";
+        public string Mode = "";
+        public string Holder = "";
+        public string HolderName = "";
+        public string State = "";
+        public string HoldReason = "";
+        public Quantiles ReceiveToStep = null;
+        public string[] Queue = new string[0];
+
+        public static RobotReport Read(WireReader reader)
+        {
+            RobotReport value = new RobotReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "name": value.Name = reader.ReadString(); seen |= 1u; break;
+                    case "mode": value.Mode = reader.ReadString(); seen |= 2u; break;
+                    case "holder": value.Holder = reader.ReadString(); break;
+                    case "holder_name": value.HolderName = reader.ReadString(); break;
+                    case "state": value.State = reader.ReadString(); break;
+                    case "hold_reason": value.HoldReason = reader.ReadString(); break;
+                    case "receive_to_step": value.ReceiveToStep = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
+                    case "queue": value.Queue = reader.ReadStrings(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of RobotReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(8);
+            writer.Write("name");
+            writer.Write(Name);
+            writer.Write("mode");
+            writer.Write(Mode);
+            writer.Write("holder");
+            writer.Write(Holder);
+            writer.Write("holder_name");
+            writer.Write(HolderName);
+            writer.Write("state");
+            writer.Write(State);
+            writer.Write("hold_reason");
+            writer.Write(HoldReason);
+            writer.Write("receive_to_step");
+            writer.Write(ReceiveToStep);
+            writer.Write("queue");
+            writer.Write(Queue);
+        }
+    }
+
+    /// <summary>
+    /// state: off (nothing is recorded), running, hangs (says nothing for 5 s), dead (being replaced) or
+    /// failed (the file cannot be written). disk_free_bytes 0: not known. text: what it said last, for people.
+    /// </summary>
+    public sealed class RecorderReport : WireValue
+    {
+        public string State = "off";
+        public string Path = "";
+        public long BytesWritten = 0;
+        public long DiskFreeBytes = 0;
+        public long LostRows = 0;
+        public long SpilledBytes = 0;
+        public string Text = "";
+
+        public static RecorderReport Read(WireReader reader)
+        {
+            RecorderReport value = new RecorderReport();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "state": value.State = reader.ReadString(); break;
+                    case "path": value.Path = reader.ReadString(); break;
+                    case "bytes_written": value.BytesWritten = reader.ReadLong(); break;
+                    case "disk_free_bytes": value.DiskFreeBytes = reader.ReadLong(); break;
+                    case "lost_rows": value.LostRows = reader.ReadLong(); break;
+                    case "spilled_bytes": value.SpilledBytes = reader.ReadLong(); break;
+                    case "text": value.Text = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(7);
+            writer.Write("state");
+            writer.Write(State);
+            writer.Write("path");
+            writer.Write(Path);
+            writer.Write("bytes_written");
+            writer.Write(BytesWritten);
+            writer.Write("disk_free_bytes");
+            writer.Write(DiskFreeBytes);
+            writer.Write("lost_rows");
+            writer.Write(LostRows);
+            writer.Write("spilled_bytes");
+            writer.Write(SpilledBytes);
+            writer.Write("text");
+            writer.Write(Text);
+        }
+    }
+
+    /// <summary>
     /// First message of a connection.
     ///
     /// secret: client-made 128-bit secret that stands for the key on plain loopback. resume_token: from the last
@@ -1555,6 +1888,43 @@ namespace IrisSession.Protocol
             writer.Write(Q);
             writer.Write("qd");
             writer.Write(Qd);
+        }
+    }
+
+    /// <summary>
+    /// Samples of several devices that were taken together, such as head and both controllers at a display frame.
+    ///
+    /// Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+    /// </summary>
+    public sealed class Samples : ClientMessage
+    {
+        public const string TagName = "samples";
+        public override string Tag { get { return TagName; } }
+        public Sample[] SamplesValue = new Sample[0];
+
+        public static Samples Read(WireReader reader)
+        {
+            Samples value = new Samples();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "samples": value.SamplesValue = reader.ReadArray(Protocol.Sample.Read); seen |= 1u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of Samples");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(2);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("samples");
+            writer.Write(SamplesValue);
         }
     }
 
@@ -2211,6 +2581,203 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+    ///
+    /// proof: shows that the sender knows a join code, without telling it (protocol.pairing). name: under which the
+    /// key is listed, for people.
+    /// </summary>
+    public sealed class Pair : ClientMessage
+    {
+        public const string TagName = "pair";
+        public override string Tag { get { return TagName; } }
+        public string Name = "";
+        public byte[] Proof = new byte[0];
+        public string Software = "";
+
+        public static Pair Read(WireReader reader)
+        {
+            Pair value = new Pair();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "name": value.Name = reader.ReadString(); seen |= 1u; break;
+                    case "proof": value.Proof = reader.ReadBytes(); seen |= 2u; break;
+                    case "software": value.Software = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of Pair");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("name");
+            writer.Write(Name);
+            writer.Write("proof");
+            writer.Write(Proof);
+            writer.Write("software");
+            writer.Write(Software);
+        }
+    }
+
+    /// <summary>
+    /// A director ends someone's participation. revoke: their key is taken off the allow-list too.
+    /// </summary>
+    public sealed class RemoveParticipant : ClientMessage
+    {
+        public const string TagName = "remove_participant";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string Participant = "";
+        public bool Revoke = false;
+        public string Reason = "";
+
+        public static RemoveParticipant Read(WireReader reader)
+        {
+            RemoveParticipant value = new RemoveParticipant();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); seen |= 1u; break;
+                    case "participant": value.Participant = reader.ReadString(); seen |= 2u; break;
+                    case "revoke": value.Revoke = reader.ReadBool(); break;
+                    case "reason": value.Reason = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of RemoveParticipant");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(5);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("revoke");
+            writer.Write(Revoke);
+            writer.Write("reason");
+            writer.Write(Reason);
+        }
+    }
+
+    /// <summary>
+    /// Asks for a StatusReport.
+    /// </summary>
+    public sealed class GetStatus : ClientMessage
+    {
+        public const string TagName = "get_status";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+
+        public static GetStatus Read(WireReader reader)
+        {
+            GetStatus value = new GetStatus();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(2);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+        }
+    }
+
+    /// <summary>
+    /// How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+    ///
+    /// Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
+    /// missed: frames that were sent (by state_seq) and not delivered. rtt_ms: lowest round trip of late.
+    /// media_bytes_per_s, media_age_ms: of the media channel. display_hz: frames drawn, 0 when nothing is.
+    /// </summary>
+    public sealed class ClientReport : ClientMessage
+    {
+        public const string TagName = "client_report";
+        public override string Tag { get { return TagName; } }
+        public double AgeMsP50 = 0.0;
+        public double AgeMsP99 = 0.0;
+        public long Delivered = 0;
+        public long Missed = 0;
+        public double RttMs = 0.0;
+        public double BytesPerS = 0.0;
+        public double MediaBytesPerS = 0.0;
+        public double MediaAgeMs = 0.0;
+        public double DisplayHz = 0.0;
+
+        public static ClientReport Read(WireReader reader)
+        {
+            ClientReport value = new ClientReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "age_ms_p50": value.AgeMsP50 = reader.ReadDouble(); seen |= 1u; break;
+                    case "age_ms_p99": value.AgeMsP99 = reader.ReadDouble(); seen |= 2u; break;
+                    case "delivered": value.Delivered = reader.ReadLong(); seen |= 4u; break;
+                    case "missed": value.Missed = reader.ReadLong(); break;
+                    case "rtt_ms": value.RttMs = reader.ReadDouble(); break;
+                    case "bytes_per_s": value.BytesPerS = reader.ReadDouble(); break;
+                    case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
+                    case "media_age_ms": value.MediaAgeMs = reader.ReadDouble(); break;
+                    case "display_hz": value.DisplayHz = reader.ReadDouble(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of ClientReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(10);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("age_ms_p50");
+            writer.Write(AgeMsP50);
+            writer.Write("age_ms_p99");
+            writer.Write(AgeMsP99);
+            writer.Write("delivered");
+            writer.Write(Delivered);
+            writer.Write("missed");
+            writer.Write(Missed);
+            writer.Write("rtt_ms");
+            writer.Write(RttMs);
+            writer.Write("bytes_per_s");
+            writer.Write(BytesPerS);
+            writer.Write("media_bytes_per_s");
+            writer.Write(MediaBytesPerS);
+            writer.Write("media_age_ms");
+            writer.Write(MediaAgeMs);
+            writer.Write("display_hz");
+            writer.Write(DisplayHz);
+        }
+    }
+
+    /// <summary>
     /// Answer to an accepted hello. resume_token is bound to the key and may be used once.
     /// </summary>
     public sealed class Welcome : ServerMessage
@@ -2346,6 +2913,9 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// A message that could not be taken, or what has become of the session. code: FaultCode.
+    ///
+    /// reason: with dropped and revoked, why the session let this connection go: replaced (another connection
+    /// resumed this participant: joining again would take it back), removed, revoked, expired, ...
     /// </summary>
     public sealed class ProtocolFault : ServerMessage
     {
@@ -2353,6 +2923,7 @@ namespace IrisSession.Protocol
         public override string Tag { get { return TagName; } }
         public string Code = "";
         public string Message = "";
+        public string Reason = "";
 
         public static ProtocolFault Read(WireReader reader)
         {
@@ -2364,6 +2935,7 @@ namespace IrisSession.Protocol
                 {
                     case "code": value.Code = reader.ReadString(); seen |= 1u; break;
                     case "message": value.Message = reader.ReadString(); seen |= 2u; break;
+                    case "reason": value.Reason = reader.ReadString(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2373,13 +2945,15 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(3);
+            writer.WriteMapHeader(4);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("code");
             writer.Write(Code);
             writer.Write("message");
             writer.Write(Message);
+            writer.Write("reason");
+            writer.Write(Reason);
         }
     }
 
@@ -2581,8 +3155,8 @@ namespace IrisSession.Protocol
     /// <summary>
     /// Everything a late joiner needs; events with event_seq at or below its own are to be discarded.
     ///
-    /// Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses x y z qw qx qy qz of bodies at
-    /// state_seq.
+    /// In the step of a reset tick and sim_time are still those before it. Bulk frame 1 (added by the front): float64
+    /// (n_bodies, 7) world poses x y z qw qx qy qz of bodies at state_seq.
     /// </summary>
     public sealed class Snapshot : ServerMessage
     {
@@ -2673,6 +3247,243 @@ namespace IrisSession.Protocol
             writer.Write(Episode);
             writer.Write("state_seq");
             writer.Write(StateSeq);
+        }
+    }
+
+    /// <summary>
+    /// The key is on the allow-list. Connect anew to say hello: this connection stays that of an unknown key.
+    ///
+    /// proof: shows that the session knows the join code too, so it is the one that gave it out.
+    /// roles: what this key may join as; empty: any role.
+    /// </summary>
+    public sealed class Paired : ServerMessage
+    {
+        public const string TagName = "paired";
+        public override string Tag { get { return TagName; } }
+        public byte[] Proof = new byte[0];
+        public string[] Roles = new string[0];
+
+        public static Paired Read(WireReader reader)
+        {
+            Paired value = new Paired();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "proof": value.Proof = reader.ReadBytes(); seen |= 1u; break;
+                    case "roles": value.Roles = reader.ReadStrings(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of Paired");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("proof");
+            writer.Write(Proof);
+            writer.Write("roles");
+            writer.Write(Roles);
+        }
+    }
+
+    /// <summary>
+    /// Answer to GetStatus. Shares are of the last ten seconds unless they say total.
+    ///
+    /// late_causes: late ticks by where the time went (LateCause), and skipped for those given up after a long gap.
+    /// lateness: of ticks, after their deadline. step_to_publish: end of tick to the state socket.
+    /// drops: by reason, everything that was thrown away anywhere. restarts: of front and recorder.
+    /// authority_silent_ns: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
+    /// is as old. -1: it has not spoken yet. cpu_share: of one processor, by the authority's process; load: of the
+    /// machine, over a minute.
+    /// </summary>
+    public sealed class StatusReport : ServerMessage
+    {
+        public const string TagName = "status_report";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string SessionId = "";
+        public string SessionName = "";
+        public long SessionTime = 0;
+        public long Tick = 0;
+        public long TickPeriodNs = 0;
+        public bool Paused = false;
+        public bool Estop = false;
+        public bool Stalled = false;
+        public string Scheduling = "";
+        public double LateShare = 0.0;
+        public double LateShareTotal = 0.0;
+        public Quantiles Lateness = null;
+        public Dictionary<string, long> LateCauses = new Dictionary<string, long>();
+        public Quantiles StepToPublish = null;
+        public double CpuShare = 0.0;
+        public double Load = 0.0;
+        public long Cpus = 0;
+        public long MemoryBytes = 0;
+        public ParticipantReport[] Participants = new ParticipantReport[0];
+        public RobotReport[] Robots = new RobotReport[0];
+        public RecorderReport Recorder = null;
+        public Dictionary<string, long> Drops = new Dictionary<string, long>();
+        public Dictionary<string, long> Restarts = new Dictionary<string, long>();
+        public long Connections = 0;
+        public double EntriesPerS = 0.0;
+        public string[] Warnings = new string[0];
+        public long AuthoritySilentNs = -1;
+
+        public static StatusReport Read(WireReader reader)
+        {
+            StatusReport value = new StatusReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); seen |= 1u; break;
+                    case "session_id": value.SessionId = reader.ReadString(); seen |= 2u; break;
+                    case "session_name": value.SessionName = reader.ReadString(); seen |= 4u; break;
+                    case "session_time": value.SessionTime = reader.ReadLong(); seen |= 8u; break;
+                    case "tick": value.Tick = reader.ReadLong(); break;
+                    case "tick_period_ns": value.TickPeriodNs = reader.ReadLong(); break;
+                    case "paused": value.Paused = reader.ReadBool(); break;
+                    case "estop": value.Estop = reader.ReadBool(); break;
+                    case "stalled": value.Stalled = reader.ReadBool(); break;
+                    case "scheduling": value.Scheduling = reader.ReadString(); break;
+                    case "late_share": value.LateShare = reader.ReadDouble(); break;
+                    case "late_share_total": value.LateShareTotal = reader.ReadDouble(); break;
+                    case "lateness": value.Lateness = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
+                    case "late_causes": value.LateCauses = reader.ReadCounts(); break;
+                    case "step_to_publish": value.StepToPublish = reader.TryReadNil() ? null : Quantiles.Read(reader); break;
+                    case "cpu_share": value.CpuShare = reader.ReadDouble(); break;
+                    case "load": value.Load = reader.ReadDouble(); break;
+                    case "cpus": value.Cpus = reader.ReadLong(); break;
+                    case "memory_bytes": value.MemoryBytes = reader.ReadLong(); break;
+                    case "participants": value.Participants = reader.ReadArray(Protocol.ParticipantReport.Read); break;
+                    case "robots": value.Robots = reader.ReadArray(Protocol.RobotReport.Read); break;
+                    case "recorder": value.Recorder = reader.TryReadNil() ? null : RecorderReport.Read(reader); break;
+                    case "drops": value.Drops = reader.ReadCounts(); break;
+                    case "restarts": value.Restarts = reader.ReadCounts(); break;
+                    case "connections": value.Connections = reader.ReadLong(); break;
+                    case "entries_per_s": value.EntriesPerS = reader.ReadDouble(); break;
+                    case "warnings": value.Warnings = reader.ReadStrings(); break;
+                    case "authority_silent_ns": value.AuthoritySilentNs = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 15u) != 15u) throw new WireException("missing field of StatusReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(29);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("session_id");
+            writer.Write(SessionId);
+            writer.Write("session_name");
+            writer.Write(SessionName);
+            writer.Write("session_time");
+            writer.Write(SessionTime);
+            writer.Write("tick");
+            writer.Write(Tick);
+            writer.Write("tick_period_ns");
+            writer.Write(TickPeriodNs);
+            writer.Write("paused");
+            writer.Write(Paused);
+            writer.Write("estop");
+            writer.Write(Estop);
+            writer.Write("stalled");
+            writer.Write(Stalled);
+            writer.Write("scheduling");
+            writer.Write(Scheduling);
+            writer.Write("late_share");
+            writer.Write(LateShare);
+            writer.Write("late_share_total");
+            writer.Write(LateShareTotal);
+            writer.Write("lateness");
+            writer.Write(Lateness);
+            writer.Write("late_causes");
+            writer.Write(LateCauses);
+            writer.Write("step_to_publish");
+            writer.Write(StepToPublish);
+            writer.Write("cpu_share");
+            writer.Write(CpuShare);
+            writer.Write("load");
+            writer.Write(Load);
+            writer.Write("cpus");
+            writer.Write(Cpus);
+            writer.Write("memory_bytes");
+            writer.Write(MemoryBytes);
+            writer.Write("participants");
+            writer.Write(Participants);
+            writer.Write("robots");
+            writer.Write(Robots);
+            writer.Write("recorder");
+            writer.Write(Recorder);
+            writer.Write("drops");
+            writer.Write(Drops);
+            writer.Write("restarts");
+            writer.Write(Restarts);
+            writer.Write("connections");
+            writer.Write(Connections);
+            writer.Write("entries_per_s");
+            writer.Write(EntriesPerS);
+            writer.Write("warnings");
+            writer.Write(Warnings);
+            writer.Write("authority_silent_ns");
+            writer.Write(AuthoritySilentNs);
+        }
+    }
+
+    /// <summary>
+    /// What media this client gets from now on: subscribe to topics of budget_class (BudgetClass) only.
+    ///
+    /// State and control are never cut. mbit_per_s: bound of all media together, 0 for none stated.
+    /// </summary>
+    public sealed class DeliveryBudget : ServerMessage
+    {
+        public const string TagName = "delivery_budget";
+        public override string Tag { get { return TagName; } }
+        public string BudgetClass = "";
+        public double MbitPerS = 0.0;
+        public string Reason = "";
+
+        public static DeliveryBudget Read(WireReader reader)
+        {
+            DeliveryBudget value = new DeliveryBudget();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "budget_class": value.BudgetClass = reader.ReadString(); seen |= 1u; break;
+                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
+                    case "reason": value.Reason = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of DeliveryBudget");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("budget_class");
+            writer.Write(BudgetClass);
+            writer.Write("mbit_per_s");
+            writer.Write(MbitPerS);
+            writer.Write("reason");
+            writer.Write(Reason);
         }
     }
 
@@ -3393,7 +4204,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// kind: stalled (no step for duration_ns) or recording (rows lost; verification restarts).
+    /// kind: stalled (no step for so long), recording (rows are lost), resumed (from an earlier recording).
     /// </summary>
     public sealed class Gap : EventKind
     {
@@ -3401,6 +4212,7 @@ namespace IrisSession.Protocol
         public override string Tag { get { return TagName; } }
         public string Kind = "";
         public long DurationNs = 0;
+        public long Rows = 0;
 
         public static Gap Read(WireReader reader)
         {
@@ -3412,6 +4224,7 @@ namespace IrisSession.Protocol
                 {
                     case "kind": value.Kind = reader.ReadString(); seen |= 1u; break;
                     case "duration_ns": value.DurationNs = reader.ReadLong(); seen |= 2u; break;
+                    case "rows": value.Rows = reader.ReadLong(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3421,18 +4234,21 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(3);
+            writer.WriteMapHeader(4);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("kind");
             writer.Write(Kind);
             writer.Write("duration_ns");
             writer.Write(DurationNs);
+            writer.Write("rows");
+            writer.Write(Rows);
         }
     }
 
     /// <summary>
-    /// Something an operator should read. level: info, warning, error.
+    /// Something an operator should read. level: info, warning, error. participant: whom it concerns. reason: the
+    /// DenialReason of a refusal that answers no request (of an alignment).
     /// </summary>
     public sealed class Notice : EventKind
     {
@@ -3440,6 +4256,8 @@ namespace IrisSession.Protocol
         public override string Tag { get { return TagName; } }
         public string Level = "";
         public string Text = "";
+        public string Participant = "";
+        public string Reason = "";
 
         public static Notice Read(WireReader reader)
         {
@@ -3451,6 +4269,8 @@ namespace IrisSession.Protocol
                 {
                     case "level": value.Level = reader.ReadString(); seen |= 1u; break;
                     case "text": value.Text = reader.ReadString(); seen |= 2u; break;
+                    case "participant": value.Participant = reader.ReadString(); break;
+                    case "reason": value.Reason = reader.ReadString(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3460,13 +4280,74 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(3);
+            writer.WriteMapHeader(5);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("level");
             writer.Write(Level);
             writer.Write("text");
             writer.Write(Text);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("reason");
+            writer.Write(Reason);
+        }
+    }
+
+    /// <summary>
+    /// Something that concerns security. kind: AuditKind. subject: fingerprint of a key, or a participant id.
+    ///
+    /// Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their count.
+    /// </summary>
+    public sealed class Audited : EventKind
+    {
+        public const string TagName = "audited";
+        public override string Tag { get { return TagName; } }
+        public string Kind = "";
+        public string Subject = "";
+        public string Name = "";
+        public string Address = "";
+        public string Detail = "";
+        public long Count = 1;
+
+        public static Audited Read(WireReader reader)
+        {
+            Audited value = new Audited();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "kind": value.Kind = reader.ReadString(); seen |= 1u; break;
+                    case "subject": value.Subject = reader.ReadString(); break;
+                    case "name": value.Name = reader.ReadString(); break;
+                    case "address": value.Address = reader.ReadString(); break;
+                    case "detail": value.Detail = reader.ReadString(); break;
+                    case "count": value.Count = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of Audited");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(7);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("kind");
+            writer.Write(Kind);
+            writer.Write("subject");
+            writer.Write(Subject);
+            writer.Write("name");
+            writer.Write(Name);
+            writer.Write("address");
+            writer.Write(Address);
+            writer.Write("detail");
+            writer.Write(Detail);
+            writer.Write("count");
+            writer.Write(Count);
         }
     }
 
@@ -3718,6 +4599,52 @@ namespace IrisSession.Protocol
             writer.Write(Web);
             writer.Write("key_fingerprint");
             writer.Write(KeyFingerprint);
+        }
+    }
+
+    /// <summary>
+    /// What a session says of itself on a TCP connection to control port - 1, before it closes it. It reads nothing.
+    ///
+    /// server_key: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
+    /// pairing: a join code can be used now. participants: how many are here.
+    /// </summary>
+    public sealed class Introduction : WireValue
+    {
+        public Beacon Beacon = new Beacon();
+        public string ServerKey = "";
+        public bool Pairing = false;
+        public long Participants = 0;
+
+        public static Introduction Read(WireReader reader)
+        {
+            Introduction value = new Introduction();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "beacon": value.Beacon = Beacon.Read(reader); seen |= 1u; break;
+                    case "server_key": value.ServerKey = reader.ReadString(); break;
+                    case "pairing": value.Pairing = reader.ReadBool(); break;
+                    case "participants": value.Participants = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of Introduction");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("beacon");
+            writer.Write(Beacon);
+            writer.Write("server_key");
+            writer.Write(ServerKey);
+            writer.Write("pairing");
+            writer.Write(Pairing);
+            writer.Write("participants");
+            writer.Write(Participants);
         }
     }
 }

@@ -6,10 +6,11 @@
 export const PROTOCOL_VERSION = 1;
 export const TOPIC_RIGID = "rigid";
 export const TOPIC_PRESENCE = "presence";
-export const RIGID_FORMAT = 1;
+export const RIGID_FORMAT = 2;
 /** Edge of the position lattice [m]. */
-export const RIGID_LATTICE_M = 0.0001068115234375;
-export const RIGID_ROTATION_LEVELS = 6501;
+export const RIGID_LATTICE_M = 6.103515625e-05;
+export const RIGID_POSITION_BITS = 18;
+export const RIGID_ROTATION_CENTRE = 8191;
 
 /** What a participant may do. Reserved for later message types: `camera`, `source`. */
 export const Role = {
@@ -116,6 +117,7 @@ export const HoldReason = {
   DISCONNECTED: "disconnected",
   GAP: "gap",
   SCENE_CHANGED: "scene_changed",
+  INTERVENTION: "intervention",
   REARM: "rearm",
 } as const;
 export type HoldReason = (typeof HoldReason)[keyof typeof HoldReason] | (string & {});
@@ -142,6 +144,7 @@ export const RejectReason = {
   QUOTA: "quota",
   DEVICE: "device",
   LEADER_APART: "leader_apart",
+  KIND_MISMATCH: "kind",
 } as const;
 export type RejectReason = (typeof RejectReason)[keyof typeof RejectReason] | (string & {});
 
@@ -182,6 +185,8 @@ export const RefusalCode = {
   GATEWAY_ONLY: "gateway_only",
   RESUME_TOKEN: "resume_token",
   FULL: "full",
+  UNPAIRED: "unpaired",
+  CODE: "code",
 } as const;
 export type RefusalCode = (typeof RefusalCode)[keyof typeof RefusalCode] | (string & {});
 
@@ -196,6 +201,7 @@ export const FaultCode = {
   STALLED: "stalled",
   RECOVERED: "recovered",
   SESSION_ENDED: "session_ended",
+  REVOKED: "revoked",
 } as const;
 export type FaultCode = (typeof FaultCode)[keyof typeof FaultCode] | (string & {});
 
@@ -216,6 +222,42 @@ export const ControlAction = {
   RESET: "reset",
 } as const;
 export type ControlAction = (typeof ControlAction)[keyof typeof ControlAction] | (string & {});
+
+/** What an `Audited` event tells. */
+export const AuditKind = {
+  PAIRED: "paired",
+  CODE_REFUSED: "code_refused",
+  CODE_EXHAUSTED: "code_exhausted",
+  KEY_REFUSED: "key_refused",
+  KEY_REVOKED: "key_revoked",
+  ROLE_REFUSED: "role_refused",
+  REMOVED: "removed",
+  GATEWAY_REFUSED: "gateway_refused",
+  TOKEN_REFUSED: "token_refused",
+  FLOOD: "flood",
+} as const;
+export type AuditKind = (typeof AuditKind)[keyof typeof AuditKind] | (string & {});
+
+/** How much media a client gets, from everything to nothing. State and control come whatever the class. */
+export const BudgetClass = {
+  FULL: "full",
+  HALF: "half",
+  QUARTER: "quarter",
+  NONE: "none",
+} as const;
+export type BudgetClass = (typeof BudgetClass)[keyof typeof BudgetClass] | (string & {});
+
+/** Where the time of a late tick went. */
+export const LateCause = {
+  SCHEDULER: "scheduler",
+  PHYSICS: "physics",
+  CONTROL: "control",
+  AUTHORITY: "authority",
+  OUTPUT: "output",
+  SUPERVISION: "supervision",
+  OWNER: "owner",
+} as const;
+export type LateCause = (typeof LateCause)[keyof typeof LateCause] | (string & {});
 
 /** A rigid transform `T_a_b`: position `p` [m] of frame b in a, rotation `q` `[w, x, y, z]` from b to a. */
 export type Pose = [
@@ -332,6 +374,75 @@ export type BodyInfo = [
   object?: boolean,
 ];
 
+/** Median and 99th percentile [ms] over the last seconds; null where nothing was measured. */
+export type Quantiles = [
+  p50: number,
+  p99: number,
+];
+
+/**
+ * One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
+ *
+ * `capture_to_receive`: device to front. `state_age`: end of tick to application, as its client reports it.
+ * `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
+ * `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
+ * `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
+ */
+export interface ParticipantReport {
+  id: string;
+  name: string;
+  role: Role;
+  connected: boolean;
+  address?: string;
+  software?: string;
+  worn?: boolean;
+  heard_ns?: number;
+  alignment?: AlignmentKind;
+  alignment_age_ns?: number;
+  alignment_void_ns?: number;
+  alignment_error_m?: number;
+  tracking_epoch?: number;
+  holds?: string[];
+  waits_for?: string[];
+  samples_per_s?: number;
+  capture_to_receive?: Quantiles | null;
+  state_age?: Quantiles | null;
+  missed_share?: number;
+  rtt_ms?: number;
+  bytes_per_s?: number;
+  budget_class?: BudgetClass;
+  rejected?: Record<string, number>;
+  drops?: number;
+  reported?: boolean;
+  lost?: string;
+}
+
+/** One robot: who has it, what it does, and why it holds. */
+export interface RobotReport {
+  name: string;
+  mode: LeaseMode;
+  holder?: string;
+  holder_name?: string;
+  state?: CommandKind;
+  hold_reason?: HoldReason;
+  receive_to_step?: Quantiles | null;
+  queue?: string[];
+}
+
+/**
+ * `state`: `off` (nothing is recorded), `running`, `hangs` (says nothing for 5 s), `dead` (being replaced) or
+ * `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: what it said last, for people.
+ */
+export interface RecorderReport {
+  state?: string;
+  path?: string;
+  bytes_written?: number;
+  disk_free_bytes?: number;
+  lost_rows?: number;
+  spilled_bytes?: number;
+  text?: string;
+}
+
 /**
  * First message of a connection.
  *
@@ -403,6 +514,16 @@ export interface Sample {
   hand_joints?: number[];
   q?: number[];
   qd?: number[];
+}
+
+/**
+ * Samples of several devices that were taken together, such as head and both controllers at a display frame.
+ *
+ * Each counts by itself, as if it had come alone; together they cost one message, one packet and one wake-up.
+ */
+export interface Samples {
+  type: "samples";
+  samples: Sample[];
 }
 
 /** Asks for leases, all or none. No names: the assignment policy chooses one robot. `wait`: queue when held. */
@@ -536,6 +657,54 @@ export interface Marker {
   text: string;
 }
 
+/**
+ * Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+ *
+ * `proof`: shows that the sender knows a join code, without telling it (`protocol.pairing`). `name`: under which the
+ * key is listed, for people.
+ */
+export interface Pair {
+  type: "pair";
+  name: string;
+  proof: Uint8Array;
+  software?: string;
+}
+
+/** A director ends someone's participation. `revoke`: their key is taken off the allow-list too. */
+export interface RemoveParticipant {
+  type: "remove_participant";
+  request_id: number;
+  participant: string;
+  revoke?: boolean;
+  reason?: string;
+}
+
+/** Asks for a `StatusReport`. */
+export interface GetStatus {
+  type: "get_status";
+  request_id?: number;
+}
+
+/**
+ * How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+ *
+ * Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
+ * `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
+ * `media_bytes_per_s`, `media_age_ms`: of the media channel. `display_hz`: frames drawn, 0 when nothing is.
+ */
+export interface ClientReport {
+  type: "client_report";
+  age_ms_p50: number;
+  age_ms_p99: number;
+  delivered: number;
+  missed?: number;
+  rtt_ms?: number;
+  bytes_per_s?: number;
+  media_bytes_per_s?: number;
+  media_age_ms?: number;
+  display_hz?: number;
+}
+
 /** Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once. */
 export interface Welcome {
   type: "welcome";
@@ -564,11 +733,17 @@ export interface Refused {
   supported_versions?: number[];
 }
 
-/** A message that could not be taken, or what has become of the session. `code`: `FaultCode`. */
+/**
+ * A message that could not be taken, or what has become of the session. `code`: `FaultCode`.
+ *
+ * `reason`: with `dropped` and `revoked`, why the session let this connection go: `replaced` (another connection
+ * resumed this participant: joining again would take it back), `removed`, `revoked`, `expired`, ...
+ */
 export interface ProtocolFault {
   type: "protocol_fault";
   code: FaultCode;
   message: string;
+  reason?: string;
 }
 
 /** `t0_ns` echoed; `t1_ns`, `t2_ns`: session time of receipt and of sending. */
@@ -616,8 +791,8 @@ export interface Event {
 /**
  * Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
  *
- * Bulk frame 1 (added by the front): float64 (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at
- * `state_seq`.
+ * In the step of a reset `tick` and `sim_time` are still those before it. Bulk frame 1 (added by the front): float64
+ * (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
  */
 export interface Snapshot {
   type: "snapshot";
@@ -637,6 +812,72 @@ export interface Snapshot {
   estop?: boolean;
   episode?: EpisodeChanged | null;
   state_seq?: number;
+}
+
+/**
+ * The key is on the allow-list. Connect anew to say `hello`: this connection stays that of an unknown key.
+ *
+ * `proof`: shows that the session knows the join code too, so it is the one that gave it out.
+ * `roles`: what this key may join as; empty: any role.
+ */
+export interface Paired {
+  type: "paired";
+  proof: Uint8Array;
+  roles?: Role[];
+}
+
+/**
+ * Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
+ *
+ * `late_causes`: late ticks by where the time went (`LateCause`), and `skipped` for those given up after a long gap.
+ * `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket.
+ * `drops`: by reason, everything that was thrown away anywhere. `restarts`: of front and recorder.
+ * `authority_silent_ns`: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
+ * is as old. -1: it has not spoken yet. `cpu_share`: of one processor, by the authority's process; `load`: of the
+ * machine, over a minute.
+ */
+export interface StatusReport {
+  type: "status_report";
+  request_id: number;
+  session_id: string;
+  session_name: string;
+  session_time: number;
+  tick?: number;
+  tick_period_ns?: number;
+  paused?: boolean;
+  estop?: boolean;
+  stalled?: boolean;
+  scheduling?: string;
+  late_share?: number;
+  late_share_total?: number;
+  lateness?: Quantiles | null;
+  late_causes?: Record<string, number>;
+  step_to_publish?: Quantiles | null;
+  cpu_share?: number;
+  load?: number;
+  cpus?: number;
+  memory_bytes?: number;
+  participants?: ParticipantReport[];
+  robots?: RobotReport[];
+  recorder?: RecorderReport | null;
+  drops?: Record<string, number>;
+  restarts?: Record<string, number>;
+  connections?: number;
+  entries_per_s?: number;
+  warnings?: string[];
+  authority_silent_ns?: number;
+}
+
+/**
+ * What media this client gets from now on: subscribe to topics of `budget_class` (`BudgetClass`) only.
+ *
+ * State and control are never cut. `mbit_per_s`: bound of all media together, 0 for none stated.
+ */
+export interface DeliveryBudget {
+  type: "delivery_budget";
+  budget_class: BudgetClass;
+  mbit_per_s?: number;
+  reason?: string;
 }
 
 export interface ParticipantJoined {
@@ -769,18 +1010,39 @@ export interface SamplesRejected {
   count: number;
 }
 
-/** `kind`: `stalled` (no step for `duration_ns`) or `recording` (rows lost; verification restarts). */
+/** `kind`: `stalled` (no step for so long), `recording` (`rows` are lost), `resumed` (from an earlier recording). */
 export interface Gap {
   event: "gap";
   kind: string;
   duration_ns: number;
+  rows?: number;
 }
 
-/** Something an operator should read. `level`: info, warning, error. */
+/**
+ * Something an operator should read. `level`: info, warning, error. `participant`: whom it concerns. `reason`: the
+ * `DenialReason` of a refusal that answers no request (of an alignment).
+ */
 export interface Notice {
   event: "notice";
   level: string;
   text: string;
+  participant?: string;
+  reason?: string;
+}
+
+/**
+ * Something that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
+ *
+ * Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their `count`.
+ */
+export interface Audited {
+  event: "audited";
+  kind: AuditKind;
+  subject?: string;
+  name?: string;
+  address?: string;
+  detail?: string;
+  count?: number;
 }
 
 /**
@@ -851,6 +1113,19 @@ export interface Beacon {
   key_fingerprint?: string;
 }
 
+/**
+ * What a session says of itself on a TCP connection to control port - 1, before it closes it. It reads nothing.
+ *
+ * `server_key`: the CURVE public key, Z85 (40 characters); empty: the session is not encrypted (loopback only).
+ * `pairing`: a join code can be used now. `participants`: how many are here.
+ */
+export interface Introduction {
+  beacon: Beacon;
+  server_key?: string;
+  pairing?: boolean;
+  participants?: number;
+}
+
 export type ClientMessage =
   | Hello
   | Bye
@@ -858,6 +1133,7 @@ export type ClientMessage =
   | ClockPing
   | GetSnapshot
   | Sample
+  | Samples
   | Acquire
   | Release
   | Consent
@@ -872,7 +1148,11 @@ export type ClientMessage =
   | EStop
   | ClearEStop
   | Control
-  | Marker;
+  | Marker
+  | Pair
+  | RemoveParticipant
+  | GetStatus
+  | ClientReport;
 
 export type ServerMessage =
   | Welcome
@@ -882,7 +1162,10 @@ export type ServerMessage =
   | Reply
   | Feedback
   | Event
-  | Snapshot;
+  | Snapshot
+  | Paired
+  | StatusReport
+  | DeliveryBudget;
 
 export type EventKind =
   | ParticipantJoined
@@ -903,7 +1186,8 @@ export type EventKind =
   | MarkerAdded
   | SamplesRejected
   | Gap
-  | Notice;
+  | Notice
+  | Audited;
 
 /** Values of the fields that a message or event may leave out, by its tag. */
 export const DEFAULTS = {
@@ -913,6 +1197,7 @@ export const DEFAULTS = {
   clock_ping: {},
   get_snapshot: { request_id: 0 },
   sample: { targets: [], tracked: true, worn: true, clutch: false, gripper: null, buttons: 0, pose: null, twist: null, hand_joints: [], q: [], qd: [] },
+  samples: {},
   acquire: { robots: [], objects: [], wait: false, weight: 1.0 },
   release: { request_id: 0, targets: [] },
   consent: {},
@@ -928,14 +1213,21 @@ export const DEFAULTS = {
   clear_estop: {},
   control: { ticks: 1 },
   marker: {},
+  pair: { software: "" },
+  remove_participant: { revoke: false, reason: "" },
+  get_status: { request_id: 0 },
+  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0 },
   welcome: { key_fingerprint: "" },
   refused: { advice: "", supported_versions: [1] },
-  protocol_fault: {},
+  protocol_fault: { reason: "" },
   clock_pong: {},
   reply: { denial: null, leases: [] },
   feedback: { hold_reason: "", contact_n: 0.0, limits: [], rejected: {} },
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
+  paired: { roles: [] },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1 },
+  delivery_budget: { mbit_per_s: 0.0, reason: "" },
   participant_joined: { resumed: false },
   participant_changed: {},
   participant_left: { grace: false },
@@ -953,6 +1245,7 @@ export const DEFAULTS = {
   handover: {},
   marker_added: {},
   samples_rejected: {},
-  gap: {},
-  notice: {},
+  gap: { rows: 0 },
+  notice: { participant: "", reason: "" },
+  audited: { subject: "", name: "", address: "", detail: "", count: 1 },
 } as const;

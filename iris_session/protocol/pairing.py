@@ -1,0 +1,75 @@
+"""Join codes: how a client and a session prove to each other that they know the same code, without sending it.
+
+A join code is eight characters (40 bits), valid for minutes and for one client. Both sides stretch it once:
+
+    stretched    = PBKDF2-HMAC-SHA256(code, salt = "iris-pair-1" || server_public, 200,000 iterations, 32 bytes)
+    client_proof = HMAC-SHA256(stretched, "client" || server_public || client_public)
+    server_proof = HMAC-SHA256(stretched, "server" || server_public || client_public)
+
+Keys are the raw 32 bytes of the CURVE keys in use. So a code guards against somebody in the middle: whoever relays
+with keys of their own gets a proof that is good for nothing, and to search 2**40 codes with 200,000 iterations each
+takes far longer than a code lives. PBKDF2 because every browser and .NET has it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from typing import Final
+
+#: Crockford's base 32: no I, L, O, U. Any of them, and lower case, is read as what it looks like.
+ALPHABET: Final = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+CODE_CHARACTERS: Final = 8
+KEY_BYTES: Final = 32
+ITERATIONS: Final = 200_000
+_SALT: Final = b"iris-pair-1"
+_LOOKS_LIKE: Final = str.maketrans("OILU", "011V")
+
+
+def code_from_bytes(entropy: bytes) -> str:
+    """Join code `XXXX-XXXX` from five random bytes."""
+    if len(entropy) != 5:
+        raise ValueError(f"a join code is made from 5 bytes, not {len(entropy)}")
+    number = int.from_bytes(entropy, "big")
+    text = "".join(ALPHABET[(number >> shift) & 31] for shift in range(35, -1, -5))
+    return f"{text[:4]}-{text[4:]}"
+
+
+def normal_code(text: str) -> str:
+    """`text` as typed by a person, in the one form that is stretched. Raises `ValueError` for what is no join code."""
+    code = text.upper().translate(_LOOKS_LIKE).replace("-", "").replace(" ", "")
+    if len(code) != CODE_CHARACTERS or any(character not in ALPHABET for character in code):
+        raise ValueError(f"{text!r} is not a join code: eight letters and digits, like 7KQ2-M4XD")
+    return code
+
+
+def stretch(code: str, server_public: bytes) -> bytes:
+    """The secret that both sides derive from `code` (any spelling): takes about 0.1 s, on purpose."""
+    _check(server_public)
+    return hashlib.pbkdf2_hmac("sha256", normal_code(code).encode(), _SALT + server_public, ITERATIONS, 32)
+
+
+def client_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    """What the client sends in `Pair`."""
+    return _proof(stretched, b"client", server_public, client_public)
+
+
+def server_proof(stretched: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    """What the session answers in `Paired`."""
+    return _proof(stretched, b"server", server_public, client_public)
+
+
+def same(a: bytes, b: bytes) -> bool:
+    """Compares two proofs in constant time."""
+    return hmac.compare_digest(a, b)
+
+
+def _proof(stretched: bytes, side: bytes, server_public: bytes, client_public: bytes) -> bytes:
+    _check(server_public)
+    _check(client_public)
+    return hmac.digest(stretched, side + server_public + client_public, "sha256")
+
+
+def _check(key: bytes) -> None:
+    if len(key) != KEY_BYTES:
+        raise ValueError(f"a CURVE key has {KEY_BYTES} raw bytes, got {len(key)}: decode Z85 first")

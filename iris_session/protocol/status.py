@@ -1,0 +1,168 @@
+"""Messages about how the session does: reports of clients, the status that anyone may ask for, delivery budgets.
+
+None of them reaches the authority: the front answers them, so asking costs no step and is not journaled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import msgspec
+
+from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Text
+
+
+class GetStatus(Message, frozen=True, tag="get_status"):
+    """Asks for a `StatusReport`."""
+
+    request_id: Count = 0
+
+
+class ClientReport(Message, frozen=True, tag="client_report"):
+    """How state arrives at the application of a client, once a second: for status, doctor and delivery budgets.
+
+    Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
+    `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
+    `media_bytes_per_s`, `media_age_ms`: of the media channel. `display_hz`: frames drawn, 0 when nothing is.
+    """
+
+    age_ms_p50: float
+    age_ms_p99: float
+    delivered: Count
+    missed: Count = 0
+    rtt_ms: float = 0.0
+    bytes_per_s: float = 0.0
+    media_bytes_per_s: float = 0.0
+    media_age_ms: float = 0.0
+    display_hz: float = 0.0
+
+
+class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
+    """What media this client gets from now on: subscribe to topics of `budget_class` (`BudgetClass`) only.
+
+    State and control are never cut. `mbit_per_s`: bound of all media together, 0 for none stated.
+    """
+
+    budget_class: Name
+    mbit_per_s: float = 0.0
+    reason: Text = ""
+
+
+class Quantiles(msgspec.Struct, frozen=True, array_like=True):
+    """Median and 99th percentile [ms] over the last seconds; null where nothing was measured."""
+
+    p50: float
+    p99: float
+
+
+def quantiles(durations_ns: Iterable[int]) -> Quantiles | None:
+    """Of durations [ns]; `None` of none."""
+    ordered = sorted(durations_ns)
+    if not ordered:
+        return None
+    last = len(ordered) - 1
+    return Quantiles(ordered[last // 2] * 1e-6, ordered[-(-last * 99 // 100)] * 1e-6)
+
+
+class ParticipantReport(msgspec.Struct, frozen=True):
+    """One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
+
+    `capture_to_receive`: device to front. `state_age`: end of tick to application, as its client reports it.
+    `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
+    `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
+    `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
+    """
+
+    id: Name
+    name: Name
+    role: Name
+    connected: bool
+    address: Name = ""
+    software: Name = ""
+    worn: bool = True
+    heard_ns: Nanoseconds = -1
+    alignment: Name = "none"
+    alignment_age_ns: Nanoseconds = -1
+    alignment_void_ns: Nanoseconds = -1
+    alignment_error_m: float = 0.0
+    tracking_epoch: Count = 0
+    holds: tuple[Name, ...] = ()
+    waits_for: tuple[Name, ...] = ()
+    samples_per_s: float = 0.0
+    capture_to_receive: Quantiles | None = None
+    state_age: Quantiles | None = None
+    missed_share: float = 0.0
+    rtt_ms: float = 0.0
+    bytes_per_s: float = 0.0
+    budget_class: Name = ""
+    rejected: dict[str, int] = msgspec.field(default_factory=dict)
+    drops: Count = 0
+    reported: bool = False
+    lost: Name = ""
+
+
+class RobotReport(msgspec.Struct, frozen=True):
+    """One robot: who has it, what it does, and why it holds."""
+
+    name: Name
+    mode: Name
+    holder: Name = ""
+    holder_name: Name = ""
+    state: Name = ""
+    hold_reason: Name = ""
+    receive_to_step: Quantiles | None = None
+    queue: tuple[Name, ...] = ()
+
+
+class RecorderReport(msgspec.Struct, frozen=True):
+    """`state`: `off` (nothing is recorded), `running`, `hangs` (says nothing for 5 s), `dead` (being replaced) or
+    `failed` (the file cannot be written). `disk_free_bytes` 0: not known. `text`: what it said last, for people."""
+
+    state: Name = "off"
+    path: Text = ""
+    bytes_written: Count = 0
+    disk_free_bytes: Count = 0
+    lost_rows: Count = 0
+    spilled_bytes: Count = 0
+    text: Text = ""
+
+
+class StatusReport(Message, frozen=True, tag="status_report"):
+    """Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
+
+    `late_causes`: late ticks by where the time went (`LateCause`), and `skipped` for those given up after a long gap.
+    `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket.
+    `drops`: by reason, everything that was thrown away anywhere. `restarts`: of front and recorder.
+    `authority_silent_ns`: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
+    is as old. -1: it has not spoken yet. `cpu_share`: of one processor, by the authority's process; `load`: of the
+    machine, over a minute.
+    """
+
+    request_id: Count
+    session_id: Name
+    session_name: Name
+    session_time: Nanoseconds
+    tick: Count = 0
+    tick_period_ns: Nanoseconds = 0
+    paused: bool = False
+    estop: bool = False
+    stalled: bool = False
+    scheduling: Name = ""
+    late_share: float = 0.0
+    late_share_total: float = 0.0
+    lateness: Quantiles | None = None
+    late_causes: dict[str, int] = msgspec.field(default_factory=dict)
+    step_to_publish: Quantiles | None = None
+    cpu_share: float = 0.0
+    load: float = 0.0
+    cpus: Count = 0
+    memory_bytes: Count = 0
+    participants: tuple[ParticipantReport, ...] = ()
+    robots: tuple[RobotReport, ...] = ()
+    recorder: RecorderReport | None = None
+    drops: dict[str, int] = msgspec.field(default_factory=dict)
+    restarts: dict[str, int] = msgspec.field(default_factory=dict)
+    connections: Count = 0
+    entries_per_s: float = 0.0
+    warnings: tuple[Text, ...] = ()
+    authority_silent_ns: Nanoseconds = -1
