@@ -14,14 +14,12 @@ from iris_session.authority import engagement
 from iris_session.authority.context import Context
 from iris_session.authority.state import Participant
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
-from iris_session.protocol.common import Alignment, Denial, Pose, Vec3
+from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
-#: Length of a `Text` on the wire.
-MAX_TEXT: Final = 512
 #: 95 % quantile of the standard normal distribution.
 Z95: Final = 1.6448536269514722
 
@@ -82,8 +80,12 @@ def propose(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
     tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
     if tilted and not p.tilt_warned:
         degrees = math.degrees(m.residual_tilt_rad)
-        ctx.emit(Notice("warning", f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"))
+        text = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
+        ctx.emit(Notice("warning", text, p.id))
     p.tilt_warned = tilted
+    if m.advice and not tilted and m.advice != p.advised:
+        ctx.emit(Notice("warning", f"alignment of {p.name}: {m.advice}"[:MAX_TEXT], p.id))
+    p.advised = m.advice
     placed = p.alignment is not None and p.alignment.kind == AlignmentKind.PLACED
     if placed or not _is_news(ctx, p, m, error):
         return None
@@ -129,17 +131,12 @@ def refuse_at_robot(ctx: Context, p: Participant, robot: str, error: float, advi
 
 
 def _refuse(ctx: Context, p: Participant, text: str, advice: str) -> None:
-    """Tells the wearer why, at most once per report period, and everyone when it is news.
-
-    The alignment in force stays.
-    """
+    """Tells everyone why, the wearer among them, at most once per report period. The alignment in force stays."""
     if p.refused_ns is not None and ctx.now_ns - p.refused_ns < ctx.config.report_ns:
         return
     p.refused_ns = ctx.now_ns
-    ctx.deny(p, 0, Denial(DenialReason.ALIGNMENT_REFUSED, text, advice))
-    if p.refused_text != text:
-        p.refused_text = text
-        ctx.emit(Notice("warning", f"alignment of {p.name} refused: {text}; {advice}"[:MAX_TEXT]))
+    text = f"alignment of {p.name} refused: {text}; {advice}"[:MAX_TEXT]
+    ctx.emit(Notice("warning", text, p.id, DenialReason.ALIGNMENT_REFUSED))
 
 
 def _accept(
@@ -153,7 +150,7 @@ def _accept(
     offset: bool = False,
 ) -> None:
     p.alignment_version += 1
-    p.refused_ns, p.refused_text = None, ""
+    p.refused_ns = None
     p.alignment = Alignment(
         p.alignment_version,
         kind,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from anchors.pose import compose, quat_rotate
 from iris_session.authority import engagement, roster, samples
 from iris_session.authority.context import HUMAN, Context
-from iris_session.authority.state import DeviceState, Grant, LeaseState, Participant
+from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry
@@ -44,11 +44,14 @@ def _remember(p: Participant, s: Sample, usable: bool) -> None:
     seen = p.seen.get(s.device)
     if seen is None:
         seen = p.seen[s.device] = DeviceState()
+    seen.seq = s.seq
     # Capture times that go back must not make time for a jump when they come forward again.
-    seen.seq, seen.capture_ns = s.seq, max(seen.capture_ns, s.capture_ns)
-    if usable:
-        seen.pose = s.pose if s.kind == SampleKind.POSE else None
-        seen.q = tuple(map(float, s.q))
+    if usable and s.kind == SampleKind.POSE:
+        seen.pose, seen.pose_ns = s.pose, max(seen.pose_ns, s.capture_ns)
+    elif usable and s.kind == SampleKind.JOINTS:
+        before = seen.joints.get(len(s.q))
+        capture_ns = s.capture_ns if before is None else max(before.capture_ns, s.capture_ns)
+        seen.joints[len(s.q)] = JointsSeen(capture_ns, tuple(map(float, s.q)))
 
 
 def _latch(ctx: Context, p: Participant, lease: LeaseState, g: Grant, s: Sample) -> None:
@@ -99,7 +102,7 @@ def _follow(ctx: Context, p: Participant, lease: LeaseState, g: Grant, entry: En
         twist = (*v, *w)
         g.kind = CommandKind.TWIST
     else:
-        q, qd = p.seen[s.device].q, tuple(map(float, s.qd))
+        q, qd = p.seen[s.device].joints[len(s.q)].q, tuple(map(float, s.qd))
         g.kind = CommandKind.JOINTS
     g.source = CommandSource(
         p.id,
@@ -131,12 +134,18 @@ def _show(ctx: Context, p: Participant, s: Sample) -> None:
 
 
 def expire_samples(ctx: Context) -> None:
-    """Ends every engagement without a counted sample within the freshness bound, by session time."""
+    """Ends every engagement without a counted sample within the freshness bound, by session time, and every
+    intervention whose human has not been engaged for a while."""
     oldest = ctx.now_ns - ctx.config.freshness_ns
     for lease in (*ctx.state.robots.values(), *ctx.held_objects):
         for g in lease.grants:
             if g.engagement and g.counted_ns < oldest:
                 engagement.rearm(ctx, lease, g, HoldReason.STALE)
+            if g.participant == lease.override:
+                if g.engagement or ctx.state.paused or ctx.state.estop:
+                    lease.override_ns = ctx.now_ns
+                elif ctx.now_ns - lease.override_ns >= ctx.config.intervention_idle_ns:
+                    engagement.give_back(ctx, lease)
 
 
 class Commands:
@@ -176,17 +185,15 @@ class Commands:
         return command
 
     def _blend(self, ctx: Context, lease: LeaseState) -> Command:
-        """All engaged sharers whose kind of command is that of the longest engaged one, weights summing to 1."""
+        """All engaged sharers, who send samples of one kind (`samples` sees to that), weights summing to 1."""
         engaged = [g for g in lease.grants if g.engagement and g.source is not None]
         if not engaged:
             return self._hold(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)
-        kind = min(engaged, key=lambda g: g.engagement).kind
-        engaged = [g for g in engaged if g.kind == kind]
         total = sum(g.weight for g in engaged)
         sources = tuple(_weighted(_aged(ctx, g), g.weight / total) for g in engaged)
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
         gripper = sum(w * v for w, v in gripping) / sum(w for w, _ in gripping) if gripping else None
-        return Command(lease.target, kind, "", sources, gripper, ctx.scale(lease))
+        return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.scale(lease))
 
 
 def _aged(ctx: Context, g: Grant) -> CommandSource:

@@ -1,16 +1,22 @@
 """Assignment policies: which robot a participant gets when it asks for none by name, and which it may ask for.
 
-`config`: the robots that the configuration gives to its name. `join-order`: the first free robot. `nearest`: the free
-robot whose end effector is nearest to the participant's head. `director`: none, a director assigns.
+`config`: the robots that the configuration gives to its name, or to its key as `key:<fingerprint>`. A name is a label
+that anyone can say: use keys where people are not trusted to tell who they are. `join-order`: the first free robot.
+`nearest`: the free robot whose end effector is nearest to the participant's head. `director`: none, a director assigns.
 """
 
 from __future__ import annotations
+
+from typing import Final
 
 from anchors.pose import apply, distance
 from iris_session.authority.context import Context
 from iris_session.authority.state import Participant
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import AssignmentPolicy, DenialReason, Device, Role
+
+#: Before a key's fingerprint (`Join.key_id`) in `AuthorityConfig.assignments`.
+KEY_PREFIX: Final = "key:"
 
 
 def permitted(ctx: Context, p: Participant, robots: tuple[str, ...]) -> Denial | None:
@@ -20,12 +26,50 @@ def permitted(ctx: Context, p: Participant, robots: tuple[str, ...]) -> Denial |
     if ctx.config.policy == AssignmentPolicy.DIRECTOR:
         return Denial(DenialReason.POLICY, "a director assigns the robots of this session", "ask a director")
     if ctx.config.policy == AssignmentPolicy.CONFIG:
+        own = _own(ctx, p)
         for owner, names in ctx.config.assignments.items():
             for robot in robots:
-                if robot in names and owner != p.name and robot not in ctx.config.assignments.get(p.name, ()):
-                    text = f"the configuration gives {robot} to {owner}"
-                    return Denial(DenialReason.POLICY, text, "acquire without names to get your own", robot)
+                if robot in names and robot not in own:
+                    taken = owner == p.name and _name_taken(ctx, p)
+                    return taken or Denial(
+                        DenialReason.POLICY,
+                        f"the configuration gives {robot} to {owner}",
+                        "acquire without names to get your own",
+                        robot,
+                    )
     return None
+
+
+def _own(ctx: Context, p: Participant) -> tuple[str, ...]:
+    """The robots that the configuration gives to the key of `p`, and to its name unless another key has that name.
+
+    A name that looks like a key is a name all the same, and has none.
+    """
+    plain = not p.name.startswith(KEY_PREFIX) and not _name_taken(ctx, p)
+    named = ctx.config.assignments.get(p.name, ()) if plain else ()
+    return tuple(dict.fromkeys((*ctx.config.assignments.get(KEY_PREFIX + p.key_id, ()), *named)))
+
+
+def _name_taken(ctx: Context, p: Participant) -> Denial | None:
+    """Anyone can say any name: the first key that joins under an assigned one has it, while it is here or in grace."""
+    if ctx.state.name_owners.get(p.name, p.key_id) == p.key_id:
+        return None
+    text = f"somebody else has joined as {p.name} before, and has the robots of that name"
+    advice = f"join under a name of your own, or have robots assigned to {KEY_PREFIX}{p.key_id}"
+    return Denial(DenialReason.POLICY, text, advice)
+
+
+def settle_names(ctx: Context) -> None:
+    """After somebody joined or left for good: which key has each assigned name. First come, first served."""
+    owners = ctx.state.name_owners
+    for name in ctx.config.assignments:
+        if name.startswith(KEY_PREFIX):
+            continue
+        keys = [p.key_id for p in ctx.state.participants.values() if p.name == name]
+        if keys and owners.get(name) not in keys:
+            owners[name] = keys[0]
+        elif not keys:
+            owners.pop(name, None)
 
 
 def choose(ctx: Context, p: Participant, free: list[str]) -> tuple[str, ...] | Denial:
@@ -34,11 +78,14 @@ def choose(ctx: Context, p: Participant, free: list[str]) -> tuple[str, ...] | D
     if policy == AssignmentPolicy.DIRECTOR and p.role != Role.DIRECTOR:
         return Denial(DenialReason.POLICY, "a director assigns the robots of this session", "ask a director")
     if policy == AssignmentPolicy.CONFIG:
-        robots = ctx.config.assignments.get(p.name, ())
+        robots = _own(ctx, p)
         if not robots:
+            taken = _name_taken(ctx, p) if p.name in ctx.config.assignments else None
+            if taken is not None:
+                return taken
             text = f"the configuration assigns no robot to {p.name}"
             return Denial(DenialReason.POLICY, text, "name the robot, or add the name to `assignments`")
-        return tuple(robots)
+        return robots
     if policy == AssignmentPolicy.NEAREST:
         return _nearest(ctx, p, free)
     return tuple(free[:1])

@@ -42,14 +42,22 @@ from iris_session.protocol.names import (
     Role,
     TargetKind,
 )
+from iris_session.protocol.security import Audited, RemoveParticipant
 from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply, Snapshot
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
 
 #: Requests that only a director (or the host) may make.
-DIRECTING: Final = (cm.Assign, cm.SetMode, cm.Control, cm.ClearEStop, cm.PlaceAlignment)
+DIRECTING: Final = (cm.Assign, cm.SetMode, cm.Control, cm.ClearEStop, cm.PlaceAlignment, RemoveParticipant)
 #: Entries that only the process that owns the session may make.
-HOST_ONLY: Final = (em.ExternalReset, em.StalledGap, em.FrontRestarted, em.RecordingGap)
+HOST_ONLY: Final = (
+    em.ExternalReset,
+    em.StalledGap,
+    em.FrontRestarted,
+    em.RecordingGap,
+    em.Audit,
+    em.SessionResumed,
+)
 
 NOT_JOINED: Final = Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first")
 
@@ -85,7 +93,7 @@ class Authority:
         `view`: the world after the last tick. `control`: what control reported after the previous step.
         """
         ctx = self._ctx
-        self._begin(now_ns, n_ticks, view, control)
+        self._begin(now_ns, n_ticks, view, control, resumed=bool(entries) and _resumes(entries[0]))
         others, observed = self._urgent(entries)
         for entry in others:
             self._request(entry)
@@ -139,9 +147,21 @@ class Authority:
         self._ctx.adopt(state)
         self._commands = arbitration.Commands()
 
+    @property
+    def last_connection(self) -> int:
+        """Highest connection number that was ever let in: no other one may come again."""
+        return self._ctx.state.last_connection
+
+    @property
+    def now_ns(self) -> int:
+        """Session time of the newest step, 0 before the first."""
+        return self._ctx.state.now_ns or 0
+
     # --- phases of a step ---
 
-    def _begin(self, now_ns: int, n_ticks: int, view: WorldView, control: Sequence[ControlStatus]) -> None:
+    def _begin(
+        self, now_ns: int, n_ticks: int, view: WorldView, control: Sequence[ControlStatus], *, resumed: bool
+    ) -> None:
         ctx = self._ctx
         before = ctx.state.now_ns
         if n_ticks < 0 or (before is not None and now_ns < before):
@@ -151,7 +171,7 @@ class Authority:
         ctx.state.step += 1
         ctx.clear_effects()
         self._gap_seen = before is not None and now_ns - before > ctx.config.gap_ns
-        if before is not None and self._gap_seen:
+        if before is not None and self._gap_seen and not resumed:
             stops.gap(ctx, now_ns - before)
 
     def _urgent(self, entries: Sequence[Entry]) -> tuple[list[Entry], list[Entry]]:
@@ -181,15 +201,15 @@ class Authority:
                 others.append(entry)
             p = ctx.by_connection.get(entry.connection)
             if p is not None and entry.receive_ns > p.heard_ns:
-                p.heard_ns = min(entry.receive_ns, ctx.now_ns)
+                p.heard_ns, p.spared = min(entry.receive_ns, ctx.now_ns), False
         return others, observed
 
     def _apply_urgent(self, index: int, entry: Entry) -> None:
         ctx, m = self._ctx, entry.message
         p = ctx.by_connection.get(entry.connection)
-        if isinstance(m, cm.EStop) and (p is not None or entry.connection <= ctx.state.last_connection):
-            # An honest stop must not fail on a stale envelope, nor because its sender was just given up: only that the
-            # session once knew the connection is checked.
+        if isinstance(m, cm.EStop):
+            # An honest stop must not fail on a stale envelope, nor because its sender was just given up or is not yet
+            # let in: the front takes it from anyone whose `hello` it has accepted.
             stops.estop(ctx, p.id if p is not None else "", m)
         elif p is None:
             if isinstance(m, (em.Lost, cm.Bye)):
@@ -263,7 +283,13 @@ class Authority:
         elif isinstance(m, em.FrontRestarted):
             roster.lose_everyone(ctx, "front_restarted")
         elif isinstance(m, em.RecordingGap):
-            ctx.emit(Gap("recording", 0))
+            ctx.emit(Gap("recording", 0, m.rows))
+        elif isinstance(m, em.Audit):
+            ctx.emit(Audited(m.kind, m.subject, m.name, m.address, m.detail, m.count))
+        elif isinstance(m, em.SessionResumed):
+            roster.lose_everyone(ctx, "session_resumed")
+            stops.gap(ctx, m.gap_ns, "resumed")
+            roster.begin_grace_anew(ctx)
         elif isinstance(m, em.StalledGap) and not self._gap_seen:
             self._gap_seen = True
             stops.gap(ctx, m.duration_ns)
@@ -286,6 +312,11 @@ class Authority:
             estop=state.estop,
             episode=state.episode,
         )
+
+
+def _resumes(entry: Entry) -> bool:
+    """Whether a step begins with the news that the session goes on from a recording, which tells of the gap itself."""
+    return entry.connection == HOST and isinstance(entry.message, em.SessionResumed)
 
 
 def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
@@ -350,4 +381,5 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.ClearEStop: stops.clear_estop,
     cm.Control: stops.control,
     cm.Marker: _marker,
+    RemoveParticipant: roster.remove_participant,
 }

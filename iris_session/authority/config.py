@@ -51,8 +51,8 @@ POSITIVE: Final = (
 class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Configuration of `Authority`. Times in nanoseconds of session time, lengths in metres, angles in radians.
 
-    `assignments`: participant name -> robots (policy `config`). `leader_apart`: `ramp` (control ramps) or `refuse`.
-    `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
+    `assignments`: participant name, or `key:<fingerprint>`, -> robots (policy `config`). `leader_apart`: `ramp`
+    (control ramps) or `refuse`. `user_owned_loop`: the user drives physics, so pause, step and reset are denied.
     """
 
     # samples
@@ -79,6 +79,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_queue: int = 32
     max_consents: int = 16
     consent_timeout_ns: int = 15 * SECOND
+    intervention_idle_ns: int = 2 * SECOND  # a human who stands by this long gives the agent its robot back
     max_sub_holders: int = 4  # people who share one robot, hands that hold one object
     min_scale: float = 0.05  # motion scaling that holders may set; those of `ControlConfig`
     max_scale: float = 5.0

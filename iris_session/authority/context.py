@@ -26,8 +26,8 @@ from iris_session.protocol.server_messages import (
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Admitted, ControlStatus, Dropped, FixedView, Outgoing, WorldView
 
-#: Roles of people, who preempt agents in mode `priority`.
-HUMAN = (Role.OPERATOR, Role.DIRECTOR)
+#: Roles of people, who preempt agents in mode `priority`. A leader arm is moved by a human hand.
+HUMAN = (Role.OPERATOR, Role.DIRECTOR, Role.LEADER)
 
 
 class Context:

@@ -69,8 +69,8 @@ def rearm_all(ctx: Context, reason: str) -> None:
 def preempt(ctx: Context, lease: LeaseState, human: Participant) -> None:
     """Mode `priority`: `human` takes the robot from the agent that drives it."""
     agent = lease.grants[0]
-    rearm(ctx, lease, agent, HoldReason.REARM)
-    lease.override = human.id
+    rearm(ctx, lease, agent, HoldReason.INTERVENTION)
+    lease.override, lease.override_ns = human.id, ctx.now_ns
     ctx.publish(lease, "priority", agent.participant)
     ctx.emit(Intervention(lease.target, human.id, agent.participant, True))
 

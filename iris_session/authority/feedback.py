@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from iris_session.authority.context import Context
 from iris_session.authority.state import FeedbackState
+from iris_session.protocol.names import CommandKind, HoldReason
 from iris_session.protocol.server_messages import Feedback
 from iris_session.protocol.steps import Command
 
@@ -35,7 +36,10 @@ def _report_robot(ctx: Context, command: Command, state: FeedbackState) -> None:
     limits: tuple[str, ...] = next((c.limits for c in ctx.control if c.robot == command.robot), ())
     for name in dict.fromkeys(holders):
         p = ctx.state.participants[name]
-        message = Feedback(command.robot, command.kind, command.hold_reason, contact_n, limits, dict(p.rejected))
+        kind, reason = command.kind, command.hold_reason
+        if lease.override and name != lease.override:
+            kind, reason = CommandKind.HOLD, HoldReason.INTERVENTION  # what moves it is not what this agent says
+        message = Feedback(command.robot, kind, reason, contact_n, limits, dict(p.rejected))
         if state.sent.get(name) != message:
             state.sent[name] = message
             ctx.send(p, message)

@@ -152,6 +152,8 @@ def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None
 def advance(ctx: Context) -> None:
     """Grants what has become free, in the order of the requests, and ends consents that nobody answered."""
     for pending in tuple(ctx.state.consents):
+        if not any(pending is other for other in ctx.state.consents):
+            continue  # answered meanwhile: granting one request ends the others of its participant
         p = ctx.state.participants[pending.participant]
         for consent_id, name in tuple(pending.consents.items()):
             if not ctx.state.robots[name].grants:
@@ -164,6 +166,8 @@ def advance(ctx: Context) -> None:
             ctx.deny(p, pending.request_id, Denial(DenialReason.CONSENT_REFUSED, text, "ask the holder in person"))
     ahead: list[Pending] = []
     for pending in tuple(ctx.state.queue):
+        if not any(pending is other for other in ctx.state.queue):
+            continue
         p = ctx.state.participants[pending.participant]
         if pending.any_robot:
             reserved = [name for w in ahead for name in w.robots]
@@ -194,6 +198,10 @@ def _ask_consent(ctx: Context, p: Participant, pending: Pending, robots: list[Le
             text = f"someone already asked for {lease.target}"
             denial = Denial(DenialReason.CONSENT_PENDING, text, "wait for the answer", lease.target, ctx.holder(lease))
             return ctx.deny(p, pending.request_id, denial)
+    if any(other.participant == p.id for other in ctx.state.consents):
+        text = "you asked already, and nobody has answered yet"
+        denial = Denial(DenialReason.CONSENT_PENDING, text, "wait for the answer, or release to take it back")
+        return ctx.deny(p, pending.request_id, denial)
     if len(ctx.state.consents) >= ctx.config.max_consents:
         denial = Denial(DenialReason.QUEUE_FULL, "too many requests wait for consent", "try again in a few seconds")
         return ctx.deny(p, pending.request_id, denial)

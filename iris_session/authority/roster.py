@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from iris_session.authority import engagement, leases
+from iris_session.authority import assignment, engagement, leases
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
-from iris_session.protocol.common import IDENTITY, Alignment
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
-from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason, RefusalCode, Role
+from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
+from iris_session.protocol.security import Audited, RemoveParticipant
 from iris_session.protocol.server_messages import ParticipantJoined, ParticipantLeft
 from iris_session.protocol.steps import Admitted, Dropped
 
@@ -41,6 +42,10 @@ def join(ctx: Context, connection: int, m: Join) -> None:
     if m.alignment not in (AlignmentKind.MEASURED, AlignmentKind.NOT_NEEDED):
         text, known = f"unknown alignment {m.alignment}", f"{AlignmentKind.MEASURED}, {AlignmentKind.NOT_NEEDED}"
         return ctx.refuse(connection, DenialReason.UNKNOWN_VALUE, text, known)
+    if m.roles and m.role not in m.roles:
+        ctx.emit(Audited(AuditKind.ROLE_REFUSED, m.key_id, m.name, "", m.role))
+        text = f"this key may not join as {m.role}"
+        return ctx.refuse(connection, DenialReason.ROLE, text, f"its roles: {', '.join(m.roles)}")
     if m.gateway:
         gateway = ctx.by_connection.get(m.gateway)
         if gateway is None or gateway.role != Role.GATEWAY:
@@ -66,7 +71,7 @@ def _resume(ctx: Context, connection: int, m: Join, p: Participant) -> None:
         return ctx.refuse(connection, RefusalCode.RESUME_TOKEN, text, "join without the resume token")
     if p.connection != NO_CONNECTION:
         ctx.dropped.append(Dropped(p.connection, "replaced"))
-        del ctx.by_connection[p.connection]
+        lose(ctx, p, "replaced")
     needs_alignment = m.alignment == AlignmentKind.MEASURED
     if not p.run or p.run not in _runs(m) or needs_alignment != p.needs_alignment:
         p.tracking_epoch = 0
@@ -82,7 +87,10 @@ def _runs(m: Join) -> list[str]:
 
 def _admit(ctx: Context, p: Participant, connection: int, m: Join, resumed: bool) -> None:
     p.connection, p.gateway, p.heard_ns, p.expires_ns, p.worn = connection, m.gateway, ctx.now_ns, 0, True
-    p.devices, p.run = m.devices, next(iter(_runs(m)), "")
+    p.devices, p.run, p.spared = m.devices, next(iter(_runs(m)), ""), False
+    assignment.settle_names(ctx)
+    for told in ctx.state.feedback.values():
+        told.sent.pop(p.id, None)  # it may never have come over the connection before
     if not p.needs_alignment:
         p.alignment = NOT_NEEDED
     ctx.by_connection[connection] = p
@@ -133,10 +141,32 @@ def leave(ctx: Context, p: Participant, reason: str) -> None:
     _lose_clients(ctx, connection, "gateway")
 
 
+def remove_participant(ctx: Context, p: Participant, m: RemoveParticipant) -> None:
+    """A director ends somebody's participation, at once and without grace."""
+    gone = ctx.person(m.participant)
+    if gone is None or gone.id == HOST_ID:
+        text = f"no participant {m.participant}"
+        denial = Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster")
+        return ctx.deny(p, m.request_id, denial)
+    ctx.accept(p, m.request_id)
+    kind = AuditKind.KEY_REVOKED if m.revoke else AuditKind.REMOVED
+    ctx.emit(Audited(kind, gone.id, gone.name, "", f"{p.name}: {m.reason}"[:MAX_TEXT]))
+    connection = gone.connection
+    if connection != NO_CONNECTION:
+        ctx.dropped.append(Dropped(connection, "revoked" if m.revoke else "removed", gone.key_id if m.revoke else ""))
+        del ctx.by_connection[connection]
+        gone.connection = NO_CONNECTION
+    elif m.revoke:
+        ctx.dropped.append(Dropped(HOST, "revoked", gone.key_id))
+    remove(ctx, gone, "removed")
+    return _lose_clients(ctx, connection, "gateway")
+
+
 def _lose_clients(ctx: Context, gateway: int, reason: str) -> None:
-    """Everyone for whom the gateway at that connection spoke is lost with it."""
+    """Everyone for whom the gateway at that connection spoke is lost with it, and forgotten by the front."""
     for p in tuple(ctx.state.participants.values()):
-        if p.gateway == gateway and gateway != HOST:
+        if p.gateway == gateway and gateway != HOST and p.connection != NO_CONNECTION:
+            ctx.dropped.append(Dropped(p.connection, "gateway"))
             lose(ctx, p, reason)
 
 
@@ -146,6 +176,7 @@ def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
     for tracked in ctx.state.feedback.values():
         tracked.sent.pop(p.id, None)
     del ctx.state.participants[p.id]
+    assignment.settle_names(ctx)
     ctx.emit(ParticipantLeft(p.id, reason or cause))
 
 
@@ -153,6 +184,16 @@ def lose_everyone(ctx: Context, reason: str) -> None:
     """The front was replaced: every connection is lost."""
     for p in tuple(ctx.state.participants.values()):
         lose(ctx, p, reason)
+
+
+def begin_grace_anew(ctx: Context) -> None:
+    """The session goes on after it was down: that time counts against nobody who is away."""
+    for p in ctx.state.participants.values():
+        if p.connection == NO_CONNECTION:
+            p.spared = False
+            p.expires_ns = ctx.now_ns + ctx.config.grace_ns
+            for lease in ctx.leases_of(p):
+                ctx.publish(lease, "left", p.id)
 
 
 def set_worn(ctx: Context, p: Participant, worn: bool) -> None:
@@ -166,10 +207,13 @@ def set_worn(ctx: Context, p: Participant, worn: bool) -> None:
 
 def expire(ctx: Context) -> None:
     """Heartbeats and grace periods, by session time; after the entries of the step were applied."""
-    if ctx.now_ns < ctx.state.hold_expiry_until_ns:
-        return
+    draining = ctx.now_ns < ctx.state.hold_expiry_until_ns
     silent_before = ctx.now_ns - ctx.config.heartbeat_timeout_ns
     for p in tuple(ctx.state.participants.values()):
+        if not draining:
+            p.spared = False
+        elif not p.spared:
+            continue
         if p.connection > HOST and p.heard_ns < silent_before:
             ctx.dropped.append(Dropped(p.connection, "heartbeat"))
             lose(ctx, p, "heartbeat")

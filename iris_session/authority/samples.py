@@ -11,10 +11,10 @@ import math
 from anchors.pose import distance, quat_angle
 from iris_session.authority import alignment, engagement
 from iris_session.authority.context import Context, find_grant
-from iris_session.authority.state import DeviceState, Grant, LeaseState, Participant, Rejections
+from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.names import Device, HoldReason, RejectReason, Role, SampleKind, TargetKind
+from iris_session.protocol.names import Device, HoldReason, LeaseMode, RejectReason, Role, SampleKind, TargetKind
 from iris_session.protocol.server_messages import SamplesRejected
 
 Drive = tuple[LeaseState, Grant]
@@ -109,7 +109,6 @@ def _numbers(ctx: Context, s: Sample) -> str:
 def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
     """Shape and possible speed of the payload that `kind` names."""
     limit = ctx.config.speed_limits[s.device]
-    dt = max(0, s.capture_ns - seen.capture_ns) * 1e-9
     if s.kind == SampleKind.POSE:
         if s.pose is None:
             return RejectReason.SHAPE
@@ -118,6 +117,7 @@ def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
             return RejectReason.NOT_UNIT
         if seen.pose is None:
             return ""
+        dt = max(0, s.capture_ns - seen.pose_ns) * 1e-9
         possible = (
             distance(s.pose.p, seen.pose.p) <= limit.linear * dt + ctx.config.speed_slack_m
             and quat_angle(seen.pose.q, s.pose.q) <= limit.angular * dt + ctx.config.speed_slack_rad
@@ -133,9 +133,10 @@ def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
     else:
         if not s.q or (s.qd and len(s.qd) != len(s.q)):
             return RejectReason.SHAPE
-        bound = limit.angular * dt + ctx.config.speed_slack_rad
-        possible = max(map(abs, (*s.q, *s.qd))) <= ctx.config.reach_m and (
-            len(seen.q) != len(s.q) or all(abs(a - b) <= bound for a, b in zip(s.q, seen.q, strict=True))
+        before = seen.joints.get(len(s.q), JointsSeen(0, s.q))
+        bound = limit.angular * max(0, s.capture_ns - before.capture_ns) * 1e-9 + ctx.config.speed_slack_rad
+        possible = max(map(abs, (*s.q, *s.qd))) <= ctx.config.reach_m and all(
+            abs(a - b) <= bound for a, b in zip(s.q, before.q, strict=True)
         )
     return "" if possible else RejectReason.TOO_FAST
 
@@ -149,11 +150,13 @@ def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> s
             continue
         if s.kind == SampleKind.JOINTS and len(s.q) != len(ctx.robots[lease.target].joints):
             return RejectReason.SHAPE
+        if (g.engagement or s.device in g.armed) and _other_kind(lease, g, s):
+            return RejectReason.KIND_MISMATCH
         if g.engagement or s.device not in g.armed:
             continue
         if p.role == Role.LEADER and s.kind == SampleKind.JOINTS and ctx.config.leader_apart == "refuse":
             apart = max(abs(a - b) for a, b in zip(s.q, ctx.view.joints(lease.target), strict=True))
-            if apart > ctx.config.leader_apart_rad:
+            if not apart <= ctx.config.leader_apart_rad:  # a robot that is nowhere is not near its leader
                 return RejectReason.LEADER_APART
         if s.kind != SampleKind.JOINTS and p.needs_alignment:
             error = alignment.error_at(ctx, p, lease.target)
@@ -161,6 +164,13 @@ def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> s
                 alignment.refuse_at_robot(ctx, p, lease.target, error)
                 return RejectReason.UNALIGNED
     return ""
+
+
+def _other_kind(lease: LeaseState, g: Grant, s: Sample) -> bool:
+    """Whether somebody else drives the robot by another kind of sample: those cannot be blended (mode `shared`)."""
+    if lease.mode != LeaseMode.SHARED or (g.engagement and g.device != s.device):
+        return False
+    return any(other.engagement and other is not g and other.kind != s.kind for other in lease.grants)
 
 
 def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:

@@ -20,13 +20,23 @@ HOST_ID: Final = "host"
 NO_CONNECTION: Final = -1
 
 
+class JointsSeen(msgspec.Struct, array_like=True):
+    """Newest joint positions of one device, and when they were sampled."""
+
+    capture_ns: int
+    q: tuple[float, ...]
+
+
 class DeviceState(msgspec.Struct):
-    """Newest counted sample of one device: what the next one is compared with. Pose in the tracking frame."""
+    """Newest usable payloads of one device: what the next ones are compared with, whatever was sent in between.
+
+    `pose`: in the tracking frame, sampled at `pose_ns`. `joints`: by their number.
+    """
 
     seq: int = -1
-    capture_ns: int = 0
+    pose_ns: int = 0
     pose: Pose | None = None
-    q: tuple[float, ...] = ()
+    joints: dict[int, JointsSeen] = {}
 
 
 class Rejections(msgspec.Struct):
@@ -39,6 +49,7 @@ class Rejections(msgspec.Struct):
 class Participant(msgspec.Struct):
     """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
 
+    `spared`: a gap has put off its expiry, and the gaps that follow that one at once do not put it off again.
     `run`: value of the capability `run:<id>`; a resumed connection with the same one continues the same tracking frame.
     `T_world_tracking_measured` is the last measured alignment without the director's `offset`; `pivot_world` the point
     at which its covariance is stated. `devices` empty: none declared, all known ones are taken.
@@ -55,6 +66,7 @@ class Participant(msgspec.Struct):
     run: str = ""
     devices: tuple[str, ...] = ()
     expires_ns: int = 0
+    spared: bool = False
     worn: bool = True
     tracking_epoch: int = 0
     alignment_version: int = 0
@@ -63,7 +75,7 @@ class Participant(msgspec.Struct):
     offset: Pose | None = None
     pivot_world: Vec3 = (0.0, 0.0, 0.0)
     refused_ns: int | None = None
-    refused_text: str = ""
+    advised: str = ""
     tilt_warned: bool = False
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
@@ -97,7 +109,8 @@ class Grant(msgspec.Struct):
 
 
 class LeaseState(msgspec.Struct):
-    """One robot or object. `override`: the human who has preempted the agent (mode `priority`).
+    """One robot or object. `override`: the human who has preempted the agent (mode `priority`), last engaged at
+    `override_ns`.
 
     Objects: `lead` is the engagement of the leading hand, `T_hand_object` its latched offset, `T_world_object` the
     last commanded pose.
@@ -109,6 +122,7 @@ class LeaseState(msgspec.Struct):
     version: int = 0
     grants: list[Grant] = []
     override: str = ""
+    override_ns: int = 0
     lead: int = 0
     T_hand_object: Pose = IDENTITY
     T_world_object: Pose = IDENTITY
@@ -152,7 +166,7 @@ class FeedbackState(msgspec.Struct):
 
 
 class State(msgspec.Struct):
-    """The authority's whole memory."""
+    """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`)."""
 
     robots: dict[str, LeaseState]
     objects: dict[str, LeaseState]
@@ -176,3 +190,4 @@ class State(msgspec.Struct):
     handover_tick: int = -1
     feedback: dict[str, FeedbackState] = {}
     unattributed: dict[str, Rejections] = {}
+    name_owners: dict[str, str] = {}

@@ -43,7 +43,7 @@ def control(ctx: Context, p: Participant, m: Control) -> None:
         if not ctx.state.paused or not 1 <= m.ticks <= ctx.config.max_step_ticks:
             text = f"step needs a paused session and 1 to {ctx.config.max_step_ticks} ticks"
             return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "pause first"))
-        ctx.step_ticks = m.ticks
+        ctx.step_ticks = min(ctx.step_ticks + m.ticks, ctx.config.max_step_ticks)
     elif m.action == ControlAction.RESET:
         reset(ctx)
     elif ctx.state.paused != (m.action == ControlAction.PAUSE):
@@ -76,11 +76,14 @@ def new_scene(ctx: Context, cause: str) -> None:
     ctx.emit(SceneChanged(ctx.state.scene_epoch, ctx.state.scene_revision, cause))
 
 
-def gap(ctx: Context, duration_ns: int) -> None:
+def gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:
     """No step was taken for a while: robots hold until clutched again, and nobody expires before the entries that
-    waited meanwhile were applied."""
+    waited meanwhile were applied. Once: where every step is a gap, the step after the first one had those entries."""
     ctx.state.hold_expiry_until_ns = ctx.now_ns + ctx.config.drain_ns
     for p in ctx.state.participants.values():
+        if p.spared:
+            continue
+        p.spared = True
         if p.connection == NO_CONNECTION:
             if p.expires_ns < ctx.state.hold_expiry_until_ns:
                 p.expires_ns = ctx.state.hold_expiry_until_ns
@@ -88,5 +91,7 @@ def gap(ctx: Context, duration_ns: int) -> None:
                     ctx.publish(lease, "left", p.id)
         else:
             p.heard_ns = max(p.heard_ns, ctx.now_ns)
-    ctx.emit(Gap("stalled", max(0, duration_ns)))
+    for lease in ctx.state.robots.values():
+        lease.override_ns = ctx.now_ns  # whoever took over could not engage meanwhile
+    ctx.emit(Gap(kind, max(0, duration_ns)))
     engagement.rearm_all(ctx, HoldReason.GAP)

@@ -179,12 +179,13 @@ def _relative(base: PoseTuple, start: PoseTuple, now: PoseTuple, scale: float) -
 
 
 def _increment(state: Latch, old: SourceLatch, new: CommandSource) -> None:
+    """Moves the target by a source's motion since its previous sample. That of an absolute one is not scaled."""
     if new.twist_world is not None:
         old.twist = new.twist_world
     if new.pose_world is None:
         return
     pose = pose_tuple(new.pose_world)
-    (p0, q0), (p, q), k = old.pose or pose, pose, new.weight * state.scale
+    (p0, q0), (p, q), k = old.pose or pose, pose, new.weight * (1.0 if new.absolute else state.scale)
     r = quat_to_rotvec(quat_mul(q, quat_conj(q0)))
     turn = quat_from_rotvec((new.weight * r[0], new.weight * r[1], new.weight * r[2]))
     (t, qt) = state.target

@@ -8,6 +8,7 @@ No clock, no randomness; whatever is remembered is in `snapshot()`.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import mujoco
@@ -15,7 +16,7 @@ import numpy as np
 
 from anchors.pose import PoseTuple
 from iris_session.control import clutch
-from iris_session.control.arm_model import ArmModel, joint_ranges, moving_base, site_pose
+from iris_session.control.arm_model import ArmModel, Floats, joint_ranges, moving_base, site_pose
 from iris_session.control.config import OUTPUT_CTRL, ControlConfig
 from iris_session.control.errors import ControlError
 from iris_session.control.grasp import Grasps
@@ -74,17 +75,18 @@ class Controller:
 
     def reset(self, data: mujoco.MjData) -> None:
         """Everything is forgotten; targets are where the robots stand now (kinematics of `data` must be current)."""
-        self._joints.place(data.qpos[self._qpos])
+        self._joints.place(self._measured(data))
         self._reach.rest[:] = self._joints.q
         self._grippers.reset(data)
         self._grasps.reset(data)
         self._tick = self._cursor = self._now_ns = 0
         self._ready = True
-        self._states = [RobotState() for _ in self._robots]
+        before, self._states = self._states, [RobotState() for _ in self._robots]
         for i, arm in enumerate(self._arms):
             r = self._states[i]
-            r.T_world_root = _body_pose(data, arm.root_body)
-            r.commanded = self._reach.tip(i, r) if self._writes_ctrl else site_pose(data, arm.site_id)
+            r.T_world_root = _finite(_body_pose(data, arm.root_body)) or before[i].T_world_root
+            tip = None if self._writes_ctrl else _finite(site_pose(data, arm.site_id))
+            r.commanded = tip or self._reach.tip(i, r)
 
     def begin(self, now_ns: int, n_ticks: int, decision: Decision, view: WorldView) -> None:
         """Reads the commands of one step at session time `now_ns`. A robot without a command holds.
@@ -125,9 +127,16 @@ class Controller:
             self._laws.write(data, self._joints.q, self._joints.v, self._joints.velocity)
             self._grippers.tick(data)
         else:
-            self._move_targets()
+            self._move_targets(data)
         self._grasps.tick(data)
         self._tick += 1
+
+    def rest(self, data: mujoco.MjData) -> None:
+        """The last `ctrl`, when no tick follows: robots at rest where they are commanded, no wrench on objects."""
+        still = np.zeros_like(self._joints.q)
+        self._laws.write(data, self._joints.q, still, still)  # a speed of at most zero: velocity actuators stop
+        self._grasps.commanded = {}
+        self._grasps.tick(data)
 
     def status(self) -> tuple[ControlStatus, ...]:
         """Per robot: what limits it now, and the newest sample behind the `ctrl` in use."""
@@ -243,8 +252,7 @@ class Controller:
     def _solve_due(self, data: mujoco.MjData) -> None:
         """Integrates twists; solves for at most `max_solves_per_tick` robots, taking turns."""
         n, left, start = len(self._states), self._config.max_solves_per_tick, self._cursor
-        for i in self._moving_bases:
-            self._states[i].T_world_root = _body_pose(data, self._arms[i].root_body)
+        self._follow_bases(data)
         for i in (*range(start, n), *range(start)):
             r = self._states[i]
             if r.latch is None:
@@ -258,6 +266,20 @@ class Controller:
                 self._apply(r)
             elif r.pending is not None and not r.want_solve:
                 self._apply(r)
+
+    def _follow_bases(self, data: mujoco.MjData) -> None:
+        """A robot whose base stands nowhere (physics that diverged) holds at the last place that it was seen at."""
+        for i in self._moving_bases:
+            T = _finite(_body_pose(data, self._arms[i].root_body))
+            if T is None:
+                self._hold(i)
+            else:
+                self._states[i].T_world_root = T
+
+    def _measured(self, data: mujoco.MjData) -> Floats:
+        """Joint positions of all robots, shape (n,); those that are no numbers are where they were commanded."""
+        q = data.qpos[self._qpos]
+        return np.where(np.isfinite(q), q, self._joints.q)
 
     def _integrate(self, i: int, r: RobotState, state: clutch.Latch) -> None:
         config = self._config
@@ -274,7 +296,10 @@ class Controller:
             r.lagging = some and bool(far[columns].any())
 
     def _slow_near_contact(self, data: mujoco.MjData) -> None:
-        """Bounds the speed of robots that close in on each other, until the next check."""
+        """Bounds the speed of robots that close in on each other, until the next check: new samples do not lift it.
+
+        Who holds is not bounded: it brakes as hard as it can already.
+        """
         joints = self._joints
         factors = [1.0] * len(self._states)
         speed = joints.velocity
@@ -282,17 +307,23 @@ class Controller:
         if joints.moving:
             factors = self._proximity.factors(data, [wanted[columns] for columns in self._columns])
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
-            if factor < 1.0 or r.proximity < 1.0:
-                self._set_cap(i)
-            r.proximity = factor
-            if factor < 1.0:
-                columns = self._columns[i]
-                joints.cap[columns] = np.minimum(joints.cap[columns], np.abs(wanted[columns]) * factor)
+            columns = self._columns[i]
+            r.proximity = 1.0 if r.latch is None else factor
+            joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
 
-    def _move_targets(self) -> None:
-        """Output `targets`: end-effector targets move at bounded speed; the environment's controller does the rest."""
-        config, dt = self._config, self._dt
-        for i, r in enumerate(self._states):
+    def _move_targets(self, data: mujoco.MjData) -> None:
+        """Output `targets`: end-effector targets move at bounded speed; the environment's controller does the rest.
+
+        The joints are moved by it alone, so they are where they are measured; only leaders give them goals.
+        """
+        config, dt, joints = self._config, self._dt, self._joints
+        self._follow_bases(data)
+        joints.q[:] = self._measured(data)
+        for i, (r, columns) in enumerate(zip(self._states, self._columns, strict=True)):
+            if r.latch is None or r.latch.kind != CommandKind.JOINTS:
+                joints.goal[columns] = joints.q[columns]
+            elif r.ramping:
+                r.ramping = ramping(True, float(np.abs(joints.goal[columns] - joints.q[columns]).max()), config)
             if r.latch is None:
                 continue
             if not r.fresh and r.latch.kind == CommandKind.TWIST:
@@ -340,3 +371,7 @@ def _body_pose(data: mujoco.MjData, body: int) -> PoseTuple:
     x, y, z = data.xpos[body].tolist()
     w, i, j, k = data.xquat[body].tolist()
     return ((x, y, z), (w, i, j, k))
+
+
+def _finite(T: PoseTuple) -> PoseTuple | None:
+    return T if all(map(math.isfinite, (*T[0], *T[1]))) else None

@@ -24,13 +24,14 @@ ARRIVAL_INTERVALS = 1.5
 class JointInterpolator:
     """Commanded positions `q` and velocities `v` of n joints, moving to `goal`. All arrays float64, shape (n,).
 
-    `cap`: velocity limit in force now (ramps and proximity lower it); `remaining`: time to arrive in [s].
+    `cap`: velocity limit in force now (ramps lower it); `near`: the one that proximity sets, apart from `cap` so that
+    neither undoes the other; the lower of both counts. `remaining`: time to arrive in [s].
     """
 
     def __init__(self, velocity: Floats, acceleration: Floats, dt: float) -> None:
         n = len(velocity)
         self.q, self.v, self.goal, self.remaining = np.zeros(n), np.zeros(n), np.zeros(n), np.full(n, dt)
-        self.velocity, self.cap = velocity, velocity.copy()
+        self.velocity, self.cap, self.near = velocity, velocity.copy(), velocity.copy()
         self.acceleration = acceleration
         self.dt = dt
         self._dv = acceleration * dt
@@ -43,7 +44,7 @@ class JointInterpolator:
         self.goal[:] = q
         self.v[:] = 0.0
         self.remaining[:] = self.dt
-        self.cap[:] = self.velocity
+        self.cap[:] = self.near[:] = self.velocity
         self.moving = False
 
     def aim(self, joints: slice, goal: Floats, interval: float) -> None:
@@ -75,7 +76,7 @@ class JointInterpolator:
         distance = np.abs(error) / self._unit
         ticks = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * distance) - 1.0))
         brake = (ticks + (distance - 0.5 * ticks * (ticks + 1.0)) / (ticks + 1.0)) * self._dv
-        limit = np.minimum(brake, self.cap)
+        limit = np.minimum(brake, np.minimum(self.cap, self.near))
         wanted = np.minimum(np.maximum(error / self.remaining, -limit), limit)
         self.v += np.minimum(np.maximum(wanted - self.v, -self._dv), self._dv)
         self.q += self.v * self.dt
@@ -88,13 +89,16 @@ class JointInterpolator:
 
     def state(self) -> list[bytes]:
         """Arrays as raw bytes, for snapshots."""
-        return [a.tobytes() for a in (self.q, self.v, self.goal, self.remaining, self.cap)]
+        return [a.tobytes() for a in self._arrays()]
 
     def set_state(self, arrays: list[bytes], moving: bool) -> None:
         """Inverse of `state`."""
-        for array, raw in zip((self.q, self.v, self.goal, self.remaining, self.cap), arrays, strict=True):
+        for array, raw in zip(self._arrays(), arrays, strict=True):
             array[:] = np.frombuffer(raw)
         self.moving = moving
+
+    def _arrays(self) -> tuple[Floats, ...]:
+        return (self.q, self.v, self.goal, self.remaining, self.cap, self.near)
 
 
 def speed_limits(

@@ -8,16 +8,16 @@ from iris_session.physics.errors import (
     ModelInvalidError,
     ModelNotFoundError,
     ModelUnsupportedError,
-    NotOwnerError,
     PhysicsError,
     RobotsFileError,
     SimulationDivergedError,
     SnapshotError,
+    SpecError,
     UnknownNameError,
 )
 from iris_session.physics.load import load_model, model_bytes, model_from_bytes, scene_hash
 from iris_session.physics.objects import find_objects
-from iris_session.physics.pacer import Backlog, Pacer, PacerStats
+from iris_session.physics.pacer import Pacer, PacerStats
 from iris_session.physics.robots import find_robots
 from iris_session.physics.robots_toml import dump_robots_toml, load_robots_toml
 from iris_session.physics.world import World
@@ -26,7 +26,6 @@ __all__ = [
     "World",
     "Pacer",
     "PacerStats",
-    "Backlog",
     "load_model",
     "model_bytes",
     "model_from_bytes",
@@ -40,9 +39,9 @@ __all__ = [
     "ModelInvalidError",
     "ModelNotFoundError",
     "ModelUnsupportedError",
-    "NotOwnerError",
     "RobotsFileError",
     "SimulationDivergedError",
     "SnapshotError",
+    "SpecError",
     "UnknownNameError",
 ]

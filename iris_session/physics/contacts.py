@@ -45,7 +45,7 @@ class ContactTables:
         self._fingers_of: list[int] = []
         geom_finger_robot = np.full(model.ngeom + 1, _NONE, np.int64)
         for index, spec in enumerate(robots):
-            fingers = [id_of[n] for n in spec.finger_bodies if n in id_of]
+            fingers = [id_of[n] for n in spec.finger_bodies]
             for body in fingers:
                 self.body_finger[body] = tree.weld[body]
                 first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])

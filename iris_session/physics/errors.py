@@ -6,9 +6,9 @@ PhysicsError
 ├── ModelUnsupportedError     MuJoCo runs the model, but not so that it can be replayed bit for bit
 ├── UnknownNameError          a joint, actuator, site, body or keyframe that the model does not have
 ├── RobotsFileError           a mistake in a robots TOML
+├── SpecError                 robots or objects that contradict each other
 ├── AmbiguousModelError       robots cannot be found without help; `.toml` is a ready-to-edit description
 ├── SnapshotError             bytes that are no snapshot, or one of another model
-├── NotOwnerError             the world belongs to the user's loop (or to ours), and the other one called
 └── SimulationDivergedError   the state became NaN, infinite or huge
 """
 
@@ -49,6 +49,10 @@ class RobotsFileError(PhysicsError):
     """A robots TOML that cannot be used: syntax, unknown key, wrong type, joint of two robots."""
 
 
+class SpecError(PhysicsError):
+    """Robots or objects that cannot be used together: a joint, actuator, body or name of two of them."""
+
+
 class AmbiguousModelError(PhysicsError):
     """What `find_robots` cannot decide. The text is one line; `toml` describes what was found, to be completed."""
 
@@ -59,10 +63,6 @@ class AmbiguousModelError(PhysicsError):
 
 class SnapshotError(PhysicsError):
     """Bytes that are no snapshot of this world."""
-
-
-class NotOwnerError(PhysicsError):
-    """`tick`, `reset` and `restore` are for our own loop, `after_user_step` is for a user's loop."""
 
 
 class SimulationDivergedError(PhysicsError):

@@ -1,14 +1,12 @@
 """The pacing of our own loop as pure arithmetic on session time: no clock is read here.
 
-Tick k (1, 2, ...) is due at `start + k * period`, a grid that is never moved except by `resume` and `restart`. A tick
+Tick k (1, 2, ...) is due at `start + k * period`, a grid that is never moved except by `resume`. A tick
 is late when it finishes more than one period after it was due; one that never ran is late too.
 
 Falling behind: overdue ticks are run one after the other, each still late by its own deadline, so a short hiccup is
 caught up and the simulation stays on the wall clock. Catching up more than `max_backlog_ns` (1 s) would be seen as
 fast motion, so beyond it `skip_backlog` gives up the overdue ticks: they count as late, simulated time stays behind by
-them, and the grid stays where it is. It calls that `stalled` when no tick at all finished for that long (a suspended
-process): the authority sees the same gap in session time, and robots hold until clutched again. Plain overload never
-stalls.
+them, and the grid stays where it is.
 """
 
 from __future__ import annotations
@@ -35,16 +33,6 @@ class PacerStats(NamedTuple):
     p50_ns: int
     p99_ns: int
     max_ns: int
-    stalls: int
-    anchors: int
-
-
-class Backlog(NamedTuple):
-    """Ticks that were given up. `duration_ns`: time they stood for. `stalled`: nothing had run in the meantime."""
-
-    ticks: int
-    duration_ns: int
-    stalled: bool
 
 
 class Pacer:
@@ -58,9 +46,7 @@ class Pacer:
         self.paused = False
         self._start_ns = start_ns
         self._done = 0  # grid index of the last tick that was finished or given up
-        self._last_ns = start_ns  # when anything last happened: a finish, a start
-        self._finished = self._late = self._missing = self._stalls = self._max_ns = 0
-        self._anchors = 1
+        self._finished = self._late = self._missing = self._max_ns = 0
         self._buckets = [0] * ((_MAX_BITS - _SUB_BITS + 1) << _SUB_BITS)
 
     @property
@@ -78,23 +64,20 @@ class Pacer:
         """Accounts one tick as done at `now_ns`; its lateness [ns], 0 when not after its deadline."""
         lateness = max(0, now_ns - self.next_deadline_ns)
         self._done += 1
-        self._last_ns = now_ns
         self._finished += 1
         self._late += lateness > self.period_ns
         self._max_ns = max(self._max_ns, lateness)
         self._buckets[_bucket(lateness)] += 1
         return lateness
 
-    def skip_backlog(self, now_ns: int) -> Backlog | None:
-        """Gives up all overdue ticks but the newest when more than `max_backlog_ns` behind; else None. Once a step."""
+    def skip_backlog(self, now_ns: int) -> int:
+        """Gives up all overdue ticks but the newest when more than `max_backlog_ns` behind: how many. Once a step."""
         if self.paused or now_ns - self.next_deadline_ns <= self.max_backlog_ns:
-            return None
+            return 0
         ticks = self.ticks_due(now_ns) - 1
-        stalled = now_ns - self._last_ns > self.max_backlog_ns
         self._done += ticks
         self._missing += ticks
-        self._stalls += stalled
-        return Backlog(ticks, ticks * self.period_ns, stalled)
+        return ticks
 
     def pause(self, now_ns: int) -> None:
         """Stops the grid; ticks that are overdue by more than a period now are missing for good."""
@@ -103,39 +86,34 @@ class Pacer:
             self.paused = True
 
     def resume(self, now_ns: int) -> None:
-        """Starts a new grid at `now_ns`, counted in `anchors`. Nothing happens when not paused."""
+        """Starts a new grid at `now_ns`. Nothing happens when not paused."""
         if self.paused:
-            self._anchor(now_ns)
-
-    def restart(self, now_ns: int) -> None:
-        """A reset of the scene: a new grid at `now_ns`, unless paused."""
-        if not self.paused:
-            self._missing += self._overdue(now_ns)
-            self._anchor(now_ns)
-
-    def _anchor(self, now_ns: int) -> None:
-        self.paused = False
-        self._start_ns = self._last_ns = now_ns
-        self._done = 0
-        self._anchors += 1
+            self.paused = False
+            self._start_ns = now_ns
+            self._done = 0
 
     def _overdue(self, now_ns: int) -> int:
         """Ticks that can only be late now: due more than a period ago and not done."""
         return max(0, -(-(now_ns - self._start_ns) // self.period_ns) - 2 - self._done)
 
-    def stats(self, now_ns: int) -> PacerStats:
-        """Accounting up to `now_ns`; what is overdue by more than a period counts as missing."""
+    def stats(self, now_ns: int, *, anew: bool = False) -> PacerStats:
+        """Accounting up to `now_ns`; what is overdue by more than a period counts as missing.
+
+        `anew`: percentiles and maximum are of the ticks from here on; the counts stay.
+        """
         missing = self._missing + (0 if self.paused else self._overdue(now_ns))
         ticks, late = self._finished + missing, self._late + missing
         share = late / ticks if ticks else 0.0
         p50, p99 = self._percentile(0.50), self._percentile(0.99)
-        return PacerStats(
-            ticks, self._finished, late, missing, share, p50, p99, self._max_ns, self._stalls, self._anchors
-        )
+        stats = PacerStats(ticks, self._finished, late, missing, share, p50, p99, self._max_ns)
+        if anew:
+            self._max_ns = 0
+            self._buckets = [0] * len(self._buckets)
+        return stats
 
     def _percentile(self, share: float) -> int:
         """Upper edge of the bucket that holds the share, 0 without ticks."""
-        wanted = share * self._finished
+        wanted = share * sum(self._buckets)
         count = 0
         for index, n in enumerate(self._buckets):
             count += n

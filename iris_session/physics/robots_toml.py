@@ -21,6 +21,7 @@ import mujoco
 
 from iris_session.physics.errors import RobotsFileError, UnknownNameError, one_line
 from iris_session.physics.names import body_names, element_id, element_name, wire_name
+from iris_session.physics.specs import shared_by_robots
 from iris_session.physics.tree import Tree
 from iris_session.protocol.names import LeaseMode
 from iris_session.protocol.specs import RobotSpec
@@ -49,7 +50,8 @@ def load_robots_toml(path_or_text: str | Path, model: mujoco.MjModel) -> tuple[R
         raise RobotsFileError(f"{where}: expected only [[robot]] tables, found {', '.join(unknown) or 'robot'}")
     tree = Tree(model)
     robots = tuple(_robot(tree, table, f"{where}, robot {index + 1}") for index, table in enumerate(tables))
-    _check_disjoint(robots, where)
+    if shared := shared_by_robots(robots):
+        raise RobotsFileError(f"{where}: {shared}")
     return robots
 
 
@@ -189,17 +191,3 @@ def _check_gripper(tree: Tree, fields: dict[str, Any], where: str) -> None:
     for value in (opened, closed):
         if int(tree.model.actuator_ctrllimited[actuator]) and not low <= value <= high:
             raise RobotsFileError(f"{where}gripper value {value} is outside the ctrlrange {low} to {high} of {name!r}")
-
-
-def _check_disjoint(robots: Sequence[RobotSpec], where: str) -> None:
-    """No name, joint or actuator may belong to two robots."""
-    owner: dict[tuple[str, str], str] = {}
-    for robot in robots:
-        keys = [("name", robot.name), *(("joint", j) for j in robot.joints)]
-        keys += [("actuator", a) for a in (*robot.actuators, robot.gripper_actuator) if a]
-        for kind, name in keys:
-            if (kind, name) in owner:
-                raise RobotsFileError(
-                    f"{where}: {kind} {name!r} belongs to robot {owner[kind, name]!r} and to robot {robot.name!r}"
-                )
-            owner[kind, name] = robot.name

@@ -2,10 +2,9 @@
 
 A tick is `mj_step2` then `mj_step1`: the arithmetic of `mj_step` shifted by half a step, so that after a tick every
 derived quantity (poses, contacts) belongs to the new state. Write `ctrl` and `xfrc_applied` between ticks as usual.
-Mocap poses and `eq_active` enter MuJoCo's position stage: after writing those between ticks, call `refresh`.
 
-In a user's loop the user's `MjData` is only read: the view shows a private copy that `after_user_step` brings up to
-date, because after `mj_step` the user's own derived quantities are those of the state before it.
+In a user's loop the world is a twin that `set_state_bytes` brings up to date, because after `mj_step` the user's own
+derived quantities are those of the state before it.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from numpy.typing import NDArray
 from iris_session.physics.contacts import ContactTables
 from iris_session.physics.errors import (
     ModelUnsupportedError,
-    NotOwnerError,
     SimulationDivergedError,
     SnapshotError,
     one_line,
 )
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.physics.names import body_names, element_id, element_names
+from iris_session.physics.specs import check_specs
 from iris_session.physics.tree import Tree
 from iris_session.physics.view import LiveView
 from iris_session.protocol.common import Pose
@@ -74,11 +73,12 @@ _decoder = msgspec.msgpack.Decoder(_Saved)
 
 
 class World:
-    """The simulated scene. `data` given: it belongs to a user's loop (`after_user_step`), else to ours (`tick`).
+    """The simulated scene.
 
     `keyframe`: the initial state by name; empty takes `home`, else the first keyframe, else the model's default state.
-    Raises `UnknownNameError` for specs that do not fit the model, and `ModelUnsupportedError` for sleeping islands in
-    our own loop, whose hidden state MuJoCo cannot restore. The model must not be changed afterwards.
+    Raises `UnknownNameError` for specs that do not fit the model, `SpecError` for those that do not fit each other, and
+    `ModelUnsupportedError` for sleeping islands, whose hidden state MuJoCo cannot restore. The model must not be
+    changed afterwards.
     """
 
     def __init__(
@@ -86,22 +86,19 @@ class World:
         model: mujoco.MjModel,
         robots: Sequence[RobotSpec],
         objects: Sequence[ObjectSpec],
-        data: mujoco.MjData | None = None,
         keyframe: str = "",
     ) -> None:
         self.model = model
-        self.user_owned = data is not None
-        if not self.user_owned:
-            _require_exact(model)
-        self._shown: Any = mujoco.MjData(model)
-        #: What control writes to: the user's data, or ours.
-        self.data: Any = self._shown if data is None else data
+        _require_exact(model)
+        check_specs(model, robots, objects)
+        #: What control writes to, and what the view shows.
+        self.data: Any = mujoco.MjData(model)
         self._keyframe = _initial_keyframe(model, keyframe)
         self._split = int(model.opt.integrator) in _SPLIT_INTEGRATORS
         self._state: NDArray[np.float64] = np.empty(mujoco.mj_stateSize(model, STATE))
         tree = Tree(model)
         self._tables = ContactTables(model, robots, objects, tree)
-        self._view = LiveView(model, self._shown, robots, objects, self._tables)
+        self._view = LiveView(model, self.data, robots, objects, self._tables)
         self.bodies = _body_infos(model, tree, objects)
         ids = [b.id for b in self.bodies]
         whole = bool(ids) and ids == list(range(ids[0], ids[0] + len(ids)))
@@ -116,21 +113,14 @@ class World:
         self._shown_state = b""
         #: Empty while all is well, else what went wrong, until `reset` or `restore`.
         self.diverged = ""
-        self._user_time = float(self.data.time)
-        if self.user_owned:
-            self.after_user_step()
-        else:
-            self.reset()
-
-    # --- our own loop -------------------------------------------------------------------------------------------------
+        self.reset()
 
     def reset(self) -> None:
         """Back to the initial keyframe (or default state), tick 0."""
-        self._require_owner(user=False)
         if self._keyframe >= 0:
-            mujoco.mj_resetDataKeyframe(self.model, self._shown, self._keyframe)
+            mujoco.mj_resetDataKeyframe(self.model, self.data, self._keyframe)
         else:
-            mujoco.mj_resetData(self.model, self._shown)
+            mujoco.mj_resetData(self.model, self.data)
         self._forces = (0.0,) * len(self._forces)
         self._derive(0)
 
@@ -139,9 +129,8 @@ class World:
 
         Raises `SimulationDivergedError`, again and again until `reset` or `restore`.
         """
-        model, data = self.model, self._shown
-        if self.user_owned or self.diverged:
-            self._require_owner(user=False)
+        model, data = self.model, self.data
+        if self.diverged:
             raise SimulationDivergedError(self._tick, float(data.time), self.diverged)
         try:
             if self._split:
@@ -156,37 +145,14 @@ class World:
         self._set_tick(self._tick + 1)
         self._check(data)
 
-    def refresh(self) -> None:
-        """Recomputes what follows from the state, after mocap poses, `eq_active` or `qpos` were written."""
-        self._require_owner(user=False)
-        self._derive(self._tick)
-
-    # --- a user's loop ------------------------------------------------------------------------------------------------
-
-    def after_user_step(self) -> bool:
-        """Takes over the state of the user's data. True when its time went back: a reset, the tick is 0 again.
-
-        The tick advances by the timesteps that passed, so several `mj_step` may lie between two calls.
-        Raises `SimulationDivergedError` for numbers that are not finite.
-        """
-        self._require_owner(user=True)
-        mujoco.mj_getState(self.model, self.data, self._state, STATE)
-        time = float(self.data.time)
-        passed = time - self._user_time
-        self._user_time = time
-        ticks = max(1, round(passed / float(self.model.opt.timestep))) if passed > 0.0 else 0
-        self._show(0 if passed < 0.0 else self._tick + ticks)
-        return passed < 0.0
-
     def set_state_bytes(self, state: bytes) -> None:
         """Shows a plant that is advanced elsewhere (`state_bytes` of the same model). The tick follows from its time.
 
         Everything the view shows afterwards, contact forces included, is a function of `state` alone.
         """
-        self._require_owner(user=False)
         self._load_state(state)
         if state == self._shown_state:  # shown already: only inputs may have been written since
-            mujoco.mj_setState(self.model, self._shown, self._state, STATE)
+            mujoco.mj_setState(self.model, self.data, self._state, STATE)
             self.diverged = ""
             return
         time = float(self._state[0])
@@ -194,7 +160,7 @@ class World:
 
     def _show(self, tick: int) -> None:
         """`_state` into the shown data with everything derived, contact forces too; the state itself stays as it is."""
-        model, data = self.model, self._shown
+        model, data = self.model, self.data
         self.diverged = "" if np.isfinite(self._state).all() else "the state holds numbers that are not finite"
         if self.diverged:
             raise SimulationDivergedError(tick, float(self._state[0]), self.diverged)
@@ -218,8 +184,8 @@ class World:
 
     def poses(self, out: NDArray[np.float64]) -> None:
         """Writes world poses of `bodies`, `x y z qw qx qy qz`, into `out`, shape (len(bodies), 7)."""
-        out[:, :3] = self._shown.xpos[self._rows]
-        out[:, 3:] = self._shown.xquat[self._rows]
+        out[:, :3] = self.data.xpos[self._rows]
+        out[:, 3:] = self.data.xquat[self._rows]
 
     @property
     def trouble(self) -> dict[str, int]:
@@ -235,7 +201,7 @@ class World:
 
     def state_bytes(self) -> bytes:
         """`mjSTATE_INTEGRATION` as little-endian float64: time, positions, velocities, warm start, inputs, ..."""
-        mujoco.mj_getState(self.model, self._shown, self._state, STATE)
+        mujoco.mj_getState(self.model, self.data, self._state, STATE)
         return self._state.tobytes()
 
     def snapshot(self) -> bytes:
@@ -244,7 +210,6 @@ class World:
 
     def restore(self, snapshot: bytes) -> None:
         """Inverse of `snapshot`, bit for bit. Raises `SnapshotError` for other bytes or another model's."""
-        self._require_owner(user=False)
         try:
             saved = _decoder.decode(snapshot)
         except msgspec.DecodeError as error:
@@ -254,8 +219,8 @@ class World:
         if len(saved.forces) != len(self._forces):
             raise SnapshotError(f"snapshot with {len(saved.forces)} robots, but this world has {len(self._forces)}")
         self._load_state(saved.state)
-        mujoco.mj_resetData(self.model, self._shown)  # clears warnings and whatever is outside the state
-        mujoco.mj_setState(self.model, self._shown, self._state, STATE)
+        mujoco.mj_resetData(self.model, self.data)  # clears warnings and whatever is outside the state
+        mujoco.mj_setState(self.model, self.data, self._state, STATE)
         self._forces = saved.forces
         self._derive(saved.tick)
         self.diverged = saved.diverged
@@ -270,7 +235,7 @@ class World:
     def _derive(self, tick: int) -> None:
         """Positions, contacts and velocities of the state that was just put into the shown data."""
         try:
-            mujoco.mj_step1(self.model, self._shown)
+            mujoco.mj_step1(self.model, self.data)
         except mujoco.FatalError as error:
             self._give_up(error)
         self.diverged = ""
@@ -291,15 +256,7 @@ class World:
 
     def _give_up(self, error: mujoco.FatalError) -> NoReturn:
         self.diverged = one_line(error)
-        raise SimulationDivergedError(self._tick, float(self._shown.time), self.diverged) from error
-
-    def _require_owner(self, *, user: bool) -> None:
-        if user and not self.user_owned:
-            raise NotOwnerError("this world has its own loop: call tick(), not after_user_step()")
-        if not user and self.user_owned:
-            raise NotOwnerError(
-                "the data of this world belongs to the user's loop: step or reset it there, then after_user_step()"
-            )
+        raise SimulationDivergedError(self._tick, float(self.data.time), self.diverged) from error
 
 
 def _require_exact(model: mujoco.MjModel) -> None:

@@ -19,9 +19,9 @@ from iris_session.client.session_state import SessionMirror
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, decode_entries, encode_entries
-from iris_session.protocol.server_messages import ConsentRequested, Snapshot
+from iris_session.protocol.server_messages import ConsentRequested, Reply, Snapshot
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.protocol.steps import Command, Decision
+from iris_session.protocol.steps import Command, Decision, FixedView, ObjectContact
 
 from .table import MS, SECOND, make_view, proposal, robot
 
@@ -68,7 +68,7 @@ class Play:
     def __init__(self, rng: Random, policy: str = "join-order") -> None:
         self.config = msgspec.structs.replace(CONFIG, policy=policy, assignments={"anna": ("left",)})
         self.authority, self.twin = self.fresh(), self.fresh()
-        self.journal: list[tuple[int, bytes, int]] = []
+        self.journal: list[tuple[int, bytes, int, FixedView]] = []
         self.results: list[bytes] = []
         self.now_ns = SECOND
         self.entries: list[Entry] = []
@@ -78,8 +78,13 @@ class Play:
         self.decision = Decision(())
         self.consents = [1]
         self.view = make_view()
+        self.request_id = 0
+        #: Requests without a reply so far, as (connection, request id).
+        self.open: set[tuple[int, int]] = set()
         self.opened: set[tuple[str, str, str]] = set()
         self.engagements: dict[tuple[str, str], int] = {}
+        #: Where a device was that moved something, by (participant, connection, device, tracking epoch).
+        self.moved_from: dict[tuple[str, int, str, int], tuple[int, Pose]] = {}
         self.newest_engagement = 0
         self.moved = 0
         self.flush()
@@ -98,10 +103,18 @@ class Play:
         return self.authority._ctx.state
 
     def host(self, message: Any) -> None:
-        self.entries.append(Entry(0, 0, self.now_ns, message))
+        self.add(0, message)
 
     def say(self, client: Client, message: Any) -> None:
-        self.entries.append(Entry(client.connection, client.connection, self.now_ns, message))
+        self.add(client.connection, message)
+
+    def add(self, connection: int, message: Any) -> None:
+        if hasattr(message, "request_id"):
+            self.request_id += 1
+            message = msgspec.structs.replace(message, request_id=self.request_id)
+            if not isinstance(message, cm.GetSnapshot):
+                self.open.add((connection, self.request_id))
+        self.entries.append(Entry(connection, connection, self.now_ns, message))
 
     # --- steps ---
 
@@ -110,11 +123,13 @@ class Play:
         blob = encode_entries(self.entries)
         entries = decode_entries(blob)
         self.entries = []
+        before = self.connected()
         self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view)
-        self.journal.append((self.now_ns, blob, n_ticks))
+        self.journal.append((self.now_ns, blob, n_ticks, self.view))
         self.results.append(_encode(self.decision))
         assert _decode(self.results[-1]) == self.decision, "a client's schema would not take this"
         assert _encode(self.twin.step(self.now_ns, entries, n_ticks, self.view)) == self.results[-1]
+        self.view = self.moved_on(n_ticks)
         for admitted in self.decision.admitted:
             next(c for c in self.people if c.connection == admitted.connection).id = admitted.participant_id
         self.consents += [e.body.consent_id for e in self.decision.events if isinstance(e.body, ConsentRequested)]
@@ -123,6 +138,22 @@ class Play:
         self.check_urgent(entries)
         self.check_bounds()
         self.check_queue()
+        self.check_replies()
+        self.check_dropped(before, entries)
+
+    def moved_on(self, n_ticks: int) -> FixedView:
+        """The world a few ticks later: robots sway, grippers touch things, and now and then physics diverges."""
+        tick = self.view.tick + n_ticks
+        view = make_view(tick=tick, sim_time=0.002 * tick)
+        if not n_ticks or not hasattr(self, "rng"):
+            return view
+        rng, nowhere = self.rng, self.rng.random() < 0.05
+        lie = Pose((math.nan if nowhere else 0.001 * (tick % 50), 0.0, 0.2), (1.0, 0.0, 0.0, 0.0))
+        touching = tuple(name for name in NAMES if rng.random() < 0.3)
+        contacts = (ObjectContact("hammer", touching[:1], touching, ("table",) if rng.random() < 0.1 else ()),)
+        return msgspec.structs.replace(
+            view, objects={**view.objects, "hammer": lie}, contacts=contacts, forces={"left": rng.choice([0.0, 3.0])}
+        )
 
     def swap(self) -> None:
         """A crash between two steps: a new process continues from the snapshot."""
@@ -136,8 +167,8 @@ class Play:
     def replay(self) -> None:
         """The journal alone gives the same effects and the same state."""
         again = self.fresh()
-        for (now_ns, blob, n_ticks), result in zip(self.journal, self.results, strict=True):
-            assert _encode(again.step(now_ns, decode_entries(blob), n_ticks, self.view)) == result
+        for (now_ns, blob, n_ticks, view), result in zip(self.journal, self.results, strict=True):
+            assert _encode(again.step(now_ns, decode_entries(blob), n_ticks, view)) == result
         assert again.snapshot() == self.authority.snapshot()
 
     # --- what people do ---
@@ -165,13 +196,16 @@ class Play:
         client = Client(self.connections, role, old.key if old is not None else f"key{self.connections}")
         self.people.append(client)
         need = "not_needed" if role in ("agent", "leader") else "measured"
-        self.say(client, Join(client.key, role, "anna", alignment=need, resume_of=old.id if old is not None else ""))
+        gates = [c.connection for c in self.people if c.role == "gateway" and self.still_here(c)]
+        through = gates[-1] if gates and role != "gateway" and len(self.people) % 2 else 0
+        resume_of = old.id if old is not None else ""
+        self.say(client, Join(client.key, role, "anna", alignment=need, resume_of=resume_of, gateway=through))
         self.flush()
         if role == "operator":
             self.say(client, proposal())
 
     def join(self) -> None:
-        self.enter(self.rng.choice(["operator", "operator", "agent", "director", "observer", "leader"]))
+        self.enter(self.rng.choice(["operator", "operator", "agent", "director", "observer", "leader", "gateway"]))
 
     def resume(self) -> None:
         old = self.who()
@@ -257,6 +291,8 @@ class Play:
             "q": (0.0,) * 7 if device == "joints" else (),
             "gripper": 0.25,
         }
+        if forged.get("kind") == "twist":
+            fields |= {"pose": None, "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.1)}
         return cm.Sample(**{**fields, **forged})
 
     def held(self, client: Client) -> tuple[str, ...]:
@@ -279,20 +315,28 @@ class Play:
     def keep_going(self) -> None:
         """Everyone sends one more sample, mostly with the clutch closed."""
         for client in [c for c in self.people if self.still_here(c)]:
-            self.say(client, self.sample(client, self.held(client), client.device, self.rng.random() < 0.9))
+            fields: Any = {}
+            if client.device != "joints" and self.rng.random() < 0.2:
+                far = Pose((3.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+                fields = self.rng.choice([{"kind": "twist"}, {"kind": "twist"}, {"pose": far}, {"tracked": False}])
+            names = self.held(client) if self.rng.random() < 0.9 else ()
+            self.say(client, self.sample(client, names, client.device, self.rng.random() < 0.9, **fields))
         self.now_ns += 14 * MS
         self.flush()
 
     def odd_sample(self) -> None:
         client = self.who()
-        fields = {"worn": self.rng.random() < 0.7, "tracked": self.rng.random() < 0.7}
+        fields: dict[str, Any] = {"worn": self.rng.random() < 0.7, "tracked": self.rng.random() < 0.7}
+        if self.rng.random() < 0.2:
+            fields["kind"] = "twist"
         device, clutch = self.rng.choice(DEVICES), self.rng.random() < 0.5
-        self.say(client, self.sample(client, self.some(), device, clutch, **fields))
+        names = self.some() if self.rng.random() < 0.7 else ()
+        self.say(client, self.sample(client, names, device, clutch, **fields))
 
     def forge(self) -> None:
         client, rng = self.who(), self.rng
         wrong, x = rng.randrange(7), rng.choice([1e-3, math.nan, math.inf, 1e300, -1e300])
-        forged = rng.choice(
+        forged: dict[str, Any] = rng.choice(
             [
                 {"scene_epoch": wrong},
                 {"tracking_epoch": wrong},
@@ -306,6 +350,8 @@ class Play:
             ]
         )
         s = self.sample(client, self.some(), client.device, True, **forged)
+        if rng.random() < 0.2:
+            s = self.sample(client, (), client.device, True)
         claimed = client if rng.random() < 0.7 else self.who()
         self.entries.append(Entry(client.connection, claimed.connection, self.now_ns, s))
 
@@ -338,6 +384,9 @@ class Play:
         for c in self.decision.commands:
             assert (c.kind == "hold") == (c.hold_reason != "") == (not c.sources)
             assert len(c.sources) <= 1 or self.state.robots[c.robot].mode == "shared"
+            if self.state.robots[c.robot].mode == "shared":
+                engaged = [g.participant for g in self.state.robots[c.robot].grants if g.engagement]
+                assert [s.participant for s in c.sources] == engaged, "who is engaged drives"
             assert not c.sources or math.isclose(sum(s.weight for s in c.sources), 1.0)
             assert not c.sources or c.scale == self.mirror.leases[c.robot].scale
             assert 0.05 <= c.scale <= 5.0
@@ -357,6 +406,8 @@ class Play:
         grants = {g.participant: g for g in lease.grants}
         for s in c.sources:
             self.moved += 1
+            payload = {"pose": s.pose_world, "twist": s.twist_world, "joints": s.q or None}
+            assert [kind for kind, value in payload.items() if value is not None] == [c.kind], "kinds do not mix"
             assert s.participant in grants, "moved by one who does not hold it"
             p = self.state.participants[s.participant]
             assert p.connection > 0
@@ -379,6 +430,12 @@ class Play:
             assert isinstance(m, cm.Sample)
             assert e.connection_epoch == e.connection
             assert m.clutch
+            if m.kind == "pose" and m.pose is not None:
+                device = (p.id, p.connection, s.device, p.tracking_epoch)
+                then, before = self.moved_from.get(device, (m.capture_ns, m.pose))
+                bound = max(0, m.capture_ns - then) * 1e-9 * 10.0 + CONFIG.speed_slack_m
+                assert math.dist(m.pose.p, before.p) <= bound, "nobody moves that fast"
+                self.moved_from[device] = (m.capture_ns, m.pose)
             assert (m.scene_epoch, m.tracking_epoch) == (self.decision.scene_epoch, p.tracking_epoch)
             (version, *_) = [t.lease_version for t in m.targets if t.name == c.robot]
             assert grants[s.participant].version <= version <= lease.version
@@ -413,6 +470,28 @@ class Play:
             assert len(lease.grants) <= 1 or lease.mode in ("shared", "priority")
             assert all(1 <= g.version <= lease.version for g in lease.grants)
             assert not lease.override or lease.override in [g.participant for g in lease.grants[1:]]
+
+    def check_replies(self) -> None:
+        """Every request gets exactly one reply: at once, or when it no longer waits. Who is gone may get none."""
+        for out in self.decision.outgoing:
+            if isinstance(out.message, Reply):
+                assert (out.connection, out.message.request_id) in self.open, "a second reply, or to nobody's request"
+                self.open.remove((out.connection, out.message.request_id))
+        people, state = self.state.participants, self.state
+        waiting = {(people[w.participant].connection, w.request_id) for w in (*state.queue, *state.consents)}
+        here = {p.connection for p in people.values()}
+        assert {asked for asked in self.open if asked[0] in here} == waiting
+
+    def connected(self) -> set[int]:
+        return {p.connection for p in self.state.participants.values() if p.connection > 0}
+
+    def check_dropped(self, before: set[int], entries: list[Entry]) -> None:
+        """The front learns of every connection that the authority is done with, unless it said so itself."""
+        if any(isinstance(e.message, FrontRestarted) for e in entries):
+            return
+        known = {e.connection for e in entries if isinstance(e.message, Lost)}
+        known |= {d.connection for d in self.decision.dropped}
+        assert before - self.connected() <= known
 
     def check_queue(self) -> None:
         """No deadlock: nobody waits while holding, and every wait has a robot that is held or promised before it."""

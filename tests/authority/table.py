@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Message, Sample
-from iris_session.protocol.common import IDENTITY, Lease, Pose, Target
+from iris_session.protocol.client_messages import Acquire, Sample
+from iris_session.protocol.common import IDENTITY, EventBody, Lease, Message, Pose, Target
 from iris_session.protocol.entries import AlignmentProposal, Entry, Join
-from iris_session.protocol.server_messages import EventBody, Feedback, Reply
+from iris_session.protocol.server_messages import Feedback, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import Command, ControlStatus, Decision, FixedView
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Release, TrackingEpoch
+from iris_session.protocol.client_messages import Acquire, Bye, Release, TrackingEpoch
 from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import Entry, Join, Lost
 from iris_session.protocol.server_messages import LeaseChanged
 
 from .table import Person, Table, robot
@@ -50,6 +51,49 @@ def test_config_gives_a_name_its_robots_and_nobody_elses() -> None:
     assert anna.denied(ANY) == "held"
     t.step(t.persons[3].says(Release()))
     assert got(anna) == ["left", "right"]
+
+
+def test_a_second_key_under_an_assigned_name_gets_nothing_while_the_first_is_here_or_in_grace() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left",)}))
+    anna, mallory = t.join(name="anna"), t.join(name="anna")
+    for _ in range(2):
+        assert mallory.denied(ANY) == "policy"
+        assert mallory.denied(Acquire(1, ("left",))) == "policy"
+        assert "key:key2" in mallory.replies()[0].denial.advice  # type: ignore[union-attr]
+        t.step(anna.says(Lost()))
+    assert mallory.acquire("right").ok
+    t.step(mallory.says(Release()))
+    t.people += 1
+    again = t.persons[t.people] = Person(t, t.people, "anna")
+    t.step(Entry(t.people, t.people, t.now_ns, Join("key1", "operator", "anna", resume_of=anna.id)))
+    assert got(again) == ["left"]
+    again.does(Bye())
+    assert got(mallory) == ["left"], "who waits takes over the name when the first has left for good"
+
+
+def test_a_name_taken_on_by_a_resume_is_not_ones_own() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"anna": ("left",)}))
+    mallory, anna = t.join(name="mallory"), t.join(name="anna")
+    t.people += 1
+    again = t.persons[t.people] = Person(t, t.people, "anna")
+    t.step(Entry(t.people, t.people, t.now_ns, Join("key1", "operator", "anna", resume_of=mallory.id)))
+    assert again.denied(ANY) == "policy"
+    assert got(anna) == ["left"]
+
+
+def test_robots_assigned_to_a_key_are_its_own_whatever_its_name() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"key:key2": ("right",), "anna": ("left",)}))
+    anna, bert = t.join(name="anna"), t.join(name="anna")
+    assert got(bert) == ["right"]
+    assert anna.denied(Acquire(1, ("right",))) == "policy"
+    assert got(anna) == ["left"]
+
+
+def test_a_name_that_looks_like_a_key_is_no_key() -> None:
+    t = Table(AuthorityConfig(policy="config", assignments={"key:key9": ("right",)}))
+    mallory = t.join(name="key:key9")
+    assert mallory.denied(ANY) == "policy"
+    assert mallory.denied(Acquire(1, ("right",))) == "policy"
 
 
 def test_unassigned_robots_are_free_for_all_under_config() -> None:

@@ -80,9 +80,9 @@ def test_strangers_and_wrong_envelopes_are_answered() -> None:
     t.step(Entry(9, 9, t.now_ns, Acquire(3, ("left",))))
     (out,) = t.decision.outgoing
     assert (out.connection, out.message.denial.reason) == (9, "not_joined")
-    t.step(Entry(anna.connection, 9, t.now_ns, Acquire(3, ("left",))), Entry(9, 9, t.now_ns, EStop()))
+    t.step(Entry(anna.connection, 9, t.now_ns, Acquire(3, ("left",))), Entry(9, 9, t.now_ns, Release(4)))
     assert anna.replies()[0].denial.reason == "not_joined"
-    assert not t.decision.estop
+    assert [o.message.denial.reason for o in t.decision.outgoing if o.connection == 9] == ["not_joined"]
     t.step(Entry(anna.connection, 9, t.now_ns, Bye()))
     assert t.decision.dropped == ()
 

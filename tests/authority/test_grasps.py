@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -125,3 +126,27 @@ def test_nothing_is_taken_hold_of_in_the_step_of_a_reset() -> None:
     assert t.decision.objects == ()
     anna.engage("hammer", **LEFT)
     assert t.decision.objects != ()
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        Pose((math.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        Pose((1e300, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        Pose((0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)),
+        Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_an_object_that_is_nowhere_is_not_held_and_needs_a_new_clutch(pose: Pose) -> None:
+    t = Table()
+    anna = t.operator()
+    anna.asks(Grasp(1, "hammer", "hand/left"))
+    t.view = make_view(objects={"hammer": pose})
+    anna.engage("hammer", **LEFT)
+    assert t.decision.objects == ()
+    assert not t.last(ObjectGrasped).grasped
+    t.view = make_view()
+    move(anna, LEFT, 0.0, "hammer")
+    assert t.decision.objects == ()
+    anna.engage("hammer", **LEFT)
+    assert t.decision.objects[0].T_world_object.p == pytest.approx((0.0, 0.0, 0.2))

@@ -5,10 +5,17 @@ from __future__ import annotations
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, Release, SetMode
+from iris_session.authority.state import Pending
+from iris_session.protocol.client_messages import Acquire, Assign, Consent, Control, Grasp, Heartbeat, Release, SetMode
 from iris_session.protocol.common import Target
 from iris_session.protocol.entries import Lost
-from iris_session.protocol.server_messages import ConsentRequested, Feedback, Intervention, LeaseChanged
+from iris_session.protocol.server_messages import (
+    ConsentRequested,
+    Feedback,
+    Intervention,
+    LeaseChanged,
+    SamplesRejected,
+)
 
 from .table import MS, SECOND, Table, robot
 
@@ -198,6 +205,29 @@ def test_consented_request_that_met_another_obstacle_is_denied() -> None:
     assert anna.acquire("left").leases[0].holder == anna.id
 
 
+def test_one_request_for_consent_each_and_it_is_answered_once() -> None:
+    t = with_mode("request")
+    anna, bert, carl = t.operator("left"), t.operator("right"), t.join()
+    carl.does(Acquire(1, ("left",)))
+    assert carl.denied(Acquire(2, ("right",))) == "consent_pending"
+    carl.does(Acquire(3, ("right", "left"), wait=True))
+    assert [r.request_id for r in carl.replies()] == [3]
+    t.step(anna.says(Release(7)), bert.says(Release(8)))
+    assert [(r.request_id, r.ok) for r in carl.replies()] == [(1, True)]
+
+
+def test_a_request_that_ended_another_is_not_answered_again() -> None:
+    t = with_mode("request")
+    anna, bert, carl, dora = t.operator("left"), t.operator("right"), t.join(), t.join()
+    carl.does(Acquire(1, ("left",)))
+    state = t.authority._ctx.state
+    state.consents.append(Pending(carl.id, 2, ("right",), (), 1.0, expires_ns=t.now_ns + SECOND))
+    state.consents[-1].consents[99] = "right"
+    t.step(anna.says(Release(7)), bert.says(Release(8)))
+    assert sorted((r.request_id, r.ok) for r in carl.replies()) == [(1, True), (2, False)]
+    assert dora.acquire("right").ok
+
+
 # --- takeover ---
 
 
@@ -273,6 +303,58 @@ def test_an_intervention_ends_when_either_side_leaves(leaving: str) -> None:
         assert len(t.last(LeaseChanged).lease.sub_holders) == 0
 
 
+def test_an_intervention_ends_when_its_human_is_silent_for_two_seconds() -> None:
+    t = with_mode("priority")
+    agent, human = t.join("agent", alignment="not_needed"), t.operator()
+    agent.acquire("left")
+    human.acquire("left")
+    human.engage("left")
+
+    def wait(duration_ns: int) -> None:
+        for _ in range(duration_ns // (20 * MS)):
+            t.step(agent.says(Heartbeat()), human.says(Heartbeat()), dt_ns=20 * MS)
+
+    wait(100 * MS)
+    assert (agent.told["left"].state, agent.told["left"].hold_reason) == ("hold", "intervention")
+    assert human.told["left"].state == "pose"
+    wait(1900 * MS)
+    assert t.last(Intervention).active, "it counts from the last engagement"
+    assert (t.hold(), human.told["left"].hold_reason) == ("stale", "stale")
+    wait(400 * MS)
+    assert t.last(Intervention) == Intervention("left", human.id, agent.id, False)
+    agent.engage("left", device="target")
+    assert t.command().sources[0].participant == agent.id
+    human.engage("left")
+    assert t.last(Intervention).active, "and the human may step in again"
+
+
+def test_an_intervention_outlasts_a_standstill_and_a_pause() -> None:
+    t = with_mode("priority")
+    agent, human, boss = t.join("agent", alignment="not_needed"), t.operator(), t.join("director")
+    agent.acquire("left")
+    human.acquire("left")
+    human.engage("left")
+    t.step(dt_ns=5_000 * MS)
+    assert t.last(Intervention).active, "the session stood still, not the human"
+    boss.does(Control(1, "pause"))
+    for _ in range(200):
+        t.step(*(p.says(Heartbeat()) for p in (agent, human, boss)), dt_ns=20 * MS, n_ticks=0)
+    assert t.last(Intervention).active, "who looks and thinks keeps the robot"
+
+
+def test_a_leader_arm_is_a_human_hand() -> None:
+    t = with_mode("priority")
+    joints = {"device": "joints", "kind": "joints", "pose": None, "q": (0.0,) * 7}
+    agent, leader = t.join("agent", alignment="not_needed"), t.join("leader", alignment="not_needed")
+    agent.acquire("left")
+    agent.engage("left", device="target")
+    assert leader.acquire("left").ok
+    leader.engage("left", **joints)
+    assert t.command().sources[0].participant == leader.id
+    assert leader.acquire("right").ok
+    assert t.operator().denied(Acquire(1, ("right",))) == "held"
+
+
 def test_humans_and_agents_among_themselves_are_exclusive_in_priority_mode() -> None:
     t = with_mode("priority")
     human, agent, other = t.operator("left"), t.join("agent"), t.join("agent")
@@ -303,12 +385,20 @@ def test_shared_robot_blends_by_normalised_weights() -> None:
     anna.sends("left")
     assert [(s.participant, s.weight) for s in t.command().sources] == [(bert.id, 1.0)]
     twist = {"kind": "twist", "pose": None, "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.0)}
-    anna.sends("left", **twist)
-    anna.sends("left", **twist, clutch=True)
-    assert [s.participant for s in t.command().sources] == [bert.id]  # another kind of command waits for its turn
+    anna.engage("left", **twist)
+    assert t.since(SamplesRejected)[0].reason == "kind"  # poses and twists cannot be blended
+    assert [s.participant for s in t.command().sources] == [bert.id]
     bert.sends("left")
-    assert t.command().kind == "twist"
-    assert t.command().gripper is None
+    anna.engage("left", **twist)
+    assert (t.command().kind, t.command().gripper) == ("twist", None)
+    bert.engage("left")
+    assert t.last(SamplesRejected).reason == "kind"
+    bert.engage("left", **twist)
+    assert len(t.command().sources) == 2
+    bert.sends("left", clutch=True)
+    assert [s.participant for s in t.command().sources] == [anna.id], "changing the kind ends one's own engagement"
+    anna.sends("left", clutch=True)
+    assert t.command().kind == "pose", "who drives alone may change it"
 
 
 def test_joining_does_not_fence_the_first_sharer() -> None:

@@ -236,3 +236,62 @@ def test_capture_times_that_go_back_and_forth_make_no_time_for_a_jump() -> None:
     assert t.command().kind == "pose"
     anna.sends("left", clutch=True, p=(0.9, 0.0, 1.0))
     assert t.hold() == "rejected"
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        {"kind": "twist", "pose": None, "twist": (0.0,) * 6},
+        {"tracked": False},
+        {"worn": False},
+        {"tracked": False, "pose": None},
+    ],
+)
+def test_nothing_sent_in_between_makes_a_jump_possible(between: dict[str, Any]) -> None:
+    t, op = engaged()
+    op.sends(**between)
+    op.sends(p=(0.9, 0.0, 1.0))
+    assert t.last(SamplesRejected).reason == "too_fast"
+    op.engage("left")
+    assert t.command().kind == "pose"
+
+
+def test_joints_of_another_number_do_not_make_a_jump_possible() -> None:
+    t = Table()
+    leader = t.join("leader", alignment="not_needed")
+    leader.acquire("left")
+    joints: dict[str, Any] = {"device": "joints", "kind": "joints", "pose": None}
+    leader.engage("left", **joints, q=(0.1,) * 7)
+    leader.sends(**joints, q=(0.0,) * 3)
+    leader.sends("left", **joints, q=(1.5,) * 7, clutch=True)
+    assert t.last(SamplesRejected).reason == "too_fast"
+    assert t.hold() == "rejected"
+
+
+def test_a_hand_that_was_not_tracked_for_a_while_may_be_elsewhere() -> None:
+    """The time that counts is that since the pose it is compared with."""
+    t, op = engaged()
+    for _ in range(10):
+        op.sends(tracked=False)
+        t.step(dt_ns=20 * MS)
+    op.engage("left", p=(0.9, 0.0, 1.0))
+    assert t.command().kind == "pose"
+
+
+def test_the_last_poses_of_a_device_survive_a_restart_of_the_authority() -> None:
+    t, op = engaged()
+    op.sends(kind="twist", pose=None, twist=(0.0,) * 6)
+    snapshot = t.authority.snapshot()
+    t.authority = Table(objects=("hammer",)).authority
+    t.authority.restore(snapshot)
+    op.sends(p=(0.9, 0.0, 1.0))
+    assert t.since(SamplesRejected)[0].reason == "too_fast"
+
+
+def test_a_robot_that_is_nowhere_is_not_near_its_leader() -> None:
+    t = Table(AuthorityConfig(leader_apart="refuse"))
+    leader = t.join("leader", alignment="not_needed")
+    leader.acquire("left")
+    t.view = make_view(q={"left": (NAN,) * 7})
+    leader.engage("left", device="joints", kind="joints", pose=None, q=(0.0,) * 7)
+    assert t.last(SamplesRejected).reason == "leader_apart"

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Release
+from iris_session.protocol.client_messages import Acquire, ClearEStop, Control, Episode, EStop, Heartbeat, Release
 from iris_session.protocol.entries import Entry, ExternalReset, Join, Lost, RecordingGap, StalledGap
 from iris_session.protocol.server_messages import (
     EpisodeChanged,
     EStopChanged,
     Gap,
     LeaseChanged,
+    ParticipantLeft,
     PauseChanged,
-    SamplesRejected,
     SceneChanged,
 )
 
@@ -81,6 +81,10 @@ def test_pause_and_resume_rearm() -> None:
     assert t.command().kind == "hold"
     boss.asks(Control(1, "step", 5))
     assert t.decision.step_ticks == 5
+    t.step(boss.says(Control(1, "step", 5)), boss.says(Control(2, "step", 7)))
+    assert t.decision.step_ticks == 12
+    t.step(boss.says(Control(1, "step", 10_000)), boss.says(Control(2, "step", 7)))
+    assert t.decision.step_ticks == 10_000
     boss.asks(Control(1, "pause"))
     assert t.since(PauseChanged) == []
     boss.asks(Control(1, "resume"))
@@ -138,10 +142,36 @@ def test_nobody_expires_in_a_gap_before_the_waiting_entries_came() -> None:
     assert (t.hold("left"), t.hold("right")) == ("clutch_open", "no_lease")
 
 
+def test_where_every_step_is_a_gap_the_silent_and_the_lost_expire_all_the_same() -> None:
+    t, op, _ = playing()
+    lost = t.operator("right")
+    t.step(lost.says(Lost()))
+    left = []
+    for _ in range(170):
+        t.step(dt_ns=200 * MS)
+        assert t.since(Gap) != []
+        left += [(e.participant, e.grace, t.now_ns) for e in t.since(ParticipantLeft)]
+    start = t.now_ns - 34 * SECOND
+    gone = {(who, grace): (when - start) * 1e-9 for who, grace, when in left}
+    assert gone[(op.id, True)] == pytest.approx(3.3, abs=0.3)
+    assert gone[(lost.id, False)] == pytest.approx(30.2, abs=0.5)
+    assert gone[(op.id, False)] == pytest.approx(33.3, abs=0.5)
+
+
+def test_who_speaks_in_a_session_of_slow_steps_stays() -> None:
+    t, op, _ = playing()
+    for _ in range(60):
+        t.step(op.says(Heartbeat()), dt_ns=200 * MS)
+    assert t.hold() == "gap"
+    t.step(dt_ns=3 * SECOND)
+    op.sends("left")
+    assert t.hold() == "clutch_open"
+
+
 def test_recording_gap_is_announced_and_only_by_the_host() -> None:
     t, op, _ = playing()
     t.step(t.host(RecordingGap(3)))
-    assert t.since(Gap) == [Gap("recording", 0)]
+    assert t.since(Gap) == [Gap("recording", 0, 3)]
     t.step(op.says(RecordingGap(3)))
     assert t.since(Gap) == []
 
@@ -193,8 +223,13 @@ def test_one_who_was_just_given_up_still_stops_everything() -> None:
     assert t.since(EStopChanged) == [EStopChanged(True, "", "from afar")]
 
 
-def test_a_stop_that_comes_with_its_senders_hello_does_not_end_the_connection() -> None:
+def test_a_stop_that_comes_with_its_senders_hello_or_before_it_stops() -> None:
     t = Table()
-    t.step(Entry(7, 7, t.now_ns, EStop()), Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
+    t.step(Entry(7, 0, t.now_ns, EStop()), Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
     assert [a.connection for a in t.decision.admitted] == [7]
-    assert t.since(SamplesRejected) == [SamplesRejected("", "", "connection_epoch", 1)]
+    assert t.decision.estop
+    t = Table()
+    t.step(Entry(7, 0, t.now_ns, EStop()))
+    t.step(Entry(7, 7, t.now_ns, Join("key", "operator", "anna")))
+    assert t.decision.estop
+    assert [a.connection for a in t.decision.admitted] == [7]

@@ -89,6 +89,15 @@ def test_absolute_poses_are_the_target_themselves() -> None:
     assert state.target == ((0.2, 0.3, 0.4), TURN)
 
 
+def test_the_motion_of_an_absolute_source_is_blended_without_the_scale() -> None:
+    hand, policy = source("a", (0.0, 0.0, 0.0), weight=0.5), source("b", (2.0, 0.0, 0.0), weight=0.5, absolute=True)
+    state = clutch.latch(command(hand, policy), 4.0, BASE)
+    clutch.follow(state, [hand, source("b", (2.2, 0.0, 0.0), weight=0.5, absolute=True)], None)
+    assert state.target[0] == pytest.approx((0.6, 0.1, 0.8))
+    clutch.follow(state, [source("a", (0.0, 0.1, 0.0), weight=0.5), policy], None)
+    assert state.target[0] == pytest.approx((0.5, 0.3, 0.8))
+
+
 def test_the_workspace_bounds_the_target_and_never_throws_it_in() -> None:
     box = ((0.0, 0.0, 0.0), (0.4, 1.0, 0.9))  # the robot stands outside in x
     state = clutch.latch(command(source("a", (0.0, 0.0, 0.0))), 1.0, BASE)

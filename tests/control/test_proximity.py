@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.control import ControlConfig
+from iris_session.control import ControlConfig, Controller
 from iris_session.control.proximity import Proximity
 from iris_session.protocol.specs import RobotSpec
+from iris_session.protocol.steps import Command
 from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_arms, pose_command
 
 FACING = ([(0.0, 0.0, 0.0), (1.3, 0.0, 0.0)], [0.0, math.pi])
@@ -55,6 +56,45 @@ def test_closing_robots_are_slowed_and_stop_apart_and_retreat_freely() -> None:
     away = push(rig, -0.15, 400)
     assert gap(rig, proximity) > 0.12
     assert not any("proximity" in limits for both in away[20:] for limits in both)
+
+
+def lean(rig: Rig, steps: int) -> float:
+    """Leader robots that send at 500 Hz lean both arms towards each other at 1 rad/s; returns the smallest gap."""
+    proximity, smallest = Proximity(rig.model, rig.robots, ControlConfig()), 1.0
+    for k in range(steps):
+        q = np.add(IIWA_HOME, (0.0, min(0.002 * k, 0.7), 0.0, min(0.002 * k, 0.7), 0.0, 0.0, 0.0))
+        rows = [rig.source((0.0, 0.0, 0.0), pose_world=None, q=tuple(q.tolist()), device="joints") for _ in range(2)]
+        rig.step(decision(Command(f"r{i}", "joints", sources=(row,)) for i, row in enumerate(rows)))
+        if k % 5 == 0:
+            smallest = min(smallest, gap(rig, proximity))
+    return smallest
+
+
+def test_leaders_that_send_at_every_step_do_not_lift_the_bound() -> None:
+    model, robots = iiwa_arms(*FACING)
+    rig = Rig(model, robots, home=IIWA_HOME)
+    rig.hold(200)
+    assert 0.005 < lean(rig, 700) < 0.04
+    assert all("proximity" in status.limits for status in rig.controller.status())
+    free = Rig(model, robots, ControlConfig(proximity_margin=0.0), home=IIWA_HOME)
+    free.hold(200)
+    assert lean(free, 700) < 0.0, "without the bound they would have collided"
+
+
+def test_the_bound_survives_a_restart_of_control() -> None:
+    model, robots = iiwa_arms(*FACING)
+    rig = Rig(model, robots, home=IIWA_HOME)
+    rig.hold(200)
+    lean(rig, 403)  # between two checks
+    assert (rig.controller._joints.near < rig.controller._joints.velocity).any()
+    again = Controller(model, robots)
+    again.restore(rig.controller.snapshot())
+    assert (again._joints.near == rig.controller._joints.near).all()
+    other = mujoco.MjData(model)
+    mujoco.mj_copyData(other, model, rig.data)
+    rig.controller.tick(rig.data)
+    again.tick(other)
+    assert (rig.data.ctrl == other.ctrl).all()
 
 
 def test_without_the_margin_they_collide() -> None:

@@ -107,7 +107,7 @@ def test_gripper_force_is_that_of_mj_contact_force() -> None:
 def test_one_finger_holds_only_when_it_is_the_only_one() -> None:
     world = grasp_world("elliptic")
     m, robots, objects = world.model, find_robots(world.model), find_objects(world.model)
-    push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.refresh())  # noqa: E731
+    push = lambda w: (w.data.qpos.__setitem__(slice(0, 3), (0.0, 0.026, 0.02)), w.set_state_bytes(w.state_bytes()))  # noqa: E731
     push(world)
     assert contacts_of(world)["cube"].touching == ("robot",)
     assert contacts_of(world)["cube"].grippers == ()

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
 
 from iris_session.physics import (
     ModelUnsupportedError,
-    NotOwnerError,
     SimulationDivergedError,
     SnapshotError,
+    SpecError,
     UnknownNameError,
     World,
     find_objects,
@@ -124,7 +126,7 @@ def test_restore_is_invisible(integrator: str, option: str, flag: str) -> None:
             if k in (50, 230):
                 w.data.mocap_pos[0] = (0.1 * k / 50, 0.0, 0.05)
                 w.data.eq_active[0] = k == 50
-                w.refresh()
+                mujoco.mj_step1(m, w.data)
             w.tick()
         if k % 37 == 0:
             snapshot = saved_often.snapshot()
@@ -355,11 +357,10 @@ def test_unknown_object_body_is_refused() -> None:
 
 
 @pytest.mark.skipif(not SLEEPS, reason="this MuJoCo has no sleeping islands")
-def test_sleeping_islands_are_refused_in_our_loop_only() -> None:
+def test_sleeping_islands_are_refused() -> None:
     m = clutter(flag='<flag sleep="enable"/>')
     with pytest.raises(ModelUnsupportedError, match="sleeping islands"):
         World(m, (), ())
-    World(m, (), (), mujoco.MjData(m))
 
 
 def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path, iiwa: mujoco.MjModel) -> None:
@@ -377,23 +378,18 @@ def test_scene_hash_does_not_depend_on_the_folder(data_dir: Path, tmp_path: Path
 # --- a user's loop ----------------------------------------------------------------------------------------------------
 
 
-def test_a_users_data_is_only_read_and_the_view_shows_its_new_state(handover: mujoco.MjModel) -> None:
+def test_a_twin_shows_the_new_state_of_a_users_data(handover: mujoco.MjModel) -> None:
     robots, objects = find_robots(handover), find_objects(handover)
-    plain, user = mujoco.MjData(handover), mujoco.MjData(handover)
-    for d in (plain, user):
-        mujoco.mj_resetDataKeyframe(handover, d, 0)
-    world = World(handover, robots, objects, user)
-    ours = World(handover, robots, objects)
-    assert world.view().tick == 0
+    user = mujoco.MjData(handover)
+    mujoco.mj_resetDataKeyframe(handover, user, 0)
+    world, ours = World(handover, robots, objects), World(handover, robots, objects)
     for k in range(200):
-        for d in (plain, user, ours.data):
+        for d in (user, ours.data):
             d.ctrl[:] = handover.key_ctrl[0] + 0.1 * np.sin(0.03 * k)
-        mujoco.mj_step(handover, plain)
         mujoco.mj_step(handover, user)
         ours.tick()
-        assert world.after_user_step() is False
-    assert state_of(handover, user) == state_of(handover, plain) == world.state_bytes()
-    assert user.xpos.tobytes() == plain.xpos.tobytes()
+        world.set_state_bytes(state_of(handover, user))
+    assert state_of(handover, user) == world.state_bytes()
     view, expected = world.view(), ours.view()
     assert view.tick == expected.tick == 200
     assert view.tip_pose("left") == expected.tip_pose("left")
@@ -402,30 +398,21 @@ def test_a_users_data_is_only_read_and_the_view_shows_its_new_state(handover: mu
     assert view.object_contacts() == expected.object_contacts() != ()
 
 
-def test_user_time_decides_the_tick(handover: mujoco.MjModel) -> None:
-    user = mujoco.MjData(handover)
-    world = World(handover, (), (), user)
-    for _ in range(5):
-        mujoco.mj_step(handover, user)
-    world.after_user_step()
-    assert world.view().tick == 5
-    world.after_user_step()
-    assert world.view().tick == 5
-    mujoco.mj_resetData(handover, user)
-    assert world.after_user_step() is True
-    assert world.view().tick == 0
-    user.qpos[0] = np.inf
-    with pytest.raises(SimulationDivergedError, match="not finite"):
-        world.after_user_step()
-
-
-def test_loops_are_not_mixed(handover: mujoco.MjModel) -> None:
-    user = World(handover, (), (), mujoco.MjData(handover))
-    for call in (user.tick, user.reset, user.refresh, lambda: user.restore(b""), lambda: user.set_state_bytes(b"")):
-        with pytest.raises(NotOwnerError, match="user's loop"):
-            call()
-    with pytest.raises(NotOwnerError, match="call tick"):
-        World(handover, (), ()).after_user_step()
+def test_nothing_belongs_to_two_robots(handover: mujoco.MjModel) -> None:
+    left, right = find_robots(handover)
+    (hammer, *_) = find_objects(handover)
+    for change, named in (
+        ({"joints": left.joints}, f"joint {left.joints[0]!r}"),
+        ({"actuators": left.actuators}, f"actuator {left.actuators[0]!r}"),
+        ({"gripper_actuator": left.gripper_actuator}, f"actuator {left.gripper_actuator!r}"),
+        ({"name": "left"}, "name 'left'"),
+    ):
+        with pytest.raises(SpecError, match=re.escape(named)):
+            World(handover, (left, msgspec.structs.replace(right, **change)), ())
+    with pytest.raises(SpecError, match="belongs to object"):
+        World(handover, (), (hammer, ObjectSpec("again", hammer.body)))
+    with pytest.raises(UnknownNameError, match=r"robot 'left': body 'left/fingr'.*Available bodies: .*left"):
+        World(handover, (msgspec.structs.replace(left, finger_bodies=("left/fingr",)),), ())
 
 
 def test_a_shown_state_is_a_function_of_its_bytes(handover: mujoco.MjModel) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 #: Joint positions with the gripper pointing down, 0.40 m in front of the base and 0.28 m above it; then the fingers.
 ARM_HOME = (0.0, 0.314, 0.0, 1.8127, 0.0, 1.0149, 0.0)
 FINGER_OPEN = 0.04
-_ARM_FILE = Path(__file__).parent / "arm.xml"
+ARM_FILE = Path(__file__).parent / "arm.xml"
 _FREE_HALL = (10.0, 10.0, 3.0)  # m
 
 
@@ -32,36 +32,46 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
     if not 1 <= n <= 12:
         raise ValueError(f"n_arms_scene makes 1 to 12 arms, not {n}")
     n_objects = (n + 1) // 2 if objects is None else objects
-    radius = max(0.6, 0.36 / math.sin(math.pi / max(n, 2)))  # m, neighbours at least 0.72 m apart
-    spec = _room(f"{n}_arms")
-    spec.worldbody.add_geom(
-        name="table_top",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[radius + 0.25, 0.02, 0],
-        pos=[0, 0, -0.02],
-        rgba=[0.66, 0.67, 0.66, 1],
-    )
-    spec.worldbody.add_geom(
-        name="table_foot",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[0.12, 0.355, 0],
-        pos=[0, 0, -0.395],
-        rgba=[0.25, 0.26, 0.28, 1],
-    )
+    radius = circle_radius(n)
+    spec = room(f"{n}_arms")
+    add_round_table(spec, radius + 0.25)
     for i, name in enumerate(arm_names(n)):
-        bearing = math.pi + 2.0 * math.pi * i / n  # the first arm stands at -x, as `left` in handover.xml
-        arm = mujoco.MjSpec.from_file(str(_ARM_FILE))
-        arm.material("accent").rgba = [*_hue(i / n), 1.0]
-        frame = spec.worldbody.add_frame(
-            pos=[radius * math.cos(bearing), radius * math.sin(bearing), 0.0],
-            quat=[math.cos((bearing + math.pi) / 2), 0.0, 0.0, math.sin((bearing + math.pi) / 2)],
-        )
-        frame.attach_body(arm.body("base"), f"{name}/", "")
+        arm = mujoco.MjSpec.from_file(str(ARM_FILE))
+        arm.material("accent").rgba = [*hue(i / n), 1.0]
+        place_arm(spec, radius, bearing_of(i, n)).attach_body(arm.body("base"), f"{name}/", "")
     qpos = [*ARM_HOME, FINGER_OPEN, FINGER_OPEN] * n
     for k in range(n_objects):
-        qpos += _add_object(spec, k, n_objects, radius)
+        qpos += add_object(spec, k, n_objects, radius - 0.38)
     spec.add_key(name="home", qpos=qpos, ctrl=[*ARM_HOME, FINGER_OPEN] * n)
     return spec
+
+
+def circle_radius(n: int, least: float = 0.6, apart: float = 0.72) -> float:
+    """Radius [m] of the circle on which `n` arms stand: at least `least`, neighbours at least `apart`."""
+    return max(least, 0.5 * apart / math.sin(math.pi / max(n, 2)))
+
+
+def bearing_of(i: int, n: int) -> float:
+    """Where the `i`-th of `n` stands, seen from the middle of the table [rad]; the first at -x, as in handover.xml."""
+    return math.pi + 2.0 * math.pi * i / n
+
+
+def place_arm(spec: Any, radius: float, bearing: float) -> Any:
+    """A frame on the table at `bearing`, its x axis towards the middle."""
+    return spec.worldbody.add_frame(
+        pos=[radius * math.cos(bearing), radius * math.sin(bearing), 0.0],
+        quat=[math.cos((bearing + math.pi) / 2), 0.0, 0.0, math.sin((bearing + math.pi) / 2)],
+    )
+
+
+def add_round_table(spec: Any, radius: float) -> None:
+    """A round table whose top is z = 0, 0.75 m above the floor."""
+    import mujoco
+
+    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+    top, foot = [0.66, 0.67, 0.66, 1], [0.25, 0.26, 0.28, 1]
+    spec.worldbody.add_geom(name="table_top", type=cylinder, size=[radius, 0.02, 0], pos=[0, 0, -0.02], rgba=top)
+    spec.worldbody.add_geom(name="table_foot", type=cylinder, size=[0.12, 0.355, 0], pos=[0, 0, -0.395], rgba=foot)
 
 
 def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
@@ -74,7 +84,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
     import mujoco
 
     rng = np.random.default_rng(seed)
-    spec = _room(f"{n}_free_bodies", floor_z=0.0)
+    spec = room(f"{n}_free_bodies", floor_z=0.0)
     spec.option.gravity = [0, 0, 0]
     qpos: list[float] = []
     qvel: list[float] = []
@@ -93,7 +103,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX if i % 2 else mujoco.mjtGeom.mjGEOM_ELLIPSOID,
             size=list(map(float, rng.uniform(0.03, 0.12, size=3))),
-            rgba=[*_hue(i / n), 1.0],
+            rgba=[*hue(i / n), 1.0],
             contype=0,
             conaffinity=0,
         )
@@ -128,7 +138,7 @@ def _circling(rng: np.random.Generator) -> tuple[list[float], list[float], list[
     return tuple(list(map(float, v)) for v in values)  # type: ignore[return-value]
 
 
-def _room(name: str, floor_z: float = -0.75) -> Any:
+def room(name: str, floor_z: float = -0.75) -> Any:
     """An empty room: options as in `handover.xml`, sky, checker floor at `floor_z`, two lights."""
     import mujoco
 
@@ -182,14 +192,14 @@ def _room(name: str, floor_z: float = -0.75) -> Any:
     return spec
 
 
-def _add_object(spec: Any, k: int, count: int, radius: float) -> list[float]:
-    """Adds hammer (even `k`) or board (odd) on the table between two arms; returns its home `qpos`."""
+def add_object(spec: Any, k: int, count: int, distance: float) -> list[float]:
+    """Adds hammer (even `k`) or board (odd) on the table, `distance` [m] from its middle; returns its home `qpos`."""
     import mujoco
 
     box = mujoco.mjtGeom.mjGEOM_BOX
     bearing = math.pi + 2.0 * math.pi * k / max(count, 1)
     height = 0.012 if k % 2 else 0.016
-    pos = [(radius - 0.38) * math.cos(bearing), (radius - 0.38) * math.sin(bearing), height]
+    pos = [distance * math.cos(bearing), distance * math.sin(bearing), height]
     body = spec.worldbody.add_body(name=f"object{k + 1}", pos=pos)
     body.add_freejoint()
     parts: list[dict[str, Any]]
@@ -206,7 +216,7 @@ def _add_object(spec: Any, k: int, count: int, radius: float) -> list[float]:
     return [*pos, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
 
 
-def _hue(x: float) -> tuple[float, float, float]:
+def hue(x: float) -> tuple[float, float, float]:
     """A distinct, muted colour for `x` in 0 to 1."""
     return (
         0.5 + 0.35 * math.cos(2 * math.pi * (x + 0.55)),

@@ -1,0 +1,58 @@
+"""Output `targets`: the environment's own controller moves the joints, so where they are is measured."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from anchors.pose import IDENTITY_QUAT
+from iris_session.control import ControlConfig
+from iris_session.protocol.steps import Command
+from tests.control.rigs import IIWA_HOME, Rig, decision, iiwa_model, iiwa_spec, pose_command
+from tests.control.test_diverged import on_a_rail
+
+TARGETS = ControlConfig(output="targets")
+
+
+def lead(rig: Rig, q: np.ndarray, steps: int, engagement: int = 1) -> list[tuple[str, ...]]:
+    """A leader at `q` whose environment moves the arm there at 1 rad/s."""
+    limits, now = [], rig.data.qpos.copy()
+    for _ in range(steps):
+        source = rig.source((0.0,) * 3, pose_world=None, q=tuple(q.tolist()), device="joints", engagement=engagement)
+        rig.step(decision([Command("iiwa", "joints", sources=(source,))]))
+        now += np.clip(q - now, -0.002, 0.002)
+        rig.data.qpos[:] = now
+        rig.data.qvel[:] = 0.0
+        limits.append(rig.controller.status()[0].limits)
+    return limits
+
+
+def test_a_leader_is_apart_until_the_environment_has_caught_up() -> None:
+    rig = Rig(iiwa_model(), [iiwa_spec()], TARGETS, home=IIWA_HOME)
+    limits = lead(rig, np.add(IIWA_HOME, 0.5), 400)
+    assert limits[10] == ("leader_apart",)
+    assert limits[-1] == ()
+
+
+def test_the_workspace_of_a_leader_starts_where_the_arm_was_taken_by_others() -> None:
+    """What a hand has moved through the environment in between is no detour for the leader that comes next."""
+    rig = Rig(iiwa_model(), [iiwa_spec()], TARGETS, home=IIWA_HOME)
+    there = np.add(IIWA_HOME, 0.3)
+    lead(rig, there, 300)
+    rig.step(decision([pose_command("iiwa", rig.source((0.0, 0.0, 0.0), engagement=2))]))
+    rig.data.qpos[:] = IIWA_HOME
+    rig.hold(1)
+    assert rig.controller._joints.goal == pytest.approx(IIWA_HOME)
+    lead(rig, np.add(IIWA_HOME, 0.05), 3, engagement=3)
+    assert rig.controller.status()[0].limits == ()
+
+
+def test_the_target_of_a_leader_stands_on_the_base_as_it_moves() -> None:
+    rig = on_a_rail(TARGETS)
+    rig.data.joint("rail").qpos[:] = 0.5
+    mujoco.mj_forward(rig.model, rig.data)
+    rig.hold(1)
+    p, q = rig.controller._states[0].T_world_root
+    assert p[0] == pytest.approx(0.5, abs=1e-3)
+    assert q == IDENTITY_QUAT
