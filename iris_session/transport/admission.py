@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from iris_session.keys import DEFAULT_ROLES, fingerprint
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.limits import RateLimiter
-from iris_session.protocol.names import RefusalCode, Role
+from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
+from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer, Route
 from iris_session.transport.config import FrontConfig, Ports
+from iris_session.transport.doors import Doors
+from iris_session.transport.keyring import Keyring
 from iris_session.transport.limiter import Drops, TokenBucket
 from iris_session.transport.resume_tokens import ResumeTokens
-from iris_session.transport.sockets import fingerprint, peer_of
+from iris_session.transport.sockets import peer_of
 
 SECRET_BYTES = 16  # 128 bits, made by the client
 
@@ -36,6 +40,9 @@ class Admission:
         outbox: Outbox,
         drops: Drops,
         tokens: ResumeTokens,
+        keyring: Keyring,
+        audit: AuditTrail,
+        doors: Doors,
     ) -> None:
         self._config = config
         self._ports = ports
@@ -43,6 +50,9 @@ class Admission:
         self._outbox = outbox
         self._drops = drops
         self._tokens = tokens
+        self._keyring = keyring
+        self._audit = audit
+        self._doors = doors
         self._hellos = TokenBucket(config.limits.hellos_per_second, config.limits.hello_burst)
         self._knocks: dict[int, RateLimiter] = {}
 
@@ -61,17 +71,21 @@ class Admission:
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
         if not self._may_knock(route, peer, now_ns):
             raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
-        if len(self._clients) >= self._config.limits.connections:
-            raise _RefusedError(
-                RefusalCode.FULL, f"all {self._config.limits.connections} connections are in use", "try again later"
-            )
-        gateway = self._gateway(route, peer)
+        gateway = self._gateway(route, peer, now_ns)
         key_id = self._key_id(peer, hello, gateway)
-        resume_of = self._resume(hello, key_id)
+        if self._doors.barred(key_id, now_ns):
+            raise _RefusedError(
+                RefusalCode.RATE, "this client was cut off: it sent a flood", "send less; try again soon"
+            )
+        roles = self._roles(key_id, gateway)
+        address = peer_of(peer.descriptor)
+        resume_of = self._resume(hello, key_id, address[0], now_ns)
+        # Who comes back replaces a connection that may still be counted: as many again, so that it is bounded.
+        limit = self._config.limits.connections
+        if len(self._clients) >= (2 * limit if resume_of else limit):
+            raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
         number = self._tokens.new_connection()
-        connection = Connection(
-            number, route, peer, peer_of(peer.descriptor), key_id, hello, gateway.number if gateway else 0
-        )
+        connection = Connection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
         join = Join(
             key_id,
             hello.role,
@@ -82,6 +96,7 @@ class Admission:
             hello.alignment,
             resume_of,
             connection.gateway,
+            roles,
         )
         return connection, join
 
@@ -97,12 +112,31 @@ class Admission:
         """A TCP connection was closed: its descriptor may become another's."""
         self._knocks.pop(descriptor, None)
 
-    def _gateway(self, route: Route, peer: Peer) -> Connection | None:
+    def gateway(self, routing_id: bytes, peer: Peer) -> Connection | None:
+        """The admitted gateway that this peer is."""
+        gateway = self._clients.find(Route(routing_id), peer)
+        return gateway if gateway is not None and gateway.admitted and gateway.hello.role == Role.GATEWAY else None
+
+    def forged(self, route: Route, peer: Peer, now_ns: int) -> None:
+        """Somebody who is no gateway spoke on behalf of another."""
+        address = peer_of(peer.descriptor)[0]
+        sender = self._clients.find(Route(route.routing_id), peer)
+        self._audit.note(
+            AuditKind.GATEWAY_REFUSED,
+            now_ns,
+            subject=sender.key_id if sender is not None else peer.user_id,
+            name=sender.hello.name if sender is not None else "",
+            address=address,
+            detail=f"on behalf of {route.on_behalf_of}",
+        )
+
+    def _gateway(self, route: Route, peer: Peer, now_ns: int) -> Connection | None:
         """The gateway that speaks, `None` for a client of its own."""
         if not route.on_behalf_of:
             return None
-        gateway = self._clients.find(Route(route.routing_id), peer)
-        if gateway is None or not gateway.admitted or gateway.hello.role != Role.GATEWAY:
+        gateway = self.gateway(route.routing_id, peer)
+        if gateway is None:
+            self.forged(route, peer, now_ns)
             raise _RefusedError(
                 RefusalCode.GATEWAY_ONLY,
                 "only an admitted participant with role 'gateway' may speak on behalf of others",
@@ -121,11 +155,27 @@ class Admission:
             )
         return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
-    def _resume(self, hello: Hello, key_id: str) -> str:
+    def _roles(self, key_id: str, gateway: Connection | None) -> tuple[str, ...]:
+        """What the key may join as, empty for any role. People behind a gateway get the other roles of its key; when it
+        has no other, those that a new key gets."""
+        entry = self._keyring.find(gateway.key_id if gateway else key_id)
+        if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
+            raise _RefusedError(
+                RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
+            )
+        roles = () if entry is None else entry.roles
+        if gateway is None or not roles:
+            return roles
+        return tuple(role for role in roles if role != Role.GATEWAY) or DEFAULT_ROLES
+
+    def _resume(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         if not hello.resume_token:
             return ""
         participant_id = self._tokens.find(hello.resume_token, key_id)
         if participant_id is None:
+            self._audit.note(
+                AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
+            )
             raise _RefusedError(
                 RefusalCode.RESUME_TOKEN, "this resume token is used, unknown, or of another key", "join without one"
             )
@@ -137,8 +187,10 @@ class Admission:
         if connection is None:
             return
         config = self._config
-        token = self._tokens.issue(connection.key_id, admitted.participant_id)
+        token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token)
         connection.admitted = True
+        self._keyring.welcomed(connection.key_id)
+        connection.participant_id = admitted.participant_id
         self._outbox.send(
             connection,
             Welcome(
@@ -158,6 +210,10 @@ class Admission:
                 self._ports.key_fingerprint,
             ),
         )
+
+    def left(self, participant_id: str) -> None:
+        """A participant is gone for good: its tokens open nothing any more."""
+        self._tokens.left(participant_id)
 
     def confirmed(self, connection: Connection) -> None:
         """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""

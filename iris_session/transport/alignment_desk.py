@@ -22,18 +22,19 @@ class AlignmentDesk:
         self._period_ns = period_ns
         self._estimator = AlignmentEstimator(anchors)
         self._next_ns = 0
-        self._pending = False
-        self._unknown: tuple[str, int] | None = None
+        self._pending = False  # something of use came since the last estimate
+        self._unknown: tuple[str, int] | None = None  # anchor and tracking epoch, to be told
+        self._told: tuple[str, int] | None = None
         self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
 
     def observe(self, observation: Observation) -> bool:
         """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform)."""
         if observation.anchor_id not in self._anchors:
-            self._unknown = (observation.anchor_id, observation.tracking_epoch)
-            self._pending = True
+            unknown = (observation.anchor_id, observation.tracking_epoch)
+            if unknown != self._told:
+                self._unknown = unknown
             return False
         pose = observation.T_tracking_anchor
-        self._unknown = None
         try:
             used = self._estimator.add(
                 observation.anchor_id,
@@ -51,19 +52,22 @@ class AlignmentDesk:
         return used
 
     def due(self, now_ns: int) -> bool:
-        return self._pending and now_ns >= self._next_ns
+        return (self._pending or self._unknown is not None) and now_ns >= self._next_ns
 
     def propose(self, now_ns: int) -> AlignmentProposal | None:
-        """Estimates from everything observed. `None`: the same refusal as before, for the same reason."""
-        self._pending = False
+        """Estimates from everything observed. `None`: the same refusal as before, for the same reason.
+
+        When nothing new is of use, an anchor that is not known is told of, once: it may hang beside one that is.
+        """
         self._next_ns = now_ns + self._period_ns
-        if self._unknown is not None:
-            proposal = self._unknown_anchor(*self._unknown)
-        else:
-            try:
-                proposal = _proposal(self._estimator.estimate())
-            except _UNSOLVABLE:
-                proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
+        if not self._pending and self._unknown is not None:
+            self._told, self._unknown = self._unknown, None
+            return self._unknown_anchor(*self._told)
+        self._pending = False
+        try:
+            proposal = _proposal(self._estimator.estimate())
+        except _UNSOLVABLE:
+            proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
         refused = (proposal.tracking_epoch, proposal.advice) if proposal.refused else None
         if refused is not None and refused == self._refused:
             return None

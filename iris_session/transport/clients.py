@@ -7,13 +7,14 @@ to own the same routing id is a stranger.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
 
 import msgspec
 import zmq
 
 from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import RateLimiter
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import ServerMessage
@@ -21,6 +22,8 @@ from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops, TokenBucket
 
 _encoder = msgspec.msgpack.Encoder()
+#: Connections that were given up and may still stop the session.
+MAX_GIVEN_UP: Final = 256
 
 
 class Route(NamedTuple):
@@ -44,13 +47,18 @@ class Connection:
         "address",
         "admitted",
         "confirmed",
+        "denials",
         "drops_in_a_row",
         "faults",
+        "flood_last_ns",
+        "flood_since_ns",
         "gateway",
         "hello",
         "key_id",
         "last_heard_ns",
+        "late_epoch",
         "number",
+        "participant_id",
         "peer",
         "prefix",
         "rates",
@@ -68,10 +76,14 @@ class Connection:
         self.hello = hello
         self.gateway = gateway
         self.admitted = False
+        self.participant_id = ""  # from the authority, once admitted
         self.confirmed = False  # a message with its connection epoch has come: it has its `Welcome`
         self.last_heard_ns = 0
         self.drops_in_a_row = 0
+        self.flood_last_ns = self.flood_since_ns = 0  # above a rate limit: when last, and without a pause since when
         self.faults = TokenBucket(2.0, 5)
+        self.denials = TokenBucket(20.0, 40)  # as many as requests of one kind in an honest hand
+        self.late_epoch: Entry | None = None  # the newest tracking epoch that came above its rate
         self.rates = RateLimiter()
         self.prefix = server_prefix(number)
 
@@ -82,6 +94,7 @@ class ClientTable:
     def __init__(self) -> None:
         self.by_number: dict[int, Connection] = {}
         self.by_route: dict[Route, Connection] = {}
+        self._given_up: dict[tuple[Route, Peer], Connection] = {}
 
     def __len__(self) -> int:
         return len(self.by_number)
@@ -99,6 +112,28 @@ class ClientTable:
         """The connection of a route, if it still is the peer that said `hello`."""
         connection = self.by_route.get(route)
         return connection if connection is not None and connection.peer == peer else None
+
+    def give_up(self, connection: Connection) -> None:
+        """It counts no more, but who it was may not know that yet."""
+        self._given_up.pop((connection.route, connection.peer), None)
+        while len(self._given_up) >= MAX_GIVEN_UP:
+            del self._given_up[next(iter(self._given_up))]
+        self._given_up[connection.route, connection.peer] = connection
+
+    def given_up(self, route: Route, peer: Peer) -> Connection | None:
+        """The connection that this peer lost lately."""
+        return self._given_up.get((route, peer))
+
+    @property
+    def lost_lately(self) -> Collection[Connection]:
+        """Connections that were given up while their TCP connections stood."""
+        return self._given_up.values()
+
+    def closed(self, descriptor: int, address: tuple[str, int]) -> None:
+        """A TCP connection was closed. `address`: of the peer that has its descriptor now."""
+        for key, connection in list(self._given_up.items()):
+            if key[1].descriptor == descriptor and (connection.address != address or not address[1]):
+                del self._given_up[key]
 
     def behind(self, gateway: Connection) -> list[Connection]:
         """Connections that a gateway speaks for."""

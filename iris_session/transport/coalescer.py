@@ -1,13 +1,14 @@
 """What waits for the authority: the newest sample per device, every edge, everything else in order. Bounded. Pure.
 
-Two samples of one device in a row are merged into the newer one when nothing but the motion differs. A change of
-clutch, gripper (open or closed), buttons, worn, tracked, targets or of any epoch is an edge: both samples stay, so the
-authority sees every press. Urgent messages have a lane of their own that is emptied first.
+A heartbeat and a tracking epoch replace the one before. Two samples of one device in a row are merged into the newer
+one when nothing but the motion differs. A change of clutch, gripper (open or closed), buttons, worn, tracked, targets
+or of any epoch is an edge: both samples stay, so the authority sees every press. Urgent messages have a lane of their
+own that is emptied first.
 """
 
 from __future__ import annotations
 
-from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample
+from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample, TrackingEpoch
 from iris_session.protocol.entries import URGENT, Entry, Join, Lost
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops
@@ -38,13 +39,14 @@ def _differs_by_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
 class _Lane:
     """What waits of one connection. Values are `(arrival number, entry)`."""
 
-    __slots__ = ("heartbeat", "messages", "samples", "urgent")
+    __slots__ = ("heartbeat", "messages", "samples", "tracking", "urgent")
 
     def __init__(self) -> None:
         self.urgent: list[tuple[int, Entry]] = []
         self.messages: list[tuple[int, Entry]] = []
         self.samples: dict[str, list[tuple[int, Entry]]] = {}
         self.heartbeat: tuple[int, Entry] | None = None
+        self.tracking: tuple[int, Entry] | None = None
 
 
 class Coalescer:
@@ -75,6 +77,9 @@ class Coalescer:
             return self._offer_urgent(lane, item)
         if isinstance(message, Heartbeat):
             lane.heartbeat = item
+            return True
+        if isinstance(message, TrackingEpoch):
+            lane.tracking = item
             return True
         if len(lane.messages) >= self._limits.pending_messages:
             self._drops.count("messages_pending", entry.connection)
@@ -119,7 +124,7 @@ class Coalescer:
             lane.messages = []
         if isinstance(message, Lost | Bye):
             lane.samples.clear()
-            lane.heartbeat = None
+            lane.heartbeat = lane.tracking = None
         lane.urgent.append(item)
         self.urgent = True
         return True
@@ -152,8 +157,7 @@ class Coalescer:
         items = lane.messages
         for waiting in lane.samples.values():
             items += waiting
-        if lane.heartbeat is not None:
-            items.append(lane.heartbeat)
+        items += [item for item in (lane.heartbeat, lane.tracking) if item is not None]
         return items
 
     def forget(self, connection: int) -> None:

@@ -15,6 +15,7 @@ from iris_session.protocol.server_messages import BodyInfo, RobotInfo
 
 MILLISECOND: Final = 1_000_000
 SECOND: Final = 1_000_000_000
+MEBIBYTE: Final = 1 << 20
 
 
 class FrontLimits(msgspec.Struct, frozen=True):
@@ -24,6 +25,11 @@ class FrontLimits(msgspec.Struct, frozen=True):
     `pending_messages`, `pending_urgent`, `pending_devices`, `pending_samples`: waiting for the authority, per
     connection (samples: per device). `unacknowledged`: batches on the way to the authority; urgent ones may use as
     many again. `slow_drops`: messages in a row that a client's socket did not take before it counts as lost.
+    `receive_queue`, `send_queue`: messages in libzmq, per TCP connection. `excess_per_s`,
+    `excess_burst`: messages of one TCP connection that are not taken, before it is cut off. An honest client with a
+    fault in its loop is named by its rate limits long before. `strangers`: TCP connections that have not
+    said hello, for at most `hello_timeout_ns` each. `subscribers`: TCP connections to the state socket.
+    `memory_bytes`: what all queues together may hold (see `memory.py`).
     """
 
     connections: int = 64
@@ -36,8 +42,15 @@ class FrontLimits(msgspec.Struct, frozen=True):
     batch_entries: int = 512
     unacknowledged: int = 8
     send_queue: int = 256
+    receive_queue: int = 64
     slow_drops: int = 64
     resume_tokens: int = 256
+    excess_per_s: float = 2000.0
+    excess_burst: int = 4000
+    strangers: int = 1024
+    hello_timeout_ns: int = 10 * SECOND
+    subscribers: int = 512
+    memory_bytes: int = 256 * MEBIBYTE
 
 
 class SceneInfo(msgspec.Struct, frozen=True):
@@ -53,13 +66,19 @@ class SceneInfo(msgspec.Struct, frozen=True):
 class FrontConfig(msgspec.Struct, frozen=True):
     """Configuration of the front. Port 0: any free one.
 
-    `host`: address to listen on. Any other than loopback needs CURVE: `curve_secret_file` is the server's ZeroMQ
-    certificate (`*.key_secret`), `curve_clients_dir` holds the public certificates (`*.key`) of the clients that may
-    connect. `origin_ns`: `time.monotonic_ns()` at session time 0. `recorder_endpoint`: a PULL socket that takes raw
-    samples, empty when nothing is recorded. `forward_observations`: raw observations reach the authority too.
+    `host`: address to listen on; `listen`: several instead. `advertise`: the address that others are told, when it is
+    not ours. `beacon_port`: UDP port of the beacons, 0 for none. Any address but loopback is encrypted with CURVE,
+    loopback with `curve`. `key_home`: folder of the server's key and the allow-list, empty for that of the user;
+    `curve_secret_file`: another ZeroMQ certificate of the server (`*.key_secret`); `curve_clients_dir`: folder of
+    public certificates (`*.key`) instead of the allow-list. `origin_ns`: `time.monotonic_ns()` at session time 0.
+    `recorder_endpoint`: a PULL socket that takes raw samples, empty when nothing is recorded. `forward_observations`:
+    raw observations reach the authority too.
     """
 
     host: str = "127.0.0.1"
+    listen: tuple[str, ...] = ()
+    advertise: str = ""
+    beacon_port: int = 0
     control_port: int = 7721
     state_port: int = 7722
     media_port: int = 0
@@ -77,6 +96,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
     tick_period_ns: int = 2 * MILLISECOND
     state_period_ns: int = SECOND // 60
     limits: FrontLimits = FrontLimits()
+    curve: bool = False
+    key_home: str = ""
     curve_secret_file: str = ""
     curve_clients_dir: str = ""
     anchors: dict[str, Pose] = {}
@@ -84,22 +105,33 @@ class FrontConfig(msgspec.Struct, frozen=True):
     recorder_endpoint: str = ""
 
     @property
+    def hosts(self) -> tuple[str, ...]:
+        """Every address to listen on."""
+        return self.listen or (self.host,)
+
+    @property
     def loopback(self) -> bool:
         """True when only this machine can reach the sockets."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return all(is_loopback(host) for host in self.hosts)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address (or `localhost`) reaches no further than this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class Ports(msgspec.Struct, frozen=True):
     """Where the front listens. `host`: as in an address, IPv6 in brackets. `key_fingerprint`: of the server CURVE key,
-    empty without one."""
+    empty without one. `reachable`: addresses under which others reach it, best first, without brackets."""
 
     host: str
     control: int
     state: int
     key_fingerprint: str = ""
+    reachable: tuple[str, ...] = ()
 
 
 class FrontStart(msgspec.Struct, frozen=True):
@@ -114,3 +146,13 @@ class FrontStart(msgspec.Struct, frozen=True):
 
 class FrontError(Exception):
     """The front cannot run. The text is one line that says what to do."""
+
+
+class PortInUseError(FrontError):
+    """Somebody else listens on a port of ours."""
+
+    def __init__(self, port: int, name: str) -> None:
+        super().__init__(
+            f"port {port} ({name}) is in use (by another session?): take another block of ports, for example control "
+            "7731 and state 7732, or 0 for any free ones"
+        )

@@ -8,23 +8,33 @@ import msgspec
 import zmq
 
 from iris_session.protocol.names import FaultCode
-from iris_session.protocol.server_messages import Event, ProtocolFault, Refused, ServerMessage, Snapshot
+from iris_session.protocol.server_messages import (
+    Event,
+    ParticipantLeft,
+    ProtocolFault,
+    Refused,
+    ServerMessage,
+    Snapshot,
+)
 from iris_session.protocol.steps import Outgoing
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
 from iris_session.transport.clients import ClientTable, Connection, Outbox, encode_message
 from iris_session.transport.limiter import Drops
+from iris_session.transport.revocation import Revocation
 from iris_session.transport.sockets import readable
 from iris_session.transport.state_publisher import StatePublisher
 
 _BOUND = 64  # messages taken at once
+#: Why a director ends a participation: nobody joins again by itself after that.
+REMOVALS = ("removed", "revoked")
 
 
 class Downlink:
-    """Drains the link. `forget` is called with connections that the authority is done with.
+    """Drains the link. `forget` is called with connections that the authority is done with, and why.
 
     `heard_ns`: session time of the last word of the authority, 0 before its first. `acknowledged`: batches taken by
-    it since the start. `ended`: the session is over.
+    it since the start. `report`: the newest status report of the authority, encoded. `ended`: the session is over.
     """
 
     def __init__(
@@ -36,7 +46,8 @@ class Downlink:
         publisher: StatePublisher,
         drops: Drops,
         session_ns: Callable[[], int],
-        forget: Callable[[Connection], None],
+        forget: Callable[[Connection, str], None],
+        revocation: Revocation,
     ) -> None:
         self._socket = socket
         self._clients = clients
@@ -46,8 +57,10 @@ class Downlink:
         self._drops = drops
         self._session_ns = session_ns
         self._forget = forget
+        self._revocation = revocation
         self.heard_ns = 0
         self.acknowledged = 0
+        self.report = b""
         self.ended = False
 
     def drain(self) -> None:
@@ -89,23 +102,38 @@ class Downlink:
             self._publisher.publish_presence(self.heard_ns, frames[1])
         elif kind == link.SCENE:
             self._publisher.set_scene(link.decode_scene(frames[1]))
+        elif kind == link.REPORT:
+            self.report = frames[1]
         elif kind == link.END:
             self.ended = True
 
     def _decided(self, decided: link.Decided) -> None:
-        """Welcomes, then answers, then events: a snapshot may be older than the events of its step, never newer."""
+        """Welcomes, answers, events, then snapshots: those are of the end of the step, with its events. Who takes part
+        already gets the events first, because a client passes over those that its snapshot contains."""
         for admitted in decided.admitted:
             self._admission.welcome(admitted, self._session_ns())
+        snapshots = [outgoing for outgoing in decided.outgoing if isinstance(outgoing.message, Snapshot)]
         for outgoing in decided.outgoing:
-            self._answer(outgoing)
+            if not isinstance(outgoing.message, Snapshot):
+                self._answer(outgoing)
         for event in decided.events:
             self.broadcast(event)
+            if isinstance(event.body, ParticipantLeft) and not event.body.grace:
+                self._admission.left(event.body.participant)
+        for outgoing in snapshots:
+            self._answer(outgoing)
         for dropped in decided.dropped:
             connection = self._clients.by_number.get(dropped.connection)
-            if connection is not None:
+            if dropped.reason in REMOVALS and connection is not None:
+                text = f"a director {dropped.reason} this participant"
+                self._revocation.remove(connection, text, self.heard_ns, dropped.reason)
+                self._forget(connection, dropped.reason)
+            elif connection is not None:
                 text = f"the session let this connection go: {dropped.reason}"
-                self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text))
-                self._forget(connection)
+                self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, dropped.reason))
+                self._forget(connection, dropped.reason)
+            if dropped.key_id:
+                self._revocation.revoke(dropped.key_id, self.heard_ns)
 
     def _answer(self, outgoing: Outgoing) -> None:
         message: ServerMessage = outgoing.message
@@ -123,7 +151,7 @@ class Downlink:
             return
         self._outbox.send(connection, message)
         if isinstance(message, Refused):
-            self._forget(connection)
+            self._forget(connection, "refused")
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
         """To every admitted connection; encoded once."""

@@ -14,11 +14,11 @@ class TokenBucket:
 
     __slots__ = ("_full", "_last_ns", "_rate", "_tokens")
 
-    def __init__(self, rate: float, burst: int) -> None:
+    def __init__(self, rate: float, burst: int, now_ns: int = 0) -> None:
         self._rate = rate
         self._full = burst * _TOKEN
         self._tokens = self._full
-        self._last_ns = 0
+        self._last_ns = now_ns
 
     def take(self, now_ns: int) -> bool:
         """Uses one token; false when there is none."""

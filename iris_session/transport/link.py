@@ -8,12 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import zmq
 
 from iris_session.protocol.entries import HOST, Entry, FrontRestarted, decode_entries
-from iris_session.protocol.server_messages import PresenceItem, StateHeader
+from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem, StateHeader
+from iris_session.protocol.status import StatusReport
 from iris_session.protocol.steps import Decision
 from iris_session.transport import link_messages as messages
 from iris_session.transport.config import FrontConfig, Ports, SceneInfo
@@ -26,6 +28,10 @@ _SEND_QUEUE: Final = 256
 _BACKLOG: Final = 4096
 #: Presence follows a state frame, so that clients are woken once for both; alone when no state came for so long.
 PRESENCE_ALONE_NS: Final = 50_000_000
+#: A front says something at least every `link_messages.BEAT_NS`, however busy; one that does not for so long hangs.
+HANGING_NS: Final = 1_500_000_000
+#: Longest time between two looks at the link that counts as silence of the front.
+LOOKED_NS: Final = 100_000_000
 #: State frames come at tick times, so their distance varies by a tick.
 PRESENCE_SLACK_NS: Final = 4_000_000
 
@@ -34,7 +40,8 @@ class FrontLink:
     """Talks to one front process at a time; `open` starts over for a new one.
 
     `ports`: where the front listens, `None` until it is ready. `failure`: why it could not start. `status`: its
-    counters. `state_drops`: state frames that the front did not take. `overrun`: it reads nothing any more.
+    counters, and those of the fronts before it. `state_drops`: state frames that the front did not take. `overrun`:
+    it reads nothing any more. `hangs`: it says nothing any more.
     """
 
     def __init__(self, config: FrontConfig, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -49,7 +56,10 @@ class FrontLink:
         self._backlog: deque[tuple[bytes, bytes]] = deque()
         self.ports: Ports | None = None
         self.failure = ""
-        self.status = messages.FrontStatus(0, {}, {})
+        self.status = self._status_before = messages.FrontStatus(0, {}, {})
+        self._silence_ns = 0
+        self._received_ns = 0
+        self._scene: bytes | None = None
         self.handback = b""
         self.state_drops = 0
         self.overrun = False
@@ -65,6 +75,9 @@ class FrontLink:
             if self.ports is not None:
                 self._entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
         self.ports, self.failure, self.overrun = None, "", False
+        self._status_before = msgspec.structs.replace(self.status, connections=0, dropped_by={})
+        self._scene = None  # the next front starts with it
+        self._silence_ns = 0
         self._backlog.clear()
         self._taken = 0
         self._socket = self._context.socket(zmq.PAIR)
@@ -73,6 +86,11 @@ class FrontLink:
         endpoint = f"ipc://{path}"
         self._socket.bind(endpoint)
         return endpoint
+
+    @property
+    def hangs(self) -> bool:
+        """Nothing came from a front that was ready, for so long that it would have said that it lives."""
+        return self.ports is not None and self._silence_ns > HANGING_NS
 
     @property
     def now_ns(self) -> int:
@@ -88,8 +106,13 @@ class FrontLink:
     def receive(self) -> None:
         """Takes what waits; `poll` hands out the entries. Bounded by the front's credits. Never waits."""
         socket = self._socket
+        now_ns = self._monotonic_ns()
+        # Only while we look: an authority that stood still itself accuses nobody.
+        self._silence_ns += min(now_ns - self._received_ns, LOOKED_NS)
+        self._received_ns = now_ns
         if socket is None or not readable(socket):
             return
+        self._silence_ns = 0
         batches = 0
         for _ in range(_POLL_BOUND):
             kind, payload = socket.recv_multipart(zmq.DONTWAIT)
@@ -99,9 +122,11 @@ class FrontLink:
             elif kind == messages.HANDBACK:
                 self.handback = payload
             elif kind == messages.STATUS:
-                self.status = messages.decode_status(payload)
+                self.status = messages.add_status(self._status_before, messages.decode_status(payload))
             elif kind == messages.READY:
                 self.ports = messages.decode_ports(payload)
+                if self._scene is not None:
+                    self._send(messages.SCENE, self._scene)
             elif kind == messages.FAILED:
                 self.failure = payload.decode()
             if not readable(socket):
@@ -115,6 +140,10 @@ class FrontLink:
         """Gives the front what leaves the process; call it in every step, it also says that the session lives."""
         for item in decision.presence:
             self._presence[(item.participant, item.device)] = item
+        for event in decision.events:
+            if isinstance(event.body, ParticipantLeft):
+                for key in [key for key in self._presence if key[0] == event.body.participant]:
+                    del self._presence[key]
         if decision.outgoing or decision.events or decision.admitted or decision.dropped:
             decided = messages.Decided(step, decision.admitted, decision.outgoing, decision.events, decision.dropped)
             self._send(messages.DECIDED, messages.encoder.encode(decided))
@@ -146,9 +175,15 @@ class FrontLink:
         if self._presence and self._sent_ns - self._presence_ns >= self._config.presence_period_ns - PRESENCE_SLACK_NS:
             self._send_presence(self._sent_ns)
 
+    def send_report(self, report: StatusReport) -> None:
+        """The authority's half of the status. Only the newest counts: a front that does not read gets none."""
+        if not self._backlog:
+            self._send(messages.REPORT, messages.encoder.encode(report))
+
     def send_scene(self, scene: SceneInfo) -> None:
-        """Another scene: later snapshots and states are of its bodies."""
-        self._send(messages.SCENE, messages.encoder.encode(scene))
+        """Another scene: later snapshots and states are of its bodies. A front that is not ready yet gets it then."""
+        self._scene = messages.encoder.encode(scene)
+        self._send(messages.SCENE, self._scene)
 
     def send_end(self) -> None:
         """Asks the front to tell its clients that the session ends, and to exit."""

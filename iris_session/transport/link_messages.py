@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from iris_session.protocol.decoding import decoder
 from iris_session.protocol.server_messages import Event
 from iris_session.protocol.steps import Admitted, Dropped, Outgoing
 from iris_session.transport.config import Ports, SceneInfo
@@ -22,6 +23,7 @@ FAILED: Final = b"F"  # utf-8, one line
 ENTRIES: Final = b"E"  # list[Entry]
 HANDBACK: Final = b"H"  # opaque bytes for the next front, sent before an entry that depends on it
 STATUS: Final = b"S"  # FrontStatus
+BEAT: Final = b"B"  # nothing to say, still there; not while the authority stands still
 
 # authority -> front
 DECIDED: Final = b"D"  # Decided
@@ -31,9 +33,12 @@ ACK: Final = b"A"  # one byte: how many batches were taken
 ALIVE: Final = b"K"  # nothing to say, still there
 SCENE: Final = b"N"  # SceneInfo
 END: Final = b"Q"  # the session ends
+REPORT: Final = b"T"  # StatusReport, the authority's half; about once a second
 
 #: The authority says something at least this often; must be well below `FrontConfig.stall_ns`.
 KEEPALIVE_NS: Final = 20_000_000
+#: The front says something at least this often while it hears the authority.
+BEAT_NS: Final = 200_000_000
 
 
 class Decided(msgspec.Struct, frozen=True, array_like=True):
@@ -60,8 +65,23 @@ class FrontStatus(msgspec.Struct, frozen=True):
     entries: int = 0
 
 
+def add_status(before: FrontStatus, status: FrontStatus) -> FrontStatus:
+    """The counters of a front and of those before it: what was dropped does not come back with a new process."""
+    return FrontStatus(
+        status.connections,
+        {
+            reason: before.drops.get(reason, 0) + status.drops.get(reason, 0)
+            for reason in {**before.drops, **status.drops}
+        },
+        status.dropped_by,
+        before.stalls + status.stalls,
+        before.state_frames + status.state_frames,
+        before.entries + status.entries,
+    )
+
+
 encoder: Final = msgspec.msgpack.Encoder()
-decode_decided: Final = msgspec.msgpack.Decoder(Decided).decode
-decode_status: Final = msgspec.msgpack.Decoder(FrontStatus).decode
-decode_ports: Final = msgspec.msgpack.Decoder(Ports).decode
-decode_scene: Final = msgspec.msgpack.Decoder(SceneInfo).decode
+decode_decided: Final = decoder(Decided)
+decode_status: Final = decoder(FrontStatus)
+decode_ports: Final = decoder(Ports)
+decode_scene: Final = decoder(SceneInfo)

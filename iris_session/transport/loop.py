@@ -9,42 +9,49 @@ from __future__ import annotations
 import gc
 import time
 
+import msgspec
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
-from iris_session.protocol.entries import Entry, Lost, encode_entries
-from iris_session.protocol.names import FaultCode
+from iris_session.protocol.entries import Entry, encode_entries
+from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
-from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer
+from iris_session.transport.announce import Facts, announce, host_for_address, hosts_to_tell
+from iris_session.transport.audit import AuditTrail
+from iris_session.transport.clients import ClientTable, Outbox, Peer
 from iris_session.transport.coalescer import Coalescer
-from iris_session.transport.config import MILLISECOND, FrontError, FrontStart, Ports
+from iris_session.transport.config import MILLISECOND, FrontConfig, FrontError, FrontStart, Ports
+from iris_session.transport.departures import Departures
+from iris_session.transport.doors import Doors
 from iris_session.transport.downlink import Downlink
 from iris_session.transport.intake import Intake, RawFeed
+from iris_session.transport.introduction import open_with_introduction
+from iris_session.transport.keyring import open_keyring
 from iris_session.transport.limiter import Drops
+from iris_session.transport.memory import MemoryWatch
+from iris_session.transport.pairing_desk import PairingDesk
 from iris_session.transport.parent import parent_is
 from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.revocation import Revocation
+from iris_session.transport.service import Service
+from iris_session.transport.session_note import NoteKeeper
 from iris_session.transport.sockets import (
     bound_port,
-    close_tcp,
-    host_in_address,
     open_control,
     open_state,
     readable,
-    server_key,
-    watch_disconnects,
+    watch_tcp,
 )
 from iris_session.transport.state_publisher import StatePublisher
-from iris_session.transport.zap import Authenticator, KeyList
+from iris_session.transport.status_desk import StatusDesk, Telling
+from iris_session.transport.zap import Authenticator
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
 ROUND = 8
 ROUNDS = 16
 IDLE_MS = 10
 HOUSEKEEPING_NS = 10 * MILLISECOND
-#: How long what a closed connection has sent may wait behind the messages of others.
-LAST_WORDS_NS = 100 * MILLISECOND
 STATUS_NS = 500 * MILLISECOND
 #: Cyclic garbage is rare here; it is collected when nothing waits.
 COLLECT_NS = 10_000 * MILLISECOND
@@ -66,31 +73,83 @@ class Front:
     def __init__(self, start: FrontStart) -> None:
         self._start = start
         config = self._config = start.config
+        self._services: list[Service] = []  # in the order of their turns
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._link = self._context.socket(zmq.PAIR)
         self._link.setsockopt(zmq.LINGER, 1000)
-        self._link_monitor = watch_disconnects(self._link, "link")
+        self._link_monitor = watch_tcp(self._link, "link", zmq.EVENT_DISCONNECTED)
         self._link.connect(start.link_endpoint)
         self._drops = Drops()
+        self._clients = ClientTable()
+        self._state_sockets = 0
         try:
             self._open_sockets()
         except FrontError as error:
             self._link.send_multipart((link.FAILED, str(error).encode()))
             self.close()
             raise
-        self._clients = ClientTable()
         self._outbox = Outbox(self._control, config.limits, self._drops)
         self._tokens = ResumeTokens(config.limits.resume_tokens, start.handback)
-        admission = self._admission = Admission(
-            config, self._ports, self._clients, self._outbox, self._drops, self._tokens
-        )
         self._coalescer = Coalescer(config.limits, self._drops)
+        self._audit = AuditTrail(self._coalescer.offer)
+        doors = self._doors = Doors(self._clients, self._drops, self._audit, config.limits)
+        doors.watch_state(self._state_monitor)
+        admission = self._admission = Admission(
+            config,
+            self._ports,
+            self._clients,
+            self._outbox,
+            self._drops,
+            self._tokens,
+            self._keyring,
+            self._audit,
+            doors,
+        )
+        self._pairing = PairingDesk(self._keyring, self._outbox, self._audit, self._drops)
         raw = RawFeed(self._context, config.recorder_endpoint, self._drops)
+        self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
+        memory = MemoryWatch(config.limits.memory_bytes, doors.shed, self._shed)
+        self._services += [self._status, doors, memory]
         self._intake = Intake(
-            config, self._clients, self._outbox, admission, self._coalescer, raw, self._drops, self._session_ns
+            config,
+            self._clients,
+            self._outbox,
+            admission,
+            self._coalescer,
+            raw,
+            self._drops,
+            self._session_ns,
+            self._status,
+            self._pairing,
+            self._audit,
+            doors,
+        )
+        departures = self._departures = Departures(
+            self._monitor,
+            self._clients,
+            self._outbox,
+            admission,
+            self._coalescer,
+            self._drops,
+            self._status,
+            self._intake.desks,
+            self._session_ns,
+            doors,
         )
         first_seq = 1 + (self._session_ns() // SEQ_NS if start.handback else 0)
         self._publisher = StatePublisher(self._state, start.scene, self._session_ns, first_seq)
+        revocation = Revocation(
+            self._keyring,
+            self._clients,
+            self._outbox,
+            self._tokens,
+            self._audit,
+            self._publisher,
+            self._coalescer.offer,
+            departures.lose,
+            self._open_state_again,
+        )
+        self._services += [self._pairing, revocation, self._audit]
         self._downlink = Downlink(
             self._link,
             self._clients,
@@ -99,37 +158,64 @@ class Front:
             self._publisher,
             self._drops,
             self._session_ns,
-            self._forget,
+            departures.forget,
+            revocation,
         )
         self.ended = ""
         #: The link closed without a word: its process ends, or has ended already.
         self.cut_off = False
-        self._closed: list[tuple[Connection, int]] = []
+        if self._authenticator is not None:
+            self._authenticator.banned = self._tokens.revoked
         self._batches = 0
         self._entries = 0
         self._stalls = 0
         self._stalled = False
         self._reported = (-1, -1, -1)
-        self._next_status_ns = self._next_housekeeping_ns = self._next_collect_ns = 0
+        self._next_beat_ns = self._next_status_ns = self._next_housekeeping_ns = self._next_collect_ns = 0
 
     def _open_sockets(self) -> None:
         config = self._config
-        key = server_key(config)
+        self._keyring = open_keyring(config, self._drops)
+        key = self._keyring.key
         self._authenticator = (
-            Authenticator(self._context, KeyList(config.curve_clients_dir), self._drops) if key is not None else None
+            Authenticator(self._context, self._keyring, self._drops, self._key_refused) if key is not None else None
         )
-        self._control = open_control(self._context, config, key)
-        self._state = open_state(self._context, config, key)
-        self._monitor = watch_disconnects(self._control, "control")
+        self._control, listeners = open_with_introduction(
+            config.hosts, config.control_port, lambda port: open_control(self._context, config, key, port)
+        )
+        self._state, self._state_monitor = self._open_state(config)
+        self._monitor = watch_tcp(self._control, "control")
         self._ports = Ports(
-            host_in_address(config.host),
+            host_for_address(config),
             bound_port(self._control),
             bound_port(self._state),
             key.fingerprint if key else "",
+            hosts_to_tell(config),
         )
+        facts = Facts(key.public if key else "", lambda: self._pairing.open, lambda: len(self._clients))
+        if self._keyring.home is not None:
+            self._services.append(NoteKeeper(self._keyring.home, config, self._ports))
+        self._services += announce(config, self._ports, listeners, self._drops, facts)
+
+    def _open_state(self, config: FrontConfig) -> tuple[zmq.Socket[bytes], zmq.Socket[bytes]]:
+        """The state socket, and what tells of its TCP connections."""
+        state = open_state(self._context, config, self._keyring.key)
+        self._state_sockets += 1
+        return state, watch_tcp(state, f"state-{self._state_sockets}")
+
+    def _open_state_again(self) -> zmq.Socket[bytes]:
+        state, monitor = self._open_state(msgspec.structs.replace(self._config, state_port=self._ports.state))
+        self._doors.watch_state(monitor)
+        return state
+
+    def _shed(self, whom: str, now_ns: int) -> None:
+        self._doors.flood("", f"memory: closed {whom}", now_ns)
 
     def _session_ns(self) -> int:
         return time.monotonic_ns() - self._config.origin_ns
+
+    def _key_refused(self, mark: str, address: str) -> None:
+        self._audit.note(AuditKind.KEY_REFUSED, self._session_ns(), subject=mark, address=address, detail="state")
 
     def end(self, reason: str) -> None:
         """Lets `run` return after the clients were told."""
@@ -159,19 +245,22 @@ class Front:
             self._authenticator.answer()
         more = True
         for _ in range(ROUNDS):
-            self._drain_monitor()
+            self._departures.drain_monitor()
             more = self._drain_control()
             self._flush()
             self._downlink.drain()
             if not more:
                 break
-        self._take_leave(drained=not more)
+        replaced, self._intake.replaced = self._intake.replaced, []
+        self._departures.take_leave(replaced, drained=not more)
         self._housekeeping(idle=not more)
         self._flush()
         return more
 
     def close(self) -> None:
         """Closes every socket; what was sent leaves within its linger time."""
+        for service in self._services:
+            service.close()
         self._context.destroy()
 
     # --- from clients ------------------------------------------------------------------------------------------------
@@ -190,54 +279,13 @@ class Front:
             while more:
                 more = control.recv(zmq.DONTWAIT, copy=False).more
                 extra += 1
-            peer = Peer(int(frame.get(zmq.SRCFD)), str(frame.get("User-Id")) if with_user else "")
+            try:
+                peer = Peer(int(frame.get(zmq.SRCFD)), str(frame.get("User-Id")) if with_user else "")
+            except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: libzmq does not tell by which connection
+                self._drops.count("unversioned_peer")
+                continue
             self._intake.take(routing_id, peer, frame.buffer, extra)
         return True
-
-    def _drain_monitor(self) -> None:
-        """Notes the connections whose TCP connection was closed."""
-        while readable(self._monitor):
-            descriptor = parse_monitor_message(self._monitor.recv_multipart())["value"]
-            self._admission.forget_peer(descriptor)
-            deadline_ns = self._session_ns() + LAST_WORDS_NS
-            self._closed += [
-                (c, deadline_ns) for c in self._clients.by_number.values() if c.peer.descriptor == descriptor
-            ]
-
-    def _take_leave(self, drained: bool) -> None:
-        """Of connections that are closed (after their last words: an e-stop may still wait in the socket), were
-        replaced by another hello on their route, or did not take what was sent."""
-        if self._closed:
-            now_ns = self._session_ns()
-            gone = [c for c, deadline_ns in self._closed if drained or now_ns > deadline_ns]
-            self._closed = [] if drained else [item for item in self._closed if item[1] >= now_ns]
-            for connection in gone:
-                if self._clients.by_number.get(connection.number) is connection:
-                    self._lose(connection, "closed")
-        replaced, self._intake.replaced = self._intake.replaced, []
-        for connection in replaced:
-            self._lose(connection, "replaced")
-        failed, self._outbox.failed = self._outbox.failed, {}
-        for number, reason in failed.items():
-            slow = self._clients.by_number.get(number)
-            if slow is not None:
-                self._lose(slow, reason)
-                close_tcp(slow.peer.descriptor, slow.address)
-
-    def _lose(self, connection: Connection, reason: str) -> None:
-        """Tells the authority that a connection, and those behind it, are gone."""
-        for one in (connection, *self._clients.behind(connection)):
-            self._clients.remove(one)
-            self._intake.desks.pop(one.number, None)
-            self._drops.forget(one.number)
-            self._coalescer.offer(Entry(one.number, one.number, self._session_ns(), Lost(reason)))
-
-    def _forget(self, connection: Connection) -> None:
-        """The authority is done with a connection: it need not hear of it again."""
-        self._clients.remove(connection)
-        self._intake.desks.pop(connection.number, None)
-        self._drops.forget(connection.number)
-        self._coalescer.forget(connection.number)
 
     # --- to the authority --------------------------------------------------------------------------------------------
 
@@ -250,13 +298,17 @@ class Front:
             batch = self._coalescer.take() if self._coalescer else []
         elif self._coalescer.urgent and used < 2 * limit:
             batch = self._coalescer.take(urgent_only=True)
-        listens = self._downlink.heard_ns > 0 and not self._stalled
-        if self._tokens.changed and (batch or listens):
+        if self._tokens.changed and (batch or self._listens):
             self._link.send_multipart((link.HANDBACK, self._tokens.blob()), zmq.DONTWAIT)
         if batch:
             self._link.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
             self._batches += 1
             self._entries += len(batch)
+
+    @property
+    def _listens(self) -> bool:
+        """Whether the authority takes what is sent, as far as we know."""
+        return self._downlink.heard_ns > 0 and not self._stalled
 
     # --- now and then ------------------------------------------------------------------------------------------------
 
@@ -266,11 +318,15 @@ class Front:
         if now_ns < self._next_housekeeping_ns:
             return
         self._next_housekeeping_ns = now_ns + HOUSEKEEPING_NS
-        silent = [c for c in self._clients.by_number.values() if now_ns - c.last_heard_ns > self._config.silence_ns]
-        for connection in silent:
-            self._lose(connection, "silent")
+        self._departures.silent(now_ns, self._config.silence_ns)
+        for service in self._services:
+            service.turn(now_ns)
+        self._publisher.tend()
         self._propose(now_ns)
         self._watch_stall(now_ns)
+        if now_ns >= self._next_beat_ns and self._listens:
+            self._next_beat_ns = now_ns + link.BEAT_NS
+            self._link.send_multipart((link.BEAT, b""), zmq.DONTWAIT)
         if now_ns >= self._next_status_ns:
             self._next_status_ns = now_ns + STATUS_NS
             self._report()
@@ -279,9 +335,11 @@ class Front:
             gc.collect()
 
     def _propose(self, now_ns: int) -> None:
-        """At most one estimate a pass: it takes up to milliseconds, and state waits meanwhile."""
-        for number, desk in self._intake.desks.items():
+        """At most one estimate a pass: it takes up to milliseconds, and state waits meanwhile. Each in turn."""
+        desks = self._intake.desks
+        for number, desk in desks.items():
             if desk.due(now_ns):
+                desks[number] = desks.pop(number)
                 proposal = desk.propose(now_ns)
                 if proposal is not None:
                     self._coalescer.offer(Entry(number, number, now_ns, proposal))
@@ -307,6 +365,16 @@ class Front:
         self._stalled = stalled
         if not parent_is(self._start.parent_pid):
             self.end(ORPHANED)
+
+    def _telling(self) -> Telling:
+        return Telling(
+            self._publisher.delays_ns,
+            self._downlink.heard_ns,
+            self._downlink.report,
+            self._stalled,
+            self._entries,
+            self._doors.warnings(self._session_ns()),
+        )
 
     def _report(self) -> None:
         """Counters to the authority, while it listens."""

@@ -1,4 +1,8 @@
-"""Starting, watching, restarting and ending the front process. The parent's side; no thread."""
+"""Starting, watching, restarting and ending the front process. The parent's side.
+
+The only thread lives for some milliseconds, while a front is replaced: to end a process that hangs and to make another
+takes longer than a tick.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Final
@@ -40,6 +45,8 @@ class FrontProcess:
         self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_folder_for_sockets())  # mode 0700
         self._generation = 0
         self._process: subprocess.Popen[bytes] | None = None
+        self._replacing: threading.Thread | None = None
+        self._failure: FrontError | None = None
         self.link = FrontLink(config)
 
     @property
@@ -49,8 +56,11 @@ class FrontProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the front runs and reads its link."""
-        return self._process is not None and self._process.poll() is None and not self.link.overrun
+        """Whether the front runs, reads its link and says something now and then, or is being replaced."""
+        if self._replacing is not None and self._replacing.is_alive():
+            return True
+        running = self._process is not None and self._process.poll() is None
+        return running and not self.link.overrun and not self.link.hangs
 
     @property
     def restarts(self) -> int:
@@ -61,21 +71,39 @@ class FrontProcess:
 
         Raises `FrontError` with one line that says what to do: a port in use, a missing key, a wrong address.
         """
-        self._spawn()
+        self._process = self._spawn(self._open_link())
         return self.wait_ready(timeout_s)
 
     def restart(self) -> None:
-        """Replaces a front that died, on the same ports. Does not wait: `link.ports` is set when it is ready.
+        """Replaces a front that died or hangs, on the same ports. Does not wait: `link.ports` is set when it is ready.
 
-        Raises `FrontError` when the system gives no process, or no room for its files; it may be tried again.
+        Raises `FrontError` when the last try has failed, because the system gives no process, or no room for its
+        files; it may be tried again.
         """
-        if self._process is not None:
-            self._process.kill()  # dead, or it reads nothing any more: no step waits for its answer
-            self._process.wait()
+        self._finish_replacing()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
         ports = self.link.ports
         if ports is not None:
             self._config = msgspec.structs.replace(self._config, control_port=ports.control, state_port=ports.state)
-        self._spawn()
+        start = self._open_link()
+        self._replacing = threading.Thread(target=self._replace, args=(self._process, start), name="iris-front")
+        self._replacing.start()
+
+    def _replace(self, old: subprocess.Popen[bytes] | None, start: FrontStart) -> None:
+        if old is not None:
+            old.kill()  # dead, or it takes part no more: no step waits for its answer
+            old.wait()
+        try:
+            self._process = self._spawn(start)
+        except FrontError as error:
+            self._process, self._failure = None, error
+
+    def _finish_replacing(self) -> None:
+        if self._replacing is not None:
+            self._replacing.join()
+            self._replacing = None
 
     def set_scene(self, scene: SceneInfo) -> None:
         """Another scene, for this front and its successors."""
@@ -98,25 +126,27 @@ class FrontProcess:
         self.close()
         raise FrontError(f"the front process was not ready after {timeout_s:g} s")
 
-    def _spawn(self) -> None:
-        try:
-            self._try_spawn()
-        except (OSError, zmq.ZMQError) as error:
-            raise FrontError(f"the front process cannot be started: {error.strerror or error}") from error
-
-    def _try_spawn(self) -> None:
+    def _open_link(self) -> FrontStart:
+        """Listens for the next front; gives what it is to be told."""
         self._generation += 1
-        folder = Path(self._folder.name)
-        endpoint = self.link.open(folder / f"front-{self._generation}")
-        start = FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
-        # A file instead of a pipe: a large scene must not make the parent wait until the front reads.
-        path = folder / "start"
-        path.write_bytes(msgspec.msgpack.encode(start))
-        with path.open("rb") as stdin:
-            path.unlink()
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "iris_session.transport.front"], stdin=stdin, start_new_session=True
-            )
+        try:
+            endpoint = self.link.open(Path(self._folder.name) / f"front-{self._generation}")
+        except zmq.ZMQError as error:
+            raise _not_started(error) from error
+        return FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
+
+    def _spawn(self, start: FrontStart) -> subprocess.Popen[bytes]:
+        try:
+            # A file instead of a pipe: a large scene must not make the parent wait until the front reads.
+            path = Path(self._folder.name) / "start"
+            path.write_bytes(msgspec.msgpack.encode(start))
+            with path.open("rb") as stdin:
+                path.unlink()
+                return subprocess.Popen(
+                    [sys.executable, "-m", "iris_session.transport.front"], stdin=stdin, start_new_session=True
+                )
+        except OSError as error:
+            raise _not_started(error) from error
 
     def _end_process(self, patience_s: float) -> None:
         process = self._process
@@ -127,18 +157,23 @@ class FrontProcess:
         except subprocess.TimeoutExpired:
             process.terminate()
             try:
-                process.wait(1.0 if patience_s else 0.05)
+                process.wait(0.2 if patience_s else 0.05)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
+        self._finish_replacing()
         self.link.send_end()
         self._end_process(timeout_s if self.link.ports is not None else 0.0)
         self._process = None
         self.link.close()
         self._folder.cleanup()
+
+
+def _not_started(error: OSError | zmq.ZMQError) -> FrontError:
+    return FrontError(f"the front process cannot be started: {error.strerror or error}")
 
 
 def _folder_for_sockets() -> str | None:

@@ -22,6 +22,7 @@ class _Record(msgspec.Struct, array_like=True):
 class _Handback(msgspec.Struct, array_like=True):
     next_connection: int
     records: list[_Record]
+    revoked: list[str] = []
 
 
 _decoder = msgspec.msgpack.Decoder(_Handback)
@@ -29,6 +30,16 @@ _decoder = msgspec.msgpack.Decoder(_Handback)
 
 def _digest(token: bytes) -> bytes:
     return hashlib.blake2b(token, digest_size=16, person=b"iris-resume").digest()
+
+
+def handback_above(last_connection: int, blob: bytes = b"") -> bytes:
+    """`blob` (empty: no tokens) for a front whose connection numbers begin above `last_connection`.
+
+    Raises `msgspec.DecodeError` for bytes that are no such memory.
+    """
+    handback = _decoder.decode(blob) if blob else _Handback(1, [])
+    handback.next_connection = max(handback.next_connection, last_connection + 1)
+    return msgspec.msgpack.encode(handback)
 
 
 class ResumeTokens:
@@ -42,6 +53,7 @@ class ResumeTokens:
         self._capacity = capacity
         self._next_connection = handback.next_connection
         self._records = {record.digest: record for record in handback.records}
+        self._revoked = dict.fromkeys(handback.revoked)
         self.changed = False
 
     def new_connection(self) -> int:
@@ -51,10 +63,18 @@ class ResumeTokens:
         self.changed = True
         return number
 
-    def issue(self, key_id: str, participant_id: str) -> bytes:
-        """A fresh token for `participant_id`. The oldest token is forgotten when the table is full."""
+    def issue(self, key_id: str, participant_id: str, came_with: bytes = b"") -> bytes:
+        """A fresh token for `participant_id`, which has at most two: the one it `came_with`, and this.
+
+        The oldest token is forgotten when the table is full: that of who lost the connection longest ago, since those
+        who are gone for good have none (`left`).
+        """
         token = os.urandom(16)
         digest = _digest(token)
+        keep = _digest(came_with)
+        for record in [one for one in self._records.values() if one.participant_id == participant_id]:
+            if record.digest != keep:
+                del self._records[record.digest]
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
         self.changed = True
@@ -70,6 +90,35 @@ class ResumeTokens:
         """Uses the token up."""
         self.changed = self._records.pop(_digest(token), None) is not None or self.changed
 
+    def left(self, participant_id: str) -> None:
+        """Uses up every token of a participant."""
+        for record in [one for one in self._records.values() if one.participant_id == participant_id]:
+            del self._records[record.digest]
+            self.changed = True
+
+    def revoke(self, key_id: str) -> list[str]:
+        """Uses up every token of a key. The participants that they stand for, each once."""
+        theirs = [record for record in self._records.values() if record.key_id == key_id]
+        for record in theirs:
+            del self._records[record.digest]
+        self._revoked.pop(key_id, None)
+        while len(self._revoked) >= self._capacity:
+            del self._revoked[next(iter(self._revoked))]
+        self._revoked[key_id] = None
+        self.changed = True
+        return list(dict.fromkeys(record.participant_id for record in theirs))
+
+    def forgive(self, key_id: str) -> None:
+        """The key was let in anew."""
+        self.changed = self.changed or key_id in self._revoked
+        self._revoked.pop(key_id, None)
+
+    def revoked(self, key_id: str) -> bool:
+        """Whether this key was revoked in this session, and not let in anew since."""
+        return key_id in self._revoked
+
     def blob(self) -> bytes:
         self.changed = False
-        return msgspec.msgpack.encode(_Handback(self._next_connection, list(self._records.values())))
+        return msgspec.msgpack.encode(
+            _Handback(self._next_connection, list(self._records.values()), list(self._revoked))
+        )

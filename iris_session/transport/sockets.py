@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import resource
 import socket
-from pathlib import Path
 
 import zmq
-import zmq.auth
-from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
 
+from iris_session.keys import KeyPair
 from iris_session.protocol.limits import MAX_CLIENT_BYTES
-from iris_session.transport.config import FrontConfig, FrontError
+from iris_session.transport.config import FrontConfig, FrontError, PortInUseError
 
-ZAP_DOMAIN = b"iris"
+#: ZAP domains: keys that are not on the list may pair, on the control socket only.
+ZAP_CONTROL = b"iris-control"
+ZAP_PRIVATE = b"iris-private"
 #: State sockets: two frames may wait for a client that is slow, then the newest is lost, not the oldest (libzmq).
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
+#: A subscription. The handshake of CURVE has messages of up to 600 bytes.
+STATE_MESSAGE_BYTES = 1024
+STATE_RECEIVE_BYTES = 8192
 CONTROL_BUFFER_BYTES = 131_072
 #: As plain integers: operations on the enumerations take longer than asking the socket.
 _EVENTS = int(zmq.EVENTS)
@@ -27,61 +29,30 @@ _POLLIN = int(zmq.POLLIN)
 FILE_DESCRIPTORS = 4096
 
 
-def fingerprint(key: bytes, person: bytes = b"iris-key") -> str:
-    """Name of a key that tells nothing about it: 128-bit BLAKE2b in base32, lower case."""
-    digest = hashlib.blake2b(key, digest_size=16, person=person).digest()
-    return base64.b32encode(digest).decode().rstrip("=").lower()
-
-
-class ServerKey:
-    """The server's CURVE key pair (Z85) and its fingerprint."""
-
-    def __init__(self, secret_file: str) -> None:
-        try:
-            public, secret = zmq.auth.load_certificate(secret_file)
-        except (OSError, ValueError) as error:
-            raise FrontError(f"server key {secret_file} cannot be read: {error}") from error
-        if secret is None:
-            raise FrontError(f"server key {secret_file} holds no secret key: give the *.key_secret file")
-        self.public = public
-        self.secret = secret
-        self.fingerprint = fingerprint(z85.decode(public))
-
-
-def server_key(config: FrontConfig) -> ServerKey | None:
-    """The key to serve with, `None` on plain loopback. Raises `FrontError` where a key is required and missing."""
-    if config.curve_secret_file:
-        if not Path(config.curve_clients_dir).is_dir() or not config.curve_clients_dir:
-            raise FrontError("encryption needs a folder with the public keys (*.key) of the clients that may connect")
-        return ServerKey(config.curve_secret_file)
-    if not config.loopback:
-        raise FrontError(f"refusing to listen on {config.host} without encryption: give a server key, or use 127.0.0.1")
-    return None
-
-
 def open_control(
-    context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: ServerKey | None
+    context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None, port: int
 ) -> zmq.Socket[bytes]:
     """ROUTER for hello and everything after it."""
     control = context.socket(zmq.ROUTER)
     control.setsockopt(zmq.ROUTER_MANDATORY, 1)
     control.setsockopt(zmq.MAXMSGSIZE, MAX_CLIENT_BYTES)
     control.setsockopt(zmq.SNDHWM, config.limits.send_queue)
-    control.setsockopt(zmq.RCVHWM, config.limits.send_queue)
+    control.setsockopt(zmq.RCVHWM, config.limits.receive_queue)
     control.setsockopt(zmq.SNDBUF, CONTROL_BUFFER_BYTES)
     control.setsockopt(zmq.RCVBUF, CONTROL_BUFFER_BYTES)
-    _bind(control, config, key, config.control_port, "control")
+    _bind(control, config, key, port, "control")
     return control
 
 
-def open_state(
-    context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: ServerKey | None
-) -> zmq.Socket[bytes]:
+def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
     """PUB for rigid state and presence."""
     state = context.socket(zmq.PUB)
     state.setsockopt(zmq.SNDHWM, STATE_HWM)
     state.setsockopt(zmq.SNDBUF, STATE_BUFFER_BYTES)
-    state.setsockopt(zmq.MAXMSGSIZE, 1024)  # subscriptions only
+    # Subscriptions only. libzmq takes all that wait before it sends, in our thread: few may, and small ones.
+    state.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES)
+    state.setsockopt(zmq.RCVHWM, STATE_HWM)
+    state.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
     _bind(state, config, key, config.state_port, "state")
     return state
 
@@ -101,14 +72,22 @@ def bound_port(bound: zmq.Socket[bytes]) -> int:
     return int(bound.getsockopt_string(zmq.LAST_ENDPOINT).rsplit(":", 1)[1])
 
 
-def watch_disconnects(control: zmq.Socket[bytes], name: str) -> zmq.Socket[bytes]:
-    """Socket that reports every closed TCP connection of `control` by its file descriptor."""
-    address = f"inproc://disconnects-{name}"
-    control.monitor(address, zmq.EVENT_DISCONNECTED)
-    monitor: zmq.Socket[bytes] = control.context.socket(zmq.PAIR)
+def watch_tcp(
+    watched: zmq.Socket[bytes], name: str, events: int = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+) -> zmq.Socket[bytes]:
+    """Socket that reports every TCP connection of `watched` that is opened or closed; see `next_tcp_event`."""
+    address = f"inproc://tcp-events-{name}"
+    watched.monitor(address, events)
+    monitor: zmq.Socket[bytes] = watched.context.socket(zmq.PAIR)
     monitor.setsockopt(zmq.RCVHWM, 100_000)  # libzmq blocks its own thread when this is full
     monitor.connect(address)
     return monitor
+
+
+def next_tcp_event(monitor: zmq.Socket[bytes]) -> tuple[int, int]:
+    """What happened (`zmq.EVENT_*`) to which file descriptor. To be called when `monitor` is readable."""
+    event = parse_monitor_message(monitor.recv_multipart())
+    return int(event["event"]), int(event["value"])
 
 
 def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
@@ -146,7 +125,7 @@ def raise_descriptor_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: ServerKey | None, port: int, name: str) -> None:
+def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, port: int, name: str) -> None:
     bound.setsockopt(zmq.LINGER, 200)
     bound.setsockopt(zmq.TCP_KEEPALIVE, 1)
     bound.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
@@ -155,15 +134,17 @@ def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: ServerKey | None, 
     bound.setsockopt(zmq.HANDSHAKE_IVL, 5000)
     bound.setsockopt(zmq.BACKLOG, 512)
     if key is not None:
-        bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN)
+        bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_CONTROL if name == "control" else ZAP_PRIVATE)
         bound.setsockopt(zmq.CURVE_SERVER, 1)
-        bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public)
-        bound.setsockopt(zmq.CURVE_SECRETKEY, key.secret)
-    try:
-        bound.setsockopt(zmq.IPV6, int(":" in config.host))
-        bound.bind(f"tcp://{host_in_address(config.host)}:{port or '*'}")
-    except zmq.ZMQError as error:
-        if error.errno == zmq.EADDRINUSE:
-            advice = f"pass --{name}-port 0 for any free one"
-            raise FrontError(f"port {port} is in use (by another session?): {advice}") from error
-        raise FrontError(f"cannot listen on {config.host} port {port} ({name}): {error.strerror}") from error
+        bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public.encode())
+        bound.setsockopt(zmq.CURVE_SECRETKEY, key.secret.encode())
+    for host in config.hosts:
+        try:
+            bound.setsockopt(zmq.IPV6, int(":" in host))
+            bound.bind(f"tcp://{host_in_address(host)}:{port or '*'}")
+        except zmq.ZMQError as error:
+            bound.close()
+            if error.errno == zmq.EADDRINUSE:
+                raise PortInUseError(port, name) from error
+            raise FrontError(f"cannot listen on {host} port {port} ({name}): {error.strerror}") from error
+        port = port or bound_port(bound)  # the same on every address

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import msgspec
@@ -31,11 +32,25 @@ class StatePublisher:
     def __init__(
         self, state: zmq.Socket[bytes], scene: SceneInfo, now_ns: Callable[[], int], first_seq: int = 1
     ) -> None:
-        self._state = state
+        self._state: zmq.Socket[bytes] | None = state
         self._now_ns = now_ns
         self._next_seq = first_seq
         self.frames = 0
+        #: End of the tick until it was handed to the socket, of the newest frames (about five seconds).
+        self.delays_ns: deque[int] = deque(maxlen=300)
         self.set_scene(scene)
+
+    def use_socket(self, state: zmq.Socket[bytes] | None) -> None:
+        """Sends on another socket from now on, and closes the one before. `None`: nothing is sent for a while."""
+        if self._state is not None:
+            self._state.close(linger=0)
+        self._state = state
+
+    def tend(self) -> None:
+        """Lets libzmq do what it does only when asked for something: else, while no state is sent, all that became of
+        connections would pile up."""
+        if self._state is not None:
+            self._state.get(zmq.EVENTS)
 
     def set_scene(self, scene: SceneInfo) -> None:
         """Takes over another scene: later frames have its bodies."""
@@ -55,25 +70,29 @@ class StatePublisher:
         frame = self._encoder.encode(np.frombuffer(poses, np.float64).reshape(n, 7), head.scene_epoch)
         self._published = True
         self._next_seq = frame.state_seq + 1
+        published_ns = self._now_ns()
+        self.delays_ns.append(published_ns - head.session_time)
         stamped = StateHeader(
             head.scene_epoch,
             head.scene_revision,
             head.tick,
             head.sim_time,
             head.session_time,
-            self._now_ns(),
+            published_ns,
             frame.state_seq,
             frame.base_seq,
             head.applied,
         )
-        self._state.send_multipart((TOPIC_RIGID, _encoder.encode(stamped), frame.payload))
-        self.frames += 1
+        if self._state is not None:
+            self._state.send_multipart((TOPIC_RIGID, _encoder.encode(stamped), frame.payload))
+            self.frames += 1
         return True
 
     def publish_presence(self, session_time: int, items: bytes) -> None:
         """`items`: encoded array of `PresenceItem`, passed on as it is."""
-        presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
-        self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
+        if self._state is not None:
+            presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
+            self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
 
     def keyframe(self) -> tuple[int, bytes]:
         """`(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, or of the scene before the first."""

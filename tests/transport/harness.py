@@ -102,9 +102,13 @@ class FrontSession:
         self.clients.append(client)
         return client
 
-    def subscriber(self, curve: tuple[bytes, bytes, bytes] | None = None) -> zmq.Socket[bytes]:
+    def subscriber(
+        self, curve: tuple[bytes, bytes, bytes] | None = None, rcvhwm: int = 1000, rcvbuf: int = -1
+    ) -> zmq.Socket[bytes]:
         sub = self.context.socket(zmq.SUB)
         sub.linger = 0
+        sub.rcvhwm = rcvhwm
+        sub.setsockopt(zmq.RCVBUF, rcvbuf)
         if curve:
             sub.curve_serverkey, sub.curve_publickey, sub.curve_secretkey = curve
         sub.connect(f"tcp://127.0.0.1:{self.ports.state}")

@@ -104,3 +104,20 @@ def test_no_observation_raises(rows: list[tuple[object, ...]]) -> None:
         proposal = desk.propose(i * PERIOD)
         if proposal is not None:
             decode_entry(encode_entry(Entry(1, 1, 0, proposal)))
+
+
+def test_an_unknown_sheet_beside_a_known_one_replaces_no_estimate_and_is_told_once() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    for i in range(8):
+        desk.observe(seen(i, pose=Pose((0.0, 0.0, -0.2), IDENTITY.q)))
+        assert not desk.observe(seen(i, anchor="poster"))
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert not proposal.refused
+    told = desk.propose(PERIOD)
+    assert told is not None
+    assert "poster" in told.advice
+    desk.observe(seen(9, anchor="poster"))
+    assert not desk.due(2 * PERIOD)
+    desk.observe(seen(10, anchor="poster", epoch=2))
+    assert desk.due(2 * PERIOD), "in a new tracking frame it is worth a word again"

@@ -197,3 +197,12 @@ def test_edges_and_final_state_survive_any_interleaving(steps: list[tuple[bool, 
     assert seqs(received) == sorted(seqs(received))
     assert not steps or seqs(received)[-1] == len(steps)
     assert drops.by_reason == {}
+
+
+def test_a_tracking_epoch_replaces_the_one_before_and_is_never_dropped_for_want_of_room() -> None:
+    waiting, drops = coalescer(pending_messages=1)
+    waiting.offer(entry(Marker(1, "x")))
+    for epoch in range(1, 100):
+        assert waiting.offer(entry(TrackingEpoch(epoch)))
+    assert [e.message for e in waiting.take()] == [Marker(1, "x"), TrackingEpoch(99)]
+    assert not drops.by_reason

@@ -39,6 +39,7 @@ class Far:
             self.drops,
             lambda: 77,
             lambda connection: None,
+            unused,  # type: ignore[arg-type]
         )
 
     def send_multipart(self, frames: tuple[bytes, ...]) -> None:

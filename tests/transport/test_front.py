@@ -163,6 +163,9 @@ def test_a_silent_client_is_lost_and_told_to_say_hello_again(open_session: OpenS
     assert lost.message == Lost("silent")
     client.send(Heartbeat())
     assert client.wait_for(ProtocolFault).code == "hello"
+    client.send(EStop("I know of nothing"))
+    (stop,) = session.wait_entries(EStop)
+    assert stop.connection == 1
     assert client.join().connection_epoch == 2
 
 
@@ -192,7 +195,7 @@ def test_dropped_and_refused_connections_end(session: FrontSession) -> None:
     session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault")
 
 
-def test_snapshot_is_filled_and_older_than_the_events_of_its_step(session: FrontSession) -> None:
+def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: FrontSession) -> None:
     client, other = session.client(), session.client()
     client.join()
     other.join(name="Bob")
@@ -200,14 +203,14 @@ def test_snapshot_is_filled_and_older_than_the_events_of_its_step(session: Front
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
     session.send_state(poses)
     events = tuple(session.notice(str(i)) for i in range(3))
-    snapshot = msgspec.structs.replace(session.snapshot(5), event_seq=events[0].event_seq)
+    snapshot = msgspec.structs.replace(session.snapshot(5), event_seq=events[-1].event_seq)
     session.once(Decision((), outgoing=(Outgoing(1, snapshot),), events=events))
     filled = client.wait_for(Snapshot)
     client.wait_for(Event, 3)
     assert (filled.request_id, filled.scene_hash, filled.state_seq) == (5, "hash", 1)
     assert [body.name for body in filled.bodies] == ["body0", "body1", "body2"]
     kinds = [type(message) for message, _ in client.inbox]
-    assert kinds.index(Snapshot) < kinds.index(Event)
+    assert [kind for kind in kinds if kind in (Event, Snapshot)] == [Event, Event, Event, Snapshot]
     (bulk,) = next(bulk for message, bulk in client.inbox if isinstance(message, Snapshot))
     np.testing.assert_allclose(np.frombuffer(bulk).reshape(-1, 7), poses, atol=1e-12)
     other.wait_for(Event, 3)
@@ -347,3 +350,31 @@ def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) 
 def test_welcome_for_a_connection_that_is_gone_is_passed_over(session: FrontSession) -> None:
     session.once(Decision((), admitted=(Admitted(99, "p99", "operator", False),)))
     session.client().join()
+
+
+def test_a_gateway_that_ends_without_closing_its_tcp_takes_its_people_along(open_session: OpenSession) -> None:
+    session = open_session(silence_ns=300_000_000)
+    gateway, other = session.client(), session.client()
+    gateway.join("gateway", "Gate")
+    gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
+    session.wait_entries(Join, 2)
+    session.wait_entries(Lost, 2)  # it says nothing any more, its TCP connection stands
+    assert {e.connection for e in session.entries if isinstance(e.message, Lost)} == {1, 2}
+    other.join(name="Ann")
+    gateway.send(EStop("from behind"), on_behalf_of="tab1", epoch=2)
+    (stop,) = session.wait_entries(EStop)
+    assert stop.connection == 2
+
+
+def test_every_headset_gets_its_estimate_however_busy_the_first(open_session: OpenSession) -> None:
+    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)}, proposal_period_ns=0)
+    clients = [session.client() for _ in range(3)]
+    for i, client in enumerate(clients):
+        client.join(name=f"c{i}")
+
+    def all_estimated() -> bool:
+        for client in clients:  # new observations all the time: every desk is always due
+            client.send(Observation("table", "qr", Pose((0.5, 0.0, -0.2), IDENTITY.q), session.step, 1, session.step))
+        return {e.connection for e in session.entries if isinstance(e.message, AlignmentProposal)} == {1, 2, 3}
+
+    session.pump(all_estimated, "estimates of all")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import msgspec
 import numpy as np
+import psutil
 import pytest
 import zmq
 
@@ -18,12 +19,13 @@ from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.limits import MAX_CLIENT_BYTES
 from iris_session.protocol.server_messages import Event, ProtocolFault, Refused
-from iris_session.protocol.steps import Decision
+from iris_session.protocol.steps import Decision, Outgoing
 from iris_session.transport import FrontLimits
 from tests.transport.harness import FrontSession
 
 pytestmark = pytest.mark.e2e
 OpenSession = Callable[..., FrontSession]
+BODIES = 2000
 
 
 def test_garbage_is_answered_with_bounded_faults_and_harms_nobody(session: FrontSession) -> None:
@@ -177,11 +179,39 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
     seqs = [event.event_seq for event in honest.got(Event)]
     assert seqs == list(range(1, len(seqs) + 1))
     # Its TCP connection is closed: what waits for it takes no memory any more.
-    while slow.poll(100):
-        slow.recv()
-    assert disconnects.poll(5000)
+    deadline = time.monotonic() + 10.0
+    while not disconnects.poll(10):  # it is told after it has read what came before
+        assert time.monotonic() < deadline
+        while slow.poll(0):
+            slow.recv()
     slow.disable_monitor()
     disconnects.close(linger=0)
+    slow.close()
+
+
+def test_what_waits_for_a_client_that_reads_nothing_is_bounded_in_memory(open_session: OpenSession) -> None:
+    limits = FrontLimits(send_queue=100_000, slow_drops=10**9, memory_bytes=24 << 20)
+    session = open_session(limits=limits, silence_ns=60_000_000_000, bodies=BODIES)
+    honest, slow = session.client(), session.client()
+    honest.join(name="Ann")
+    slow.join(name="Bob")
+    session.clients.remove(slow)  # it reads no more
+    slow.socket.rcvhwm = 1
+    front = psutil.Process(session.process.pid)
+    base = front.memory_info().rss
+
+    def lost() -> bool:
+        session.once(Decision((), outgoing=(Outgoing(2, session.snapshot(1)),) * 2))
+        assert front.memory_info().rss - base < 3 * limits.memory_bytes
+        return any(isinstance(e.message, Lost) for e in session.entries)
+
+    session.pump(lost, "the end of who reads nothing", timeout_s=60.0)
+    (loss,) = [e for e in session.entries if isinstance(e.message, Lost)]
+    assert loss.connection == 2
+    assert session.wait_drops("memory") == 1
+    session.pump(lambda: any("memory" in getattr(e.message, "detail", "") for e in session.entries), "its name")
+    honest.send(EStop())
+    session.wait_entries(EStop, connection=1)
     slow.close()
 
 
@@ -218,20 +248,24 @@ def test_rates_are_per_type_and_named(session: FrontSession) -> None:
     assert "get_snapshot" in fault.message
 
 
-def test_state_goes_on_while_one_subscriber_reads_nothing(session: FrontSession) -> None:
-    stuck = session.subscriber()
-    stuck.rcvhwm = 1
+def test_state_goes_on_while_one_subscriber_reads_nothing(open_session: OpenSession) -> None:
+    """More than any queue or socket buffer on the way to the stuck one holds."""
+    session = open_session(bodies=BODIES)
+    stuck = session.subscriber(rcvhwm=1, rcvbuf=4096)
     sub = session.subscriber()
-    poses = np.zeros((3, 7))
-    poses[:, 3] = 1.0
-    seen: list[int] = []
+    rng = np.random.default_rng(1)
+    received = 0
 
-    def received() -> bool:
-        session.send_state(poses)
+    def enough() -> bool:
+        nonlocal received
+        session.send_state(rng.normal(size=(BODIES, 7)))
         while sub.poll(0):
-            sub.recv_multipart()
-            seen.append(session.step)
-        return len(seen) > 200
+            received += sum(map(len, sub.recv_multipart()))
+        return received > 10_000_000
 
-    session.pump(received, "200 frames")
-    assert session.process.link.state_drops == 0
+    session.pump(enough, "10 MB of state", timeout_s=30.0)
+    assert session.process.link.state_drops < session.step / 10, "the front waited for the stuck one"
+    for_stuck = 0
+    while stuck.poll(200):
+        for_stuck += sum(map(len, stuck.recv_multipart()))
+    assert 0 < for_stuck < received / 4, "it got what fits on the way, and the rest was dropped for it alone"

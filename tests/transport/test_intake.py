@@ -8,22 +8,36 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.protocol.client_messages import ClientMessage, EStop, Hello, Marker, envelope
+from iris_session.protocol.client_messages import (
+    ClientMessage,
+    EStop,
+    Heartbeat,
+    Hello,
+    Marker,
+    TrackingEpoch,
+    envelope,
+)
 from iris_session.protocol.codec import decode_server, encode_client
-from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Welcome
+from iris_session.protocol.entries import Audit, Entry, Join
+from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.transport import FrontConfig, Ports
+from iris_session.transport import FrontConfig, FrontLimits, Ports
 from iris_session.transport.admission import Admission
+from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Outbox, Peer
 from iris_session.transport.coalescer import Coalescer
+from iris_session.transport.doors import Doors
 from iris_session.transport.intake import Intake, RawFeed
+from iris_session.transport.keyring import Keyring
 from iris_session.transport.limiter import Drops
+from iris_session.transport.pairing_desk import PairingDesk
 from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.status_desk import StatusDesk, Telling
 
 ROUTE = b"headset"
 ANN = Peer(5, "")
 EVE = Peer(6, "")
+HELLO = Hello("operator", "Ann", secret=b"s" * 16)
 
 
 class Desk:
@@ -32,16 +46,34 @@ class Desk:
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         config = FrontConfig()
         self.now_ns = 1_000_000_000
+        self.limits = config.limits
         self.drops = Drops()
         self.clients = ClientTable()
         self.sent: list[tuple[bytes, Message, list[bytes]]] = []
         outbox = Outbox(self, config.limits, self.drops)  # type: ignore[arg-type]
         self.coalescer = Coalescer(config.limits, self.drops)
         self.tokens = ResumeTokens(8)
-        self.admission = Admission(config, Ports("127.0.0.1", 1, 2), self.clients, outbox, self.drops, self.tokens)
+        keyring, audit = Keyring(), AuditTrail(self.coalescer.offer)
+        doors = self.doors = Doors(self.clients, self.drops, audit, config.limits)
+        self.admission = Admission(
+            config, Ports("127.0.0.1", 1, 2), self.clients, outbox, self.drops, self.tokens, keyring, audit, doors
+        )
+        pairing = PairingDesk(keyring, outbox, audit, self.drops)
         raw = RawFeed(context, "", self.drops)
+        status = StatusDesk(config, self.clients, outbox, self.drops, Telling)
         self.intake = Intake(
-            config, self.clients, outbox, self.admission, self.coalescer, raw, self.drops, lambda: self.now_ns
+            config,
+            self.clients,
+            outbox,
+            self.admission,
+            self.coalescer,
+            raw,
+            self.drops,
+            lambda: self.now_ns,
+            status,
+            pairing,
+            audit,
+            doors,
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
@@ -131,6 +163,13 @@ def test_an_estop_is_never_over_its_rate(desk: Desk) -> None:
         assert isinstance(entry.message, EStop)
 
 
+def test_a_stop_does_not_wait_for_the_welcome(desk: Desk) -> None:
+    desk.take(Hello("observer", "Ann", secret=b"s" * 16))
+    desk.take(Marker(1, "too early"))
+    desk.take(EStop("now"))
+    assert [type(e.message) for e in desk.entries()] == [EStop, Join]
+
+
 def test_the_hellos_of_one_peer_are_bounded_until_it_is_gone(desk: Desk) -> None:
     for _ in range(12):
         desk.take(Hello("operator", "Ann"))
@@ -164,4 +203,91 @@ def test_nobody_speaks_for_a_gateway_of_another_tcp_connection(desk: Desk) -> No
     refused = desk.last()
     assert isinstance(refused, Refused)
     assert refused.code == "gateway_only"
-    assert desk.entries() == []
+    (audit,) = desk.entries()
+    assert audit.message == Audit("gateway_refused", "", "", "", "on behalf of tab1")
+
+
+def test_a_stop_of_who_was_given_up_lately_counts_until_the_tcp_connection_is_closed(desk: Desk) -> None:
+    number = desk.join().connection_epoch
+    lost = desk.clients.by_number[number]
+    desk.clients.remove(lost)
+    desk.take(EStop("unknown"), epoch=number)
+    assert not desk.coalescer
+    desk.clients.give_up(lost)
+    desk.take(EStop("by another"), EVE, epoch=number)
+    assert not desk.coalescer
+    desk.take(EStop("now"), epoch=number)
+    assert desk.coalescer.take() == [Entry(number, number, desk.now_ns, EStop("now"))]
+    fault = desk.sent[-1][1]
+    assert isinstance(fault, ProtocolFault)
+    assert fault.code == "hello", "it is told to come back all the same"
+    desk.clients.closed(ANN.descriptor, ("10.0.0.1", 5))
+    desk.take(EStop("somebody else"), epoch=number)
+    assert not desk.coalescer
+
+
+def test_requests_above_their_rate_or_without_room_are_answered_by_a_denial(desk: Desk) -> None:
+    number = desk.join().connection_epoch
+    for i in range(200):
+        desk.take(Marker(i + 1, "x"), epoch=number)
+    denied = {m.request_id: m.denial for _, m, _ in desk.sent if isinstance(m, Reply)}
+    taken = {e.message.request_id for e in desk.coalescer.take() if isinstance(e.message, Marker)}
+    assert taken == set(range(1, 41))
+    assert set(denied) == set(range(41, 81)), "at a bounded rate"
+    assert all(d is not None and d.reason == "quota" and "marker" in d.message for d in denied.values())
+    desk.sent.clear()
+    for second in range(1, 20):  # within the rate, while the authority takes nothing
+        desk.now_ns += 1_000_000_000
+        for i in range(10):
+            desk.take(Marker(1000 * second + i, "x"), epoch=number)
+    replies = [m for _, m, _ in desk.sent if isinstance(m, Reply)]
+    assert len(replies) == 190 - FrontLimits().pending_messages
+    assert all(r.denial is not None and r.denial.reason == "quota" for r in replies)
+
+
+def test_the_newest_tracking_epoch_gets_through_whatever_its_rate(desk: Desk) -> None:
+    number = desk.join().connection_epoch
+    for epoch in range(1, 101):
+        desk.take(TrackingEpoch(epoch), epoch=number)
+    assert [e.message for e in desk.coalescer.take()] == [TrackingEpoch(10)]
+    desk.now_ns += 1_000_000_000
+    desk.take(Heartbeat(), epoch=number)
+    assert {type(e.message): e.message for e in desk.coalescer.take()}[TrackingEpoch] == TrackingEpoch(100)
+    desk.take(Heartbeat(), epoch=number)
+    assert [e.message for e in desk.coalescer.take()] == [Heartbeat()]
+
+
+def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
+    welcome = desk.join()
+    for i in range(desk.limits.connections - 1):
+        desk.now_ns += 1_000_000_000
+        desk.intake.take(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(HELLO))), 0)
+    assert len(desk.clients) == desk.limits.connections
+    desk.now_ns += 1_000_000_000
+    desk.coalescer.take()
+    late, back = Peer(7, ""), Peer(8, "")
+    data = encode_client(envelope(HELLO))
+    desk.intake.take(b"late", late, memoryview(data), 0)
+    assert isinstance(desk.sent[-1][1], Refused)
+    data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
+    desk.intake.take(b"back", back, memoryview(data), 0)
+    (entry,) = desk.coalescer.take()
+    assert isinstance(entry.message, Join)
+    assert entry.message.resume_of == "p1"
+
+
+def test_who_is_above_the_limits_for_seconds_is_named_as_a_flood(desk: Desk) -> None:
+    epoch = desk.join().connection_epoch
+
+    def floods() -> list[Audit]:
+        return [e.message for e in desk.entries() if isinstance(e.message, Audit)]
+
+    for _ in range(60):  # a burst is none
+        desk.take(Marker(1, "x"), epoch=epoch)
+    assert floods() == []
+    for _ in range(300):
+        desk.now_ns += 10_000_000
+        for _ in range(5):
+            desk.take(Marker(1, "x"), epoch=epoch)
+    (flood,) = floods()
+    assert (flood.kind, flood.subject, flood.name, flood.detail) == ("flood", "p1", "Ann", "marker")

@@ -13,7 +13,7 @@ import zmq
 from iris_session.protocol.client_messages import EStop, Heartbeat, Marker
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Entry, FrontRestarted, encode_entries
-from iris_session.protocol.server_messages import Event, Notice, PresenceItem, StateHeader
+from iris_session.protocol.server_messages import Event, Notice, ParticipantLeft, PresenceItem, StateHeader
 from iris_session.protocol.steps import Command, Decision
 from iris_session.transport import FrontConfig, FrontLink, Ports, SceneInfo
 from iris_session.transport import link as link_module
@@ -215,3 +215,40 @@ def test_entries_that_come_right_after_ready_are_kept(pair: Pair) -> None:
     while pair.link.ports is None:
         pair.link.receive()
     assert [entry.message for entry in pair.poll(1)] == [Heartbeat()]
+
+
+def test_presence_of_who_left_is_not_sent_after_the_word_of_it(pair: Pair) -> None:
+    pair.ready()
+    heads = tuple(PresenceItem(name, "head", IDENTITY) for name in ("p1", "p2"))
+    pair.link.send_decision(1, Decision((), presence=heads))
+    pair.heard()
+    left = Event(1, 2, 0, ParticipantLeft("p1", "bye"))
+    pair.link.send_decision(2, Decision((), presence=heads, events=(left,)))
+    pair.now_ns += link_module.PRESENCE_ALONE_NS
+    pair.link.send_decision(3, Decision(()))
+    items = [msgspec.msgpack.decode(f[1], type=list[PresenceItem]) for f in pair.heard() if f[0] == messages.PRESENCE]
+    assert items == [[heads[1]]]
+
+
+def test_a_scene_waits_for_a_front_that_is_not_ready(pair: Pair) -> None:
+    pair.link.send_scene(SceneInfo("next"))
+    pair.ready()
+    assert [messages.decode_scene(f[1]).scene_hash for f in pair.heard() if f[0] == messages.SCENE] == ["next"]
+
+
+def test_a_front_without_a_word_hangs_but_not_while_nobody_looks(pair: Pair) -> None:
+    pair.ready()
+    pair.now_ns += 60_000_000_000
+    pair.link.poll()
+    assert not pair.link.hangs
+    for _ in range(60):
+        pair.now_ns += 10_000_000
+        pair.link.poll()
+    assert not pair.link.hangs
+    for _ in range(100):
+        pair.now_ns += 10_000_000
+        pair.link.poll()
+    assert pair.link.hangs
+    pair.say(messages.BEAT, b"")
+    while pair.link.hangs:
+        pair.link.poll()

@@ -18,6 +18,7 @@ import pytest
 import zmq
 import zmq.auth
 
+from iris_session.keys import KeyHome
 from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
@@ -49,12 +50,32 @@ def test_a_port_in_use_is_said_in_one_line_with_advice() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(FrontError) as error:
             FrontProcess(FrontConfig(control_port=port, state_port=0), scene()).start()
-    assert str(error.value) == (f"port {port} is in use (by another session?): pass --control-port 0 for any free one")
+    assert str(error.value).startswith(f"port {port} (control) is in use (by another session?): take another")
 
 
-def test_open_networks_need_keys() -> None:
-    with pytest.raises(FrontError, match="without encryption"):
-        FrontProcess(FrontConfig(host="0.0.0.0", control_port=0, state_port=0), scene()).start()
+def test_open_networks_are_encrypted_with_a_key_that_is_made_on_first_use(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    config = FrontConfig(host="0.0.0.0", control_port=0, state_port=0, key_home=str(home))
+    marks = []
+    for _ in range(2):
+        process = FrontProcess(config, scene())
+        marks.append(process.start().key_fingerprint)
+        process.close()
+    assert marks[0] == marks[1] == KeyHome(home).server_key().fingerprint
+    assert home.stat().st_mode & 0o777 == 0o700
+    assert (home / "server.key_secret").stat().st_mode & 0o777 == 0o600
+    assert KeyHome(home).sessions.read() == []
+
+
+def test_a_damaged_list_of_keys_is_one_line_and_stays_as_it_is(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    KeyHome(home).server_key()
+    damaged = home / "clients.json"
+    damaged.write_text("[{")
+    damaged.chmod(0o600)
+    with pytest.raises(FrontError, match=r"clients\.json is damaged"):
+        FrontProcess(FrontConfig(control_port=0, state_port=0, curve=True, key_home=str(home)), scene()).start()
+    assert damaged.read_text() == "[{"
 
 
 def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
@@ -73,8 +94,8 @@ def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("secret_file", "folder", "text"),
     [
-        ("server.key_secret", "missing", "folder with the public keys"),
-        ("nothing", ".", "cannot be read"),
+        ("server.key_secret", "missing", "no folder with the public keys"),
+        ("nothing", ".", "cannot be used"),
         ("server.key", ".", "holds no secret key"),
     ],
 )
@@ -180,12 +201,66 @@ def test_a_front_that_cannot_be_started_now_is_started_later(
 
     with monkeypatch.context() as patch:
         patch.setattr(subprocess, "Popen", refuse)
-        with pytest.raises(FrontError, match="cannot be started: Cannot allocate memory"):
-            session.process.restart()
+        session.process.restart()
+        wait(lambda: not session.process.alive, "failure")
+    with pytest.raises(FrontError, match="cannot be started: Cannot allocate memory"):
+        session.process.restart()
     assert not session.process.alive
     session.process.restart()
     session.pump(lambda: session.process.link.ports is not None, "new front")
     assert session.process.link.ports == ports
+
+
+def test_a_front_that_hangs_is_noticed_and_replaced(session: FrontSession) -> None:
+    client = session.client()
+    token = client.join().resume_token
+    session.once()
+    before, hung = time.monotonic(), session.process.pid
+    os.kill(hung, signal.SIGSTOP)
+    session.pump(lambda: not session.process.alive, "notice")
+    assert time.monotonic() - before > 1.0, "not at the first silence"
+    session.process.restart()
+    session.pump(lambda: session.process.link.ports is not None, "new front")
+    assert gone(hung)
+    assert client.join(resume_token=token).resumed
+
+
+def test_an_authority_that_stood_still_does_not_blame_the_front(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    os.kill(session.process.pid, signal.SIGSTOP)
+    time.sleep(2.0)  # both stand still, as in a debugger
+    os.kill(session.process.pid, signal.SIGCONT)
+    assert session.process.alive
+    session.once()
+    assert session.process.alive
+
+
+def test_a_scene_that_changes_during_a_restart_reaches_the_new_front(session: FrontSession) -> None:
+    session.once()
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    session.process.restart()
+    session.process.set_scene(scene(5))
+    session.pump(lambda: session.process.link.ports is not None, "new front")
+    client = session.client()
+    client.join()
+    client.send(GetSnapshot(1))
+    assert len(client.wait_for(Snapshot).bodies) == 5
+
+
+def test_drops_are_not_forgotten_with_the_front_that_counted_them(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.socket.send(b"nonsense")
+    assert session.wait_drops("malformed") == 1
+    os.kill(session.process.pid, signal.SIGKILL)
+    wait(lambda: not session.process.alive, "crash")
+    session.process.restart()
+    assert session.process.link.status.drops["malformed"] == 1
+    client.join()
+    client.socket.send(b"nonsense")
+    session.pump(lambda: session.process.link.status.drops["malformed"] == 2, "sum")
 
 
 def test_state_frames_of_a_new_front_are_newer(session: FrontSession) -> None:

@@ -42,3 +42,21 @@ def test_changed_tells_when_to_hand_back() -> None:
     assert not tokens.changed
     tokens.retire(token)
     assert tokens.changed
+
+
+def test_who_comes_and_goes_pushes_out_nobody_who_is_here() -> None:
+    tokens = ResumeTokens(4)
+    ann = tokens.issue("ann", "p1")
+    for i in range(10):
+        tokens.issue("bob", f"b{i}")
+        tokens.left(f"b{i}")
+    assert tokens.find(ann, "ann") == "p1"
+
+
+def test_a_participant_keeps_the_token_it_came_with_and_the_newest() -> None:
+    tokens = ResumeTokens(4)
+    ann, first = tokens.issue("ann", "p1"), tokens.issue("bob", "p2")
+    second = tokens.issue("bob", "p2", first)
+    third = tokens.issue("bob", "p2", first)  # the welcome with the second was lost
+    assert [tokens.find(token, "bob") for token in (first, second, third)] == ["p2", None, "p2"]
+    assert tokens.find(ann, "ann") == "p1"

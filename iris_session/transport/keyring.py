@@ -1,0 +1,112 @@
+"""The server's key and the keys that may come in, as the front sees them: read anew whenever their files change."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from iris_session.keys import AllowedKey, KeyHome, KeyPair, KeysError, fingerprint, load_public, load_secret, raw_key
+from iris_session.keys.allow_list import utc_now
+from iris_session.transport.config import FrontConfig, FrontError
+from iris_session.transport.limiter import Drops
+
+#: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
+STRANGER: Final = "pair:"
+
+
+def stranger_key(user_id: str) -> str:
+    """The key (Z85) of a connection that may only pair, empty for any other."""
+    return user_id.removeprefix(STRANGER) if user_id.startswith(STRANGER) else ""
+
+
+class Keyring:
+    """`key`: the server's, `None` on plain loopback. `home`: where unknown keys may pair, else `None`.
+
+    Since somebody emptied them: `gone`: keys that were taken off the list, or got other roles; `come`: keys that were
+    put on it; `seen`: keys that joined, with the time in UTC.
+    """
+
+    def __init__(
+        self,
+        key: KeyPair | None = None,
+        home: KeyHome | None = None,
+        read: Callable[[], dict[str, AllowedKey]] = dict,
+        signature: Callable[[], object] = lambda: None,
+        drops: Drops | None = None,
+    ) -> None:
+        self.key = key
+        self.home = home
+        self._read = read
+        self._signature = signature
+        self._drops = drops or Drops()
+        self._seen = signature()
+        self._keys = read()
+        self.gone: dict[str, AllowedKey] = {}
+        self.come: dict[str, AllowedKey] = {}
+        self.seen: dict[str, str] = {}
+
+    def find(self, mark: str) -> AllowedKey | None:
+        """The allowed key with that fingerprint."""
+        return self._keys.get(mark)
+
+    def welcomed(self, mark: str) -> None:
+        """A key has joined."""
+        if self.home is not None and mark in self._keys:
+            self.seen[mark] = utc_now()
+
+    def look(self) -> None:
+        """Reads the list again if its file has changed. One that is damaged changes nothing, and is said."""
+        signature = self._signature()
+        if signature == self._seen:
+            return
+        self._seen = signature
+        try:
+            keys = self._read()
+        except KeysError as error:
+            self._drops.count("allow_list_unreadable")
+            print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
+            return
+        for mark, old in self._keys.items():
+            new = keys.get(mark)
+            if new is None or new.roles != old.roles:
+                self.gone[mark] = old
+        self.come.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
+        self._keys = keys
+
+
+def open_keyring(config: FrontConfig, drops: Drops) -> Keyring:
+    """The keyring of a session. Off loopback everything is encrypted. Raises `FrontError`."""
+    if not (config.curve or config.curve_secret_file or not config.loopback):
+        return Keyring(drops=drops)
+    home = KeyHome(config.key_home)
+    try:
+        key = load_secret(config.curve_secret_file) if config.curve_secret_file else home.server_key()
+        if not config.curve_clients_dir:
+            return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
+        folder = Path(config.curve_clients_dir)
+        if not folder.is_dir():
+            raise FrontError(f"{folder} is no folder with the public keys (*.key) of the clients that may connect")
+        return Keyring(key, None, lambda: _certificates(folder), lambda: _folder_signature(folder), drops)
+    except KeysError as error:
+        raise FrontError(str(error)) from error
+
+
+def _certificates(folder: Path) -> dict[str, AllowedKey]:
+    """Every `*.key` certificate in a folder. A damaged one lets nobody in, and keeps nobody else out."""
+    keys = {}
+    for path in sorted(folder.glob("*.key")):
+        try:
+            public = load_public(path)
+        except KeysError:
+            continue
+        keys[fingerprint(raw_key(public))] = AllowedKey(path.stem[:64], public)
+    return keys
+
+
+def _folder_signature(folder: Path) -> object:
+    try:
+        return tuple(sorted((entry.name, entry.stat().st_mtime_ns) for entry in folder.iterdir()))
+    except OSError:
+        return None

@@ -1,0 +1,188 @@
+"""Pairing: an unknown key shows that it knows a join code, and is put on the allow-list.
+
+A code has few attempts, and so has an address. The files of the home of keys are changed in the front's turns, one
+attempt each, and never waited for.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import sys
+import time
+from collections import deque
+from typing import Final, NamedTuple
+
+from iris_session.keys import KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
+from iris_session.keys.join_codes import Attempt
+from iris_session.protocol import pairing
+from iris_session.protocol.names import AuditKind, RefusalCode
+from iris_session.protocol.security import Pair, Paired
+from iris_session.protocol.server_messages import Refused
+from iris_session.transport.audit import AuditTrail
+from iris_session.transport.clients import Outbox, Peer, Route
+from iris_session.transport.config import SECOND
+from iris_session.transport.keyring import Keyring, stranger_key
+from iris_session.transport.limiter import Drops, TokenBucket
+from iris_session.transport.sockets import peer_of
+
+#: Of everybody together; so at most `BURST` wait.
+PER_SECOND: Final = 10.0
+BURST: Final = 16
+#: How long another process may keep us from the files.
+PATIENCE_NS: Final = 2 * SECOND
+#: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
+ADDRESS_ATTEMPTS: Final = 10
+WINDOW_NS: Final = 600 * SECOND
+MAX_ADDRESSES: Final = 1024
+
+
+class _Waiting(NamedTuple):
+    route: Route
+    address: str
+    key: str
+    pair: Pair
+    since_ns: int
+
+
+class PairingDesk:
+    """A `Service`. `take` gets every `Pair`; answers are sent in `turn`."""
+
+    def __init__(self, keyring: Keyring, outbox: Outbox, audit: AuditTrail, drops: Drops) -> None:
+        self._keyring = keyring
+        self._outbox = outbox
+        self._audit = audit
+        self._drops = drops
+        self._pairs = TokenBucket(PER_SECOND, BURST)
+        self._complaints = TokenBucket(PER_SECOND, BURST)
+        self._waiting: deque[_Waiting] = deque(maxlen=4 * BURST)
+        self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
+        self._signature: object = None
+        self._codes: tuple[float, ...] = ()  # when the open codes expire, UTC seconds
+
+    @property
+    def open(self) -> bool:
+        """Whether a join code can be used now."""
+        home, key = self._keyring.home, self._keyring.key
+        if home is None or key is None:
+            return False
+        if home.codes.signature != self._signature:
+            self._signature = home.codes.signature
+            try:
+                self._codes = home.codes.expiries(key.fingerprint)
+            except KeysError as error:
+                self._codes = ()
+                self._say(error)
+        return any(time.time() < expires for expires in self._codes)
+
+    def take(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
+        """One `Pair` of a key that is on the list, or is not."""
+        address = peer_of(peer.descriptor)[0]
+        key = stranger_key(peer.user_id)
+        known = self._keyring.find(peer.user_id)
+        if known is not None:
+            key = known.key
+        if not self._pairs.take(now_ns):
+            self._drops.count("pair_rate")
+            if self._complaints.take(now_ns):
+                advice = "try again in a second"
+                self._outbox.send_to_route(route, Refused(RefusalCode.RATE, "many pair at once", advice))
+        elif self._keyring.key is None:
+            self._refuse(route, "this session is not encrypted: nobody pairs with it", "say hello")
+        elif not key:
+            self._refuse(route, "this key was revoked while it was connected", "connect anew")
+        elif route.on_behalf_of:
+            self._refuse(route, "a key pairs for itself", "leave on_behalf_of empty")
+        elif self._keyring.home is None:
+            self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
+        elif self._exhausted(address, now_ns):
+            self._audit.note(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
+            self._refuse(route, "too many wrong codes from this address", "wait ten minutes")
+        elif not self.open:
+            mark = fingerprint(raw_key(key))
+            self._audit.note(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
+            self._refuse(route, "no join code can be used now", "run `iris-session pair` where the session runs")
+        else:
+            self._waiting.append(_Waiting(route, address, key, pair, now_ns))
+
+    def turn(self, now_ns: int) -> None:
+        """Takes one attempt."""
+        if not self._waiting:
+            return
+        waiting = self._waiting.popleft()
+        home, key = self._keyring.home, self._keyring.key
+        assert home is not None
+        assert key is not None
+        try:
+            attempt = self._attempt(home, key, waiting)
+        except KeysBusyError:
+            if now_ns - waiting.since_ns < PATIENCE_NS:
+                self._waiting.append(waiting)
+            else:
+                self._refuse(waiting.route, "the list of keys is busy", "try again")
+        except KeysError as error:
+            self._say(error)
+            advice = "whoever runs the session finds more at its terminal"
+            self._refuse(waiting.route, "the session cannot change its list of keys", advice)
+        else:
+            self._answer(waiting, attempt, key, now_ns)
+
+    def close(self) -> None:
+        """Nothing was opened."""
+
+    def _attempt(self, home: KeyHome, key: KeyPair, waiting: _Waiting) -> Attempt:
+        pair = waiting.pair
+        name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
+        return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, patience_s=0.0)
+
+    def _answer(self, waiting: _Waiting, attempt: Attempt, key: KeyPair, now_ns: int) -> None:
+        client = raw_key(waiting.key)
+        mark = fingerprint(client)
+        entry = attempt.entry
+        if entry is not None:
+            self._wrong.pop(_network(waiting.address), None)
+            self._keyring.look()
+            roles = ", ".join(entry.roles) or "any role"
+            self._audit.note(
+                AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=waiting.address, detail=roles
+            )
+            proof = pairing.server_proof(attempt.secret, key.raw_public, client)
+            self._outbox.send_to_route(waiting.route, Paired(proof, entry.roles))
+            return
+        self._count_wrong(waiting.address, now_ns)
+        kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED
+        self._audit.note(kind, now_ns, subject=mark, name=waiting.pair.name, address=waiting.address)
+        advice = "run `iris-session pair` anew" if not attempt.open_codes else "look at the code again"
+        self._refuse(waiting.route, "this join code is wrong, used or expired", advice)
+
+    def _refuse(self, route: Route, message: str, advice: str) -> None:
+        self._drops.count("pair_refused")
+        self._outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
+
+    def _exhausted(self, address: str, now_ns: int) -> bool:
+        wrong, since_ns = self._wrong.get(_network(address), (0, now_ns))
+        return wrong >= ADDRESS_ATTEMPTS and now_ns - since_ns < WINDOW_NS
+
+    def _count_wrong(self, address: str, now_ns: int) -> None:
+        network = _network(address)
+        wrong, since_ns = self._wrong.pop(network, (0, now_ns))
+        if now_ns - since_ns >= WINDOW_NS:
+            wrong, since_ns = 0, now_ns
+        while len(self._wrong) >= MAX_ADDRESSES:
+            del self._wrong[next(iter(self._wrong))]
+        self._wrong[network] = (wrong + 1, since_ns)
+
+    @staticmethod
+    def _say(error: KeysError) -> None:
+        print(f"iris-session: pairing does not work: {error}", file=sys.stderr, flush=True)
+
+
+def _network(address: str) -> str:
+    """What counts as one address: with IPv6, a household or lab has 2**64 of them."""
+    try:
+        ip = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(ip, ipaddress.IPv6Address):
+        mapped = ip.ipv4_mapped
+        return str(mapped) if mapped else str(ipaddress.ip_network((ip, 64), strict=False))
+    return address

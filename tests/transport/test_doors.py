@@ -1,0 +1,272 @@
+"""TCP connections before hello: who is closed, who makes room, who is called a flood. Real TCP connections."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+import zmq
+
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.entries import Audit, Entry
+from iris_session.transport.audit import AuditTrail
+from iris_session.transport.clients import ClientTable, Connection, Peer, Route
+from iris_session.transport.config import SECOND, FrontLimits
+from iris_session.transport.doors import LOOK_NS, MAX_SHOWN, OPENED_PER_S, Doors, bytes_received
+from iris_session.transport.limiter import Drops
+from iris_session.transport.memory import LOOK_NS as MEMORY_LOOK_NS
+from iris_session.transport.memory import PATIENCE_NS, MemoryWatch
+from iris_session.transport.sockets import watch_tcp
+
+LIMITS = FrontLimits(strangers=3, hello_timeout_ns=10 * SECOND)
+
+
+class Hall:
+    """Doors, and TCP connections through them."""
+
+    def __init__(self) -> None:
+        self.now_ns = SECOND
+        self.clients, self.drops = ClientTable(), Drops()
+        self.told: list[Entry] = []
+        self.doors = Doors(self.clients, self.drops, AuditTrail(self._tell), LIMITS)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.held: list[socket.socket] = [self.listener]
+
+    def _tell(self, entry: Entry) -> bool:
+        self.told.append(entry)
+        return True
+
+    @property
+    def audits(self) -> list[Audit]:
+        return [entry.message for entry in self.told if isinstance(entry.message, Audit)]
+
+    def open(self) -> tuple[Peer, socket.socket]:
+        """A new TCP connection: as the front sees it, and its other end."""
+        theirs = socket.create_connection(self.listener.getsockname())
+        ours, _ = self.listener.accept()
+        self.held += [theirs, ours]
+        self.doors.opened(ours.fileno(), self.now_ns)
+        return Peer(ours.fileno(), ""), theirs
+
+    def hello(self, peer: Peer, number: int = 1) -> Connection:
+        route = Route(b"%d" % number)
+        address = next(one.getpeername() for one in self.held[1:] if one.fileno() == peer.descriptor)
+        connection = Connection(number, route, peer, address, f"key{number}", Hello("operator", "Ann"), 0)
+        self.clients.add(connection)
+        return connection
+
+    def look(self, after_ns: int = LOOK_NS) -> None:
+        self.now_ns += after_ns
+        self.doors.turn(self.now_ns)
+
+
+def is_closed(theirs: socket.socket) -> bool:
+    theirs.settimeout(0.05)
+    try:
+        return theirs.recv(1) == b""
+    except TimeoutError:
+        return False
+
+
+@pytest.fixture
+def hall() -> Iterator[Hall]:
+    one = Hall()
+    yield one
+    for held in one.held:
+        held.close()
+
+
+def test_who_says_no_hello_is_closed_after_ten_seconds(hall: Hall) -> None:
+    (_, silent), (guest, polite), (pairing, paired) = hall.open(), hall.open(), hall.open()
+    hall.hello(guest)
+    hall.look(9 * SECOND)
+    hall.doors.busy(pairing.descriptor, hall.now_ns)
+    assert not is_closed(silent)
+    hall.look(2 * SECOND)
+    assert is_closed(silent)
+    assert not is_closed(polite)
+    assert not is_closed(paired)
+    assert hall.drops.by_reason == {"no_hello": 1}
+    hall.look(10 * SECOND)
+    assert is_closed(paired)
+
+
+def test_who_lost_its_connection_has_as_long_to_say_hello_again(hall: Hall) -> None:
+    peer, theirs = hall.open()
+    connection = hall.hello(peer)
+    hall.look(100 * SECOND)
+    hall.clients.remove(connection)
+    hall.look(9 * SECOND)
+    assert not is_closed(theirs)
+    hall.look(2 * SECOND)
+    assert is_closed(theirs)
+
+
+def test_who_was_given_up_keeps_its_connection_for_an_estop(hall: Hall) -> None:
+    peer, theirs = hall.open()
+    connection = hall.hello(peer)
+    hall.clients.remove(connection)
+    hall.clients.give_up(connection)
+    hall.look(100 * SECOND)
+    assert not is_closed(theirs)
+
+
+def test_the_oldest_silent_ones_make_room(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(5)]
+    hall.hello(crowd[0][0])
+    hall.look()
+    assert [is_closed(theirs) for _, theirs in crowd] == [False, True, False, False, False]
+    assert hall.drops.by_reason == {"strangers_too_many": 1}
+
+
+def test_far_too_much_is_cut_off_named_and_kept_out_for_a_while(hall: Hall) -> None:
+    peer, theirs = hall.open()
+    ann = hall.hello(peer)
+    assert not any(hall.doors.excess(peer, ann, "sample", hall.now_ns) for _ in range(LIMITS.excess_burst))
+    assert hall.doors.excess(peer, ann, "sample", hall.now_ns)
+    assert is_closed(theirs)
+    (flood,) = hall.audits
+    assert (flood.kind, flood.name, flood.address, flood.detail) == ("flood", "Ann", "127.0.0.1", "sample")
+    assert hall.doors.warnings(hall.now_ns) == ("flood from 127.0.0.1 (Ann): sample",)
+    assert hall.doors.barred("key1", hall.now_ns)
+    assert not hall.doors.barred("key2", hall.now_ns)
+    hall.look(4 * SECOND)
+    assert not hall.doors.barred("key1", hall.now_ns)
+    assert hall.doors.warnings(hall.now_ns + 60 * SECOND) == ()
+
+
+def test_strangers_who_come_back_at_once_are_borne_less_and_less(hall: Hall) -> None:
+    borne = []
+    for _ in range(3):
+        peer, theirs = hall.open()
+        n = 0
+        while not hall.doors.excess(peer, None, "before hello", hall.now_ns):
+            n += 1
+        assert is_closed(theirs)
+        borne.append(n)
+    assert borne == [LIMITS.excess_burst // 4, LIMITS.excess_burst // 16, LIMITS.excess_burst // 16]
+    hall.look(4 * SECOND)
+    peer, _ = hall.open()
+    assert not any(hall.doors.excess(peer, None, "before hello", hall.now_ns) for _ in range(borne[0]))
+
+
+def test_a_subscriber_that_talks_is_cut_off(hall: Hall) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    state = context.socket(zmq.PUB)
+    state.linger = 0
+    port = state.bind_to_random_port("tcp://127.0.0.1")
+    hall.doors.watch_state(watch_tcp(state, "state"))
+    quiet, talker = context.socket(zmq.SUB), context.socket(zmq.SUB)
+    for one in (quiet, talker):
+        one.linger = 0
+        one.connect(f"tcp://127.0.0.1:{port}")
+        one.subscribe(b"rigid")
+    number = 0
+    while "flood_cut" not in hall.drops.by_reason:
+        number += 1
+        assert number < 100_000
+        talker.subscribe(b"%900d" % number)
+        state.get(zmq.EVENTS)
+        hall.look(SECOND // 100)
+    assert [audit.detail for audit in hall.audits] == ["subscriptions"]
+    assert hall.drops.by_reason["flood_cut"] == 1
+    hall.doors.close()
+    context.destroy(linger=0)
+
+
+def test_what_is_not_taken_slowly_is_never_cut_off(hall: Hall) -> None:
+    peer, theirs = hall.open()
+    for _ in range(3 * LIMITS.excess_burst):
+        hall.now_ns += SECOND // 400
+        assert not hall.doors.excess(peer, None, "before hello", hall.now_ns)
+    assert not is_closed(theirs)
+
+
+def test_many_connections_within_a_second_are_named(hall: Hall) -> None:
+    peer, _ = hall.open()
+    for _ in range(OPENED_PER_S):
+        hall.doors.opened(peer.descriptor, hall.now_ns)
+    assert [audit.detail for audit in hall.audits] == ["connections"]
+    hall.now_ns += 2 * SECOND
+    hall.doors.opened(peer.descriptor, hall.now_ns)
+    assert len(hall.audits) == 1
+
+
+def test_what_is_remembered_of_floods_is_bounded(hall: Hall) -> None:
+    for i in range(1000):
+        hall.doors.flood(f"10.0.{i // 250}.{i % 250}", "sample", hall.now_ns)
+    assert len(hall.doors.warnings(hall.now_ns)) == MAX_SHOWN
+
+
+def test_room_is_made_by_the_newest_strangers_then_the_newest_clients(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(4)]
+    hall.hello(crowd[0][0], 1)
+    hall.hello(crowd[3][0], 2)
+    assert hall.doors.shed() == "connections without hello"
+    assert [is_closed(theirs) for _, theirs in crowd] == [False, False, True, False]
+    hall.doors.shed()
+    assert hall.doors.shed() == "Ann from 127.0.0.1"
+    assert [is_closed(theirs) for _, theirs in crowd] == [False, True, True, True]
+    assert hall.drops.by_reason == {"memory": 3}
+
+
+def test_the_system_counts_what_came(hall: Hall) -> None:
+    peer, theirs = hall.open()
+    before = bytes_received(peer.descriptor)
+    theirs.sendall(b"x" * 1000)
+    ours = next(one for one in hall.held[1:] if one.fileno() == peer.descriptor)
+    got = 0
+    while got < 1000:
+        got += len(ours.recv(1000))
+    assert bytes_received(peer.descriptor) - before == 1000
+    assert bytes_received(10_000) == 0
+
+
+class Machine:
+    """Memory that is what the test says."""
+
+    def __init__(self) -> None:
+        self.held, self.free = 100, 0
+        self.shed: list[int] = []
+        self.told: list[tuple[str, int]] = []
+        self.now_ns = 0
+        self.watch = MemoryWatch(50, self._shed, self._tell, lambda: self.held + self.free, self._trim)
+
+    def _tell(self, whom: str, now_ns: int) -> None:
+        self.told.append((whom, now_ns))
+
+    def _trim(self) -> None:
+        self.free = 0
+
+    def _shed(self) -> str:
+        self.shed.append(self.now_ns)
+        return "Ann"
+
+    def look(self, after_ns: int = MEMORY_LOOK_NS) -> None:
+        self.now_ns += after_ns
+        self.watch.turn(self.now_ns)
+
+
+def test_memory_above_the_bound_costs_the_newest_their_connection() -> None:
+    machine = Machine()
+    machine.look()
+    machine.held = 150
+    machine.look()
+    assert machine.shed == []
+    machine.held = 151
+    machine.look()
+    machine.look()  # libzmq has not freed it yet
+    assert len(machine.shed) == 1
+    assert machine.told == [("Ann", machine.shed[0])]
+    machine.look(PATIENCE_NS)
+    assert len(machine.shed) == 2
+
+
+def test_memory_that_is_free_but_kept_costs_nobody() -> None:
+    machine = Machine()
+    machine.look()
+    machine.free = 1000
+    machine.look()
+    assert machine.shed == []
+    assert machine.free == 0
