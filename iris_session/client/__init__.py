@@ -5,6 +5,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 """
 
 from iris_session.client.client import Client
+from iris_session.client.discovery import FoundSession, find_sessions
 from iris_session.client.errors import (
     ClientError,
     DeniedError,
@@ -13,6 +14,8 @@ from iris_session.client.errors import (
     NotConnectedError,
     RefusedError,
     RequestTimeoutError,
+    SessionNameError,
+    TrustError,
     VersionError,
 )
 from iris_session.client.identity import Identity
@@ -26,11 +29,13 @@ __all__ = [
     "Client",
     "ClientGroup",
     "CurveKeys",
+    "FoundSession",
     "Identity",
     "PoseBuffer",
     "SceneState",
     "SessionMirror",
     "Shown",
+    "find_sessions",
     "poll_all",
     "wait_any",
     "ClientError",
@@ -40,5 +45,7 @@ __all__ = [
     "NotConnectedError",
     "RefusedError",
     "RequestTimeoutError",
+    "SessionNameError",
+    "TrustError",
     "VersionError",
 ]

@@ -10,6 +10,7 @@ import os
 import secrets
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Self
 
@@ -18,30 +19,36 @@ import zmq
 from iris_session.client.connection import Connection
 from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.identity import Identity
+from iris_session.client.joining import Joining, wanted
+from iris_session.client.reporting import ArrivalMeter, Reporting
 from iris_session.client.requests import Requests
 from iris_session.client.sampling import Sampling
 from iris_session.client.scene_view import SceneView
-from iris_session.client.sockets import ClientSockets, CurveKeys, parse_address
+from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
 from iris_session.client.values import checked_bytes, names_of
 from iris_session.client.waiting import milliseconds
-from iris_session.protocol.client_messages import ClientMessage, Hello
+from iris_session.protocol.client_messages import ClientMessage, EStop, Hello
+from iris_session.protocol.common import Denial
 from iris_session.protocol.names import AlignmentKind, Role
-from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault
+from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault, Reply
 
 #: Roles that have no headset, so nothing to align.
 UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER})
 DEFAULT_TIMEOUT_S = 5.0
 
 
-class Client(SceneView, Requests, Sampling):
+class Client(SceneView, Requests, Sampling, Reporting, Joining):
     """A participant of a session.
 
-    `address`: `HOST:PORT` of the control channel. `devices`: tracked sources of input that samples will name.
+    `address`: `HOST:PORT` of the control channel, or the `iris://` URI of a pairing code; `session`: name of a session
+    to find on the network instead. Neither: the session on this machine. `join_code`: from `iris-session pair`, for
+    the first time at an encrypted session. `devices`: tracked sources of input that samples will name.
     `alignment`: `measured` or `not_needed` (default: by role). `identity`: an `Identity`, a file that keeps one across
-    restarts, or `None` for this process only. `curve`: needed for every address but loopback.
+    restarts, or `None` for this process only. `curve`: keys of your own instead of those in the home of keys.
     `on_state(state)`, `on_event(event)`, `on_feedback(feedback)`: called from `poll` (or the thread of `start`).
+    `on_denial(denial)`: of a message that waits for no answer.
 
         with Client("127.0.0.1:7721", role="agent", name="policy", devices=("target",)) as client:
             client.acquire(["left"])
@@ -54,8 +61,9 @@ class Client(SceneView, Requests, Sampling):
 
     def __init__(
         self,
-        address: str = "127.0.0.1:7721",
+        address: str = "",
         *,
+        session: str = "",
         role: str = Role.OPERATOR,
         name: str = "",
         devices: str | Sequence[str] = (),
@@ -68,9 +76,11 @@ class Client(SceneView, Requests, Sampling):
         on_state: Callable[[SceneState], None] | None = None,
         on_event: Callable[[Event], None] | None = None,
         on_feedback: Callable[[Feedback], None] | None = None,
+        on_denial: Callable[[Denial], None] | None = None,
     ) -> None:
-        self.address = address
-        host, port = parse_address(address)
+        self._wanted = wanted(address, session, curve, join_code)
+        #: `HOST:PORT`, as soon as it is known.
+        self.address = str(self._wanted.address or f"session {session!r}")
         if alignment is None:
             alignment = AlignmentKind.NOT_NEEDED if role in UNALIGNED_ROLES else AlignmentKind.MEASURED
         if identity is None:
@@ -85,19 +95,20 @@ class Client(SceneView, Requests, Sampling):
             # The session keeps our alignment over a lost connection only while this `run` lasts.
             capabilities=(*capabilities, f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
-            join_code=join_code,
         )
         checked_bytes(hello)
         self.connection = Connection(hello, identity)
         self.on_state = on_state
         self.on_event = on_event
         self.on_feedback = on_feedback
+        self.on_denial = on_denial
         self.feedback: dict[str, Feedback] = {}
         self._state: SceneState | None = None
         self._session_id = ""
         self._seq = {}
+        self._arrivals = ArrivalMeter()
         self._generation = 0
-        self._sockets = ClientSockets(host, port, curve)
+        self._sockets = ClientSockets()
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None
@@ -109,13 +120,12 @@ class Client(SceneView, Requests, Sampling):
     def connect(self, timeout_s: float = DEFAULT_TIMEOUT_S) -> Self:
         """Joins the session and waits for snapshot and clock.
 
-        Raises `RefusedError` (or `VersionError`) when the session says no, `NotConnectedError` when nobody answers.
+        Raises `RefusedError` (or `VersionError`) when the session says no, `TrustError` when its key is not the one
+        that is trusted, `NotConnectedError` when nobody answers.
         """
         self.open()
         if not self.wait_for(lambda client: client.ready, timeout_s):
-            raise NotConnectedError(
-                f"no session let us in at {self.address} within {timeout_s:g} s: is `iris-session serve` running there?"
-            )
+            raise NotConnectedError(f"no session let us in at {self.why_not_in(f'within {timeout_s:g} s')}")
         return self
 
     def open(self) -> None:
@@ -123,8 +133,9 @@ class Client(SceneView, Requests, Sampling):
         with self._lock:
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            if self.connection.phase in (Phase.IDLE, Phase.REFUSED):
-                self.connection.open(time.monotonic_ns())
+            if self.connection.phase in (Phase.IDLE, Phase.REFUSED) and self._meeting is None:
+                self._begin_meeting()
+                self._step_meeting()
 
     def close(self) -> None:
         """Leaves at once: leases are released without grace. Stops the thread of `start`."""
@@ -136,13 +147,20 @@ class Client(SceneView, Requests, Sampling):
             thread.join()
         with self._lock:
             if self.connection.phase is not Phase.CLOSED:
+                self._end_meeting()
                 self.connection.close()
                 self._flush()
                 self._sockets.close()
             self._changed.notify_all()
 
     def __enter__(self) -> Self:
-        return self if self.ready else self.connect()
+        if self.ready:
+            return self
+        try:
+            return self.connect()
+        except BaseException:
+            self.close()
+            raise
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -194,6 +212,11 @@ class Client(SceneView, Requests, Sampling):
         return progressed
 
     @property
+    def state_waits(self) -> bool:
+        """Whether state came that `poll_state` would take."""
+        return self._sockets.state_waits
+
+    @property
     def registration(self) -> tuple[int, bool]:
         """Changes when `register` would add something else than before."""
         return self._sockets.version, self.connection.peek_outgoing() is not None
@@ -218,8 +241,7 @@ class Client(SceneView, Requests, Sampling):
                 self.poll(remaining)
                 continue
             with self._changed:
-                if self._crash is not None:
-                    raise self._crash
+                self._check_thread()
                 if self.connection.failure is not None:
                     raise self.connection.failure
                 self._changed.wait(min(remaining, 0.1))
@@ -231,8 +253,8 @@ class Client(SceneView, Requests, Sampling):
 
     @property
     def ready(self) -> bool:
-        """Joined, with snapshot and clock. False while reconnecting."""
-        return self.connection.phase is Phase.READY
+        """Joined, with snapshot and clock. False while reconnecting, and after the thread of `start` ended."""
+        return self.connection.phase is Phase.READY and self._crash is None
 
     @property
     def name(self) -> str:
@@ -257,14 +279,25 @@ class Client(SceneView, Requests, Sampling):
     def send(self, message: ClientMessage) -> bool:
         """Sends any message. Samples without a connection are dropped and counted (false); others then raise."""
         with self._lock:
+            if not isinstance(message, EStop):  # that one leaves as long as there is a socket
+                self._check_thread()
             queued = self.connection.send(message)
             self._send_soon()
+            self._check_thread()
             return queued
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
+    def _check_thread(self) -> None:
+        """Raises what ended the thread of `start`: nobody would send, receive or notice anything."""
+        if isinstance(self._crash, ClientError):
+            raise self._crash
+        if self._crash is not None:
+            text = f"the thread of start() was ended by {type(self._crash).__name__}: {self._crash}"
+            raise NotConnectedError(text) from self._crash
+
     def _send_soon(self) -> None:
-        if self._polls_here:
+        if self._polls_here or self._crash is not None:
             self._flush()
         else:
             self._sockets.wake()
@@ -275,14 +308,21 @@ class Client(SceneView, Requests, Sampling):
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
             phase = self.connection.phase
+            self._step_meeting()
         progressed = self.poll_state()
         with self._lock:
             gone = self._sockets.disconnected() and self._generation == self.connection.generation
             progressed |= self._drain_control()  # the last words of a session before its end
             if gone and self._generation == self.connection.generation:
                 self.connection.lost(time.monotonic_ns())
+            self._look_who_answered()
             self.connection.tick(time.monotonic_ns())
+            report = self._arrivals.take(self.connection, time.monotonic_ns())
+            if report is not None:
+                self.connection.send(report)
             self._flush()
+            if self.connection.phase is Phase.REFUSED:
+                self._sockets.hang_up()
             progressed |= self.connection.phase is not phase
             inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
             for message in inbox:
@@ -296,11 +336,13 @@ class Client(SceneView, Requests, Sampling):
 
     def _drain_state(self) -> tuple[SceneState | None, bool]:
         messages = self._sockets.drain_state()
-        state = self.connection.stream.drain(messages, self.session_now_ns())
+        local_ns = time.monotonic_ns()
+        state = self.connection.stream.drain(messages, self.connection.clock.session_ns(local_ns), local_ns)
         if state is not None:
             now_ns = self.session_now_ns()  # decoding is part of the age
             state = SceneState(state.header, state.poses, now_ns, now_ns - state.header.session_time)
             self._state = state
+            self._arrivals.delivered(state)
         return state, bool(messages)
 
     def _drain_control(self) -> bool:
@@ -311,7 +353,7 @@ class Client(SceneView, Requests, Sampling):
         if self.connection.joined and self.connection.welcome is not None:
             if self.connection.welcome.session_id != self._session_id:
                 self._session_id, self._state = self.connection.welcome.session_id, None
-            self._sockets.open_state(self.connection.welcome.endpoints.state)
+            self._sockets.open_state(self.connection.welcome.endpoints.state, self._generation)
         return bool(messages)
 
     def _flush(self) -> None:
@@ -325,11 +367,13 @@ class Client(SceneView, Requests, Sampling):
                 return
             self.connection.pop_outgoing(sent=sent)
 
-    def _call_back(self, message: Event | Feedback | ProtocolFault) -> None:
+    def _call_back(self, message: Event | Feedback | ProtocolFault | Reply) -> None:
         if isinstance(message, Event) and self.on_event is not None:
             self.on_event(message)
         elif isinstance(message, Feedback) and self.on_feedback is not None:
             self.on_feedback(message)
+        elif isinstance(message, Reply) and self.on_denial is not None and message.denial is not None:
+            self.on_denial(message.denial)
 
     def _wait(self, timeout_ns: int) -> None:
         poller = zmq.Poller()
@@ -345,6 +389,8 @@ class Client(SceneView, Requests, Sampling):
                 with self._changed:
                     self._changed.notify_all()
         except BaseException as error:  # whatever ends the thread is raised where somebody waits
+            if not isinstance(error, ClientError):  # those say what happened in one line, where somebody waits
+                traceback.print_exception(error)
             with self._changed:
                 self._crash = error
                 self._changed.notify_all()

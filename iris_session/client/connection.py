@@ -12,35 +12,53 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
+from iris_session.client.answers import Answers
 from iris_session.client.clock import ClockSync
-from iris_session.client.errors import NotConnectedError, RefusedError, VersionError
+from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, VersionError
 from iris_session.client.identity import Identity
-from iris_session.client.outgoing import Outgoing
+from iris_session.client.limits import (
+    BACKOFF_MAX_NS,
+    BACKOFF_MIN_NS,
+    HELLO_TIMEOUT_NS,
+    MAX_INBOX,
+    NOT_TAKEN,
+    SILENT_HEARTBEATS,
+    SNAPSHOT_RETRY_NS,
+    STEADY_NS,
+    TRANSIENT,
+    end_for_good,
+    heartbeat_period,
+)
+from iris_session.client.outgoing import Outgoing, PendingStop
 from iris_session.client.session_state import SessionMirror
 from iris_session.client.state_stream import StateStream, poses_from_bytes
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.client.values import checked_bytes
 from iris_session.protocol.client_messages import (
     Bye,
+    ClearEStop,
     ClientMessage,
     ClockPing,
+    EStop,
     GetSnapshot,
     Heartbeat,
     Hello,
     Sample,
+    Samples,
     TrackingEpoch,
     envelope,
 )
 from iris_session.protocol.codec import decode_server, encode_client
-from iris_session.protocol.common import Lease
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.names import DenialReason, FaultCode, RefusalCode
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
     ClockPong,
+    EStopChanged,
     Event,
     Feedback,
     ParticipantLeft,
@@ -50,22 +68,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-
-HELLO_TIMEOUT_NS: Final = 1_000_000_000
-BACKOFF_MIN_NS: Final = 100_000_000
-BACKOFF_MAX_NS: Final = 2_000_000_000
-STEADY_NS: Final = 1_000_000_000
-SNAPSHOT_RETRY_NS: Final = 500_000_000
-SILENT_HEARTBEATS: Final = 4  # this many heartbeat periods without a word from the front: the connection is gone
-MAX_INBOX: Final = 1024
-MAX_PENDING: Final = 64
-
-#: Refusals that pass: somebody who was in before keeps trying.
-TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
-#: Faults about a message of ours that the session could not read: whoever waits for its answer waits in vain.
-NOT_TAKEN: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LARGE})
-#: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
-REPLACED: Final = "replaced"
+from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
 class Connection:
@@ -77,7 +80,8 @@ class Connection:
         self.phase = Phase.IDLE
         self.generation = 0
         self.welcome: Welcome | None = None
-        self.failure: RefusedError | None = None
+        self.failure: ClientError | None = None
+        self.wake_ns = 0  # when the shell has something to do that is not ours; 0: never
         self.not_taken: ProtocolFault | None = None  # the newest fault of `NOT_TAKEN`
         self.stalled = False
         self.worn = True
@@ -86,17 +90,18 @@ class Connection:
         self.clock = ClockSync()
         self.stream = StateStream()
         self.counters = ConnectionCounters()
-        self.inbox: deque[Event | Feedback | ProtocolFault] = deque()
+        self.inbox: deque[Event | Feedback | ProtocolFault | Reply] = deque()  # replies: unasked denials
+        #: Newest message of the kinds of which only the newest matters, by type.
+        self.latest: dict[type, StatusReport | DeliveryBudget | Paired] = {}
+        self.answers = Answers(self.counters)
+        self.stop = PendingStop()
         self._outgoing = Outgoing(self.counters)
-        self._pending: set[int] = set()
-        self._replies: dict[int, Reply] = {}
-        self._granted: dict[str, Lease] = {}
-        self._next_request = 1
         self._backoff_ns = BACKOFF_MIN_NS
         self._hello_at = 0
         self._retry_at = 0
         self._heard_at = 0
         self._heartbeat_at = 0
+        self._heartbeat_ns = 0  # as the session asks for, within reason
         self._snapshot_at = 0
         self._joined_at = 0
         self._ticked_at = 0
@@ -114,7 +119,7 @@ class Connection:
         if self.welcome is not None:
             self._queue(Bye())
             if self.phase is not Phase.REFUSED:  # then the token in a shared file may be that of who took over
-                self.identity.resume_token = b""
+                self.counters.identity_unwritten += not self.identity.remember(b"")
         self.phase = Phase.CLOSED
 
     def lost(self, now_ns: int) -> None:
@@ -160,7 +165,7 @@ class Connection:
         if self.phase is Phase.JOINING:
             return self._hello_at + HELLO_TIMEOUT_NS
         if not self.joined:
-            return now_ns + STEADY_NS
+            return self.wake_ns or now_ns + STEADY_NS
         due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)
         return min(due, self._snapshot_at) if self._snapshot_wanted else due
 
@@ -169,11 +174,15 @@ class Connection:
     def send(self, message: ClientMessage) -> bool:
         """Queues a message. Samples are never kept: false (and counted) when there is no connection.
 
+        An e-stop is kept until the session has it, over any number of connections: false says that there is none now.
         Raises `InvalidMessageError` when the protocol does not take it, connected or not.
         """
         data = checked_bytes(message, self.connection_epoch)
+        if isinstance(message, EStop) and (self.joined or self.phase in (Phase.JOINING, Phase.WAITING)):
+            self.stop.ask(message)
+            return self.phase is not Phase.WAITING and self._outgoing.push(message, data)
         if not self.joined:
-            if isinstance(message, Sample):
+            if isinstance(message, Sample | Samples):
                 self.counters.samples_not_sent += 1
                 return False
             raise NotConnectedError(self.describe())
@@ -183,24 +192,15 @@ class Connection:
         """Queues a request under a fresh `request_id`, which is returned."""
         if not self.joined:
             raise NotConnectedError(self.describe())
-        request_id = self._next_request
+        request_id = self.answers.next_request
         message = msgspec.structs.replace(message, request_id=request_id)
         data = checked_bytes(message, self.connection_epoch)
-        self._next_request += 1
-        if len(self._pending) >= MAX_PENDING:
-            self._pending.discard(min(self._pending))
-        self._pending.add(request_id)
-        self._outgoing.push(message, data)
+        if not self._outgoing.push(message, data):
+            raise NotConnectedError("the session takes nothing: too many messages wait to be sent")
+        if isinstance(message, ClearEStop):
+            self.stop.withdraw()
+        self.answers.expect()
         return request_id
-
-    def take_reply(self, request_id: int) -> Reply | None:
-        """The answer to a request, once."""
-        return self._replies.pop(request_id, None)
-
-    def forget(self, request_id: int) -> None:
-        """Nobody waits for this answer any more."""
-        self._pending.discard(request_id)
-        self._replies.pop(request_id, None)
 
     def peek_outgoing(self) -> tuple[bool, bytes] | None:
         """The next message to send: (may be dropped when the socket is full, bytes)."""
@@ -212,7 +212,7 @@ class Connection:
 
     def lease_version(self, target: str) -> int | None:
         """Our fencing token for `target`, by events or by a reply that came before its event."""
-        granted, known = self._granted.get(target), self.mirror.leases.get(target)
+        granted, known = self.answers.granted(target), self.mirror.leases.get(target)
         if granted is not None and (known is None or granted.lease_version > known.lease_version):
             ours = granted.holder == self.participant_id or self.participant_id in granted.sub_holders
             return granted.lease_version if ours else None
@@ -243,21 +243,30 @@ class Connection:
             self._refused(message, now_ns)
         elif isinstance(message, ProtocolFault):
             self._fault(message, now_ns)
+        elif isinstance(message, StatusReport):
+            self.latest[StatusReport] = message  # also while a session that stands still lets nobody in
         elif not self.joined or wrapped.connection_epoch != self.connection_epoch:
             self.counters.other_connection += 1
         elif isinstance(message, ClockPong):
             self.clock.pong(message.t0_ns, message.t1_ns, message.t2_ns, now_ns)
+            self.stop.answered(message.t0_ns, stopped=self.mirror.synced and self.mirror.estop)
             self._maybe_ready()
         elif isinstance(message, Reply):
-            self._reply(message)
+            if not self.answers.came(message):
+                self.counters.unasked_denials += 1
+                self._deliver(message)
         elif isinstance(message, Event):
             if self.mirror.apply_event(message):
                 self.stream.scene_epoch = self.mirror.scene_epoch
+                if isinstance(message.body, EStopChanged) and message.body.active:
+                    self.stop.withdraw()
                 self._deliver(message)
         elif isinstance(message, Snapshot):
             self._snapshot(message, frames[1:])
-        else:
+        elif isinstance(message, Feedback):
             self._deliver(message)
+        else:
+            self.latest[type(message)] = message
 
     def _welcomed(self, welcome: Welcome, now_ns: int) -> None:
         if self.phase is not Phase.JOINING:
@@ -267,13 +276,19 @@ class Connection:
             self.mirror.reset()
             self.clock.reset()
             self.stream.reset()  # else state goes on: a restarted front numbers its frames above the old one's
+        self.clock.restart()  # this machine may have slept
+        self.stream.reconnected()
         self.mirror.synced = False
         self.welcome = welcome
-        self.identity.resume_token = welcome.resume_token
+        self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
         self.phase = Phase.SYNCING
         self._joined_at = now_ns
-        self._heartbeat_at = now_ns + welcome.heartbeat_ns // 2
+        self._heartbeat_ns = heartbeat_period(welcome)
+        self._heartbeat_at = now_ns + self._heartbeat_ns // 2
         self._snapshot_at = now_ns
+        if self.stop.message is not None:
+            self.stop.ask(self.stop.message)
+            self._queue(self.stop.message)
         if self.tracking_epoch:
             self._queue(TrackingEpoch(self.tracking_epoch))
         self._keep_up(now_ns)
@@ -291,32 +306,20 @@ class Connection:
             self.failure = (VersionError if refused.code == RefusalCode.VERSION else RefusedError)(refused)
 
     def _fault(self, fault: ProtocolFault, now_ns: int) -> None:
-        self.counters.faults[fault.code] = self.counters.faults.get(fault.code, 0) + 1
+        self.counters.fault(fault.code)
         self._deliver(fault)
         if fault.code in NOT_TAKEN:
             self.not_taken = fault
         elif fault.code in ("stalled", "recovered"):
             self.stalled = fault.code == "stalled"
-        elif fault.code == "dropped" and fault.message.endswith(REPLACED):
-            advice = "give every client that runs at the same time an identity of its own"
-            self.failure = RefusedError(Refused(REPLACED, "another client took over with this identity", advice))
+        elif (end := end_for_good(fault)) is not None:
+            self.failure = RefusedError(end)
             self.phase = Phase.REFUSED
         elif fault.code == "session_ended" and self.joined:
             self.counters.reconnects += 1
             self._wait(now_ns)
         elif fault.code in ("dropped", "hello"):
             self.lost(now_ns)
-
-    def _reply(self, reply: Reply) -> None:
-        self._granted.update((lease.target, lease) for lease in reply.leases)
-        if reply.request_id in self._pending:
-            self._pending.discard(reply.request_id)
-            while len(self._replies) >= MAX_PENDING:
-                del self._replies[next(iter(self._replies))]
-                self.counters.inbox_dropped += 1
-            self._replies[reply.request_id] = reply
-        elif reply.request_id:
-            self.counters.unexpected_replies += 1
 
     def _snapshot(self, snapshot: Snapshot, bulk: Sequence[bytes]) -> None:
         poses = poses_from_bytes(bulk[0] if bulk else b"", len(snapshot.bodies))
@@ -326,7 +329,10 @@ class Connection:
         self.counters.snapshots += 1
         for event in self.mirror.apply_snapshot(snapshot):
             self._deliver(event)
+        if self.mirror.estop:
+            self.stop.withdraw()
         self.stream.scene_epoch = self.mirror.scene_epoch
+        self.stream.keep_presence(self.mirror.connected)
         self.stream.load_keyframe(snapshot.state_seq, poses)
         self._maybe_ready()
 
@@ -334,7 +340,7 @@ class Connection:
         if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.settled:
             self.phase = Phase.READY
 
-    def _deliver(self, message: Event | Feedback | ProtocolFault) -> None:
+    def _deliver(self, message: Event | Feedback | ProtocolFault | Reply) -> None:
         if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
             self.stream.forget_presence(message.body.participant)
         if len(self.inbox) >= MAX_INBOX:
@@ -346,7 +352,7 @@ class Connection:
 
     @property
     def _silence_ns(self) -> int:
-        return SILENT_HEARTBEATS * max(self.welcome.heartbeat_ns if self.welcome else 0, 500_000_000)
+        return SILENT_HEARTBEATS * max(self._heartbeat_ns, 500_000_000)
 
     @property
     def _snapshot_wanted(self) -> bool:
@@ -359,8 +365,9 @@ class Connection:
             return
         if self.clock.ping_due(now_ns):
             self._queue(ClockPing(now_ns))
+            self.stop.pinged(now_ns)
         if now_ns >= self._heartbeat_at:
-            self._heartbeat_at = now_ns + self.welcome.heartbeat_ns // 2
+            self._heartbeat_at = now_ns + self._heartbeat_ns // 2
             self._queue(Heartbeat(self.worn))
         if self._snapshot_wanted and now_ns >= self._snapshot_at:
             self._snapshot_at = now_ns + SNAPSHOT_RETRY_NS
@@ -374,13 +381,13 @@ class Connection:
         self._hello_at = now_ns
         self._heard_at = now_ns
         self._outgoing.clear()
-        self._granted.clear()
-        self._pending.clear()
-        self._replies.clear()
+        self.answers.clear()
         hello = msgspec.structs.replace(
             self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
         )
         self._outgoing.push(hello, encode_client(envelope(hello)))
+        if self.stop.message is not None:  # anyone may stop, however early
+            self._outgoing.push(self.stop.message, encode_client(envelope(self.stop.message)))
 
     def _wait(self, now_ns: int) -> None:
         self.phase = Phase.WAITING
@@ -388,5 +395,5 @@ class Connection:
         self._retry_at = now_ns + self._backoff_ns
         self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)
 
-    def _queue(self, message: ClientMessage) -> None:
-        self._outgoing.push(message, encode_client(envelope(message, self.connection_epoch)))
+    def _queue(self, message: ClientMessage) -> bool:
+        return self._outgoing.push(message, encode_client(envelope(message, self.connection_epoch)))

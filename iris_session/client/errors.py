@@ -8,6 +8,8 @@
     +-- RequestTimeoutError    no answer in time (also a `TimeoutError`); the request may still take effect
     +-- InvalidMessageError    what was to be sent is not of the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
+    +-- TrustError             the session's key is not the one that is trusted, or it could not prove the join code
+    +-- SessionNameError       no single session can be meant by that name
 
 Bytes that a server sends and that do not fit the protocol never raise: they are counted in `Client.counters`.
 """
@@ -69,3 +71,11 @@ class InvalidMessageError(ClientError, ValueError):
 
 class IdentityError(ClientError):
     """The identity file is unreadable, damaged, or readable by others."""
+
+
+class TrustError(ClientError):
+    """The session at an address is not, or cannot be shown to be, the one that is meant. Nothing was said to it."""
+
+
+class SessionNameError(ClientError):
+    """Several sessions have that name, or another one answers where it was heard."""

@@ -6,6 +6,7 @@ default: then a new process is a new participant. With a file, a killed and rest
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
 import stat
@@ -16,6 +17,7 @@ import msgspec
 from iris_session.client.errors import IdentityError
 
 SECRET_BYTES = 16  # 128 bits
+_log = logging.getLogger(__name__)
 
 
 class _Stored(msgspec.Struct, frozen=True):
@@ -32,6 +34,7 @@ class Identity:
         self.secret = secret
         self.path = path
         self._resume_token = resume_token
+        self._warned = False
 
     @classmethod
     def in_memory(cls) -> Identity:
@@ -73,6 +76,20 @@ class Identity:
             self._resume_token = token
             if self.path is not None:
                 self._write()
+
+    def remember(self, token: bytes) -> bool:
+        """Sets `resume_token`; false, with a warning the first time, when the file cannot be written.
+
+        A full disk ends no participation: this process has the token, only another one could not resume with it.
+        """
+        try:
+            self.resume_token = token
+        except IdentityError as error:
+            if not self._warned:
+                _log.warning("%s: after a restart this client cannot resume", error)
+            self._warned = True
+            return False
+        return True
 
     def _write(self) -> None:
         """Replaces the file in one step, so that a kill leaves the old or the new one."""

@@ -48,6 +48,9 @@ class Requests:
     def _send_soon(self) -> None: ...
 
     @abstractmethod
+    def _check_thread(self) -> None: ...
+
+    @abstractmethod
     def send(self, message: ClientMessage) -> bool: ...
 
     @abstractmethod
@@ -59,6 +62,7 @@ class Requests:
     def submit(self, message: Any) -> int:
         """Sends a message that has a `request_id` (which is filled in) without waiting; `answer` has the reply."""
         with self._lock:
+            self._check_thread()
             request_id = self.connection.request(message)
             self._send_soon()
             return request_id
@@ -66,7 +70,7 @@ class Requests:
     def answer(self, request_id: int) -> Reply | None:
         """The reply to a submitted request, once; `None` while there is none. Look at its `denial`."""
         with self._lock:
-            return self.connection.take_reply(request_id)
+            return self.connection.answers.take(request_id)
 
     def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
         """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
@@ -89,7 +93,7 @@ class Requests:
 
         self.wait_for(answered, timeout_s)
         with self._lock:
-            self.connection.forget(request_id)
+            self.connection.answers.forget(request_id)
         kind = type(message).__name__
         if not replies:
             if self.connection.generation != generation or not self.connection.joined:
@@ -162,12 +166,15 @@ class Requests:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""
         self.request(PlaceAlignment(0, participant, pose_of("T_world_tracking", T_world_tracking), offset))
 
-    def estop(self, reason: object = "") -> None:
+    def estop(self, reason: object = "") -> bool:
         """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop.
 
-        `reason`: anything; its text is cut to what the protocol takes. Raises only `NotConnectedError`.
+        It is sent again after every reconnect, until the session says that it is stopped or `clear_estop` is called.
+        False: there is no connection now, it leaves with the next one. `reason`: anything; its text is cut to what the
+        protocol takes. Raises only `NotConnectedError`: this client was never opened, was closed, refused, or its
+        thread has ended (it is sent nevertheless while the socket stands).
         """
-        self.send(EStop(text_of(reason)))
+        return self.send(EStop(text_of(reason)))
 
     def clear_estop(self) -> None:
         """Ends the e-stop; robots hold until clutched again."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 from iris_session.client.connection import Connection
 from iris_session.client.errors import InvalidMessageError
 from iris_session.client.values import PoseLike, names_of, numbers, plain, pose_of
-from iris_session.protocol.client_messages import ClientMessage, Sample
+from iris_session.protocol.client_messages import ClientMessage, Sample, Samples
 from iris_session.protocol.common import Alignment, Target
 from iris_session.protocol.names import SampleKind, TargetKind
 
@@ -41,6 +41,13 @@ class Sampling:
         Raises `InvalidMessageError` for values that the protocol does not take, in one line that names the field.
         """
         return self.send(self.make_sample(device, pose, **fields))
+
+    def send_samples(self, samples: Iterable[Sample]) -> bool:
+        """Sends samples of several devices (at most 8, from `make_sample`) as one message. False: dropped, counted.
+
+        For devices that are sampled together: one packet instead of three, and a third of the work on both sides.
+        """
+        return self.send(Samples(tuple(samples)))
 
     def make_sample(
         self,

@@ -45,9 +45,10 @@ class SceneView:
 
     @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:
-        """Heads and hands of everyone by `(participant, device)`."""
+        """Heads and hands of everyone who is connected by `(participant, device)`, as they are now."""
         with self._lock:
-            return self.connection.stream.presence
+            self.connection.stream.keep_presence(self.connection.mirror.connected)
+            return dict(self.connection.stream.presence)
 
     @property
     def alignment(self) -> Alignment | None:

@@ -112,6 +112,11 @@ class SessionMirror:
         self._apply(event)
         return True
 
+    @property
+    def connected(self) -> frozenset[str]:
+        """Ids of the participants who are here now."""
+        return frozenset(info.id for info in self.participants.values() if info.connected)
+
     def alignment(self, participant: str) -> Alignment | None:
         """The alignment of one participant, `None` while it has none."""
         info = self.participants.get(participant)

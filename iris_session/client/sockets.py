@@ -5,16 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
 import zmq
 from zmq.auth import load_certificate
 
-from iris_session.client.errors import ClientError, IdentityError
+from iris_session.client.errors import IdentityError
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 
-DEFAULT_CONTROL_PORT: Final = 7721
 STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
 STATE_RCVBUF: Final = 16_384
@@ -34,7 +33,7 @@ class CurveKeys:
 
     server_public: bytes
     public: bytes
-    secret: bytes
+    secret: bytes = field(repr=False)  # in no log and no traceback
 
     @classmethod
     def from_files(cls, server_file: str | os.PathLike[str], own_secret_file: str | os.PathLike[str]) -> CurveKeys:
@@ -49,37 +48,33 @@ class CurveKeys:
         return cls(server_public, public, secret)
 
 
-def parse_address(address: object) -> tuple[str, int]:
-    """`host`, `host:port`, `[ipv6]:port` or the same after `tcp://`, as `(host, port)`."""
-    if not isinstance(address, str):
-        example = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
-        raise ClientError(f"address {address!r} is a {type(address).__name__}, not text like {example!r}")
-    text = address.removeprefix("tcp://").rstrip("/")
-    host, separator, port = text.rpartition(":")
-    if not separator or (text.count(":") > 1 and not text.startswith("[")) or text.endswith("]"):
-        host, port = text, str(DEFAULT_CONTROL_PORT)
-    if not host.strip("[]") or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ClientError(f"address {address!r} is not HOST:PORT, for example 127.0.0.1:{DEFAULT_CONTROL_PORT}")
-    return host.strip("[]"), int(port)
-
-
 class ClientSockets:
     """Opens, drains and closes. All methods but `wake` belong to one thread."""
 
-    def __init__(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
-        self._host = f"[{host}]" if ":" in host else host
-        self._control_port = control_port
-        self._curve = curve
+    def __init__(self) -> None:
+        self._host = ""
+        self._control_port = 0
+        self._curve: CurveKeys | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._control: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: zmq.Socket[bytes] | None = None
-        self._state_port = 0
+        self._state_of = (0, 0)
         #: Changes whenever a socket is opened or closed.
         self.version = 0
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_out.setblocking(False)
         self._wake_in.setblocking(False)
+
+    def aim(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
+        """Where the sockets that are opened from now on go, and with which keys."""
+        self._host = f"[{host}]" if ":" in host else host
+        self._control_port = control_port
+        self._curve = curve
+        if self._state is not None:
+            self._state.close(linger=0)
+            self._state = None
+            self.version += 1
 
     def open_control(self) -> None:
         """A fresh control socket; the old one goes at once with everything in it."""
@@ -95,9 +90,10 @@ class ClientSockets:
         self._control = control
         self.version += 1
 
-    def open_state(self, port: int) -> None:
-        """Subscribes to the state channel. Does nothing when that port is connected already."""
-        if self._state is not None and self._state_port == port:
+    def open_state(self, port: int, generation: int) -> None:
+        """Subscribes to the state channel, anew with every `generation` of the control connection: what cut that may
+        have left this one half open, and nothing would ever come. Does nothing when it is connected already."""
+        if self._state is not None and self._state_of == (port, generation):
             return
         if self._state is not None:
             self._state.close(linger=0)
@@ -109,7 +105,7 @@ class ClientSockets:
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_RIGID)
         state.setsockopt(zmq.SUBSCRIBE, TOPIC_PRESENCE)
         state.connect(f"tcp://{self._host}:{port}")
-        self._state, self._state_port = state, port
+        self._state, self._state_of = state, (port, generation)
         self.version += 1
 
     def send_control(self, data: bytes) -> bool:
@@ -129,6 +125,11 @@ class ClientSockets:
     def drain_state(self) -> list[list[bytes]]:
         """What came on the state channel, oldest first."""
         return _drain(self._state)
+
+    @property
+    def state_waits(self) -> bool:
+        """Whether something came on the state channel."""
+        return _readable(self._state)
 
     def disconnected(self) -> bool:
         """True once after the control socket lost its peer."""
@@ -164,6 +165,15 @@ class ClientSockets:
             while self._wake_in.recv(4096):
                 pass
 
+    def hang_up(self) -> None:
+        """Disconnects, after a session has sent us away: libzmq would knock at its door for ever."""
+        if self._control is not None or self._state is not None:
+            self.version += 1
+            self._close_control(linger_ms=0)
+            if self._state is not None:
+                self._state.close(linger=0)
+                self._state = None
+
     def close(self) -> None:
         """Closes everything; a last bye still has `LINGER_MS` to leave."""
         self.version += 1
@@ -187,6 +197,10 @@ class ClientSockets:
     def _new_socket(self, kind: int) -> zmq.Socket[bytes]:
         sock: zmq.Socket[bytes] = self._context.socket(kind)
         sock.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # as the session's sockets: a peer that vanished is noticed in 11 s
+        sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
+        sock.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
+        sock.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
         sock.setsockopt(zmq.IPV6, int(self._host.startswith("[")))
         if self._curve is not None:
             sock.curve_serverkey = self._curve.server_public

@@ -1,13 +1,14 @@
 """State channel of a client: frames in, the newest scene out. Pure: bytes and times are passed in.
 
 Bounded staleness: the caller drains its socket and passes everything that was there; only the newest rigid frame is
-decoded. After the client itself stood still, frames that waited in queues are thrown away until fresh ones come, so
-the first frame handed out is a fresh one.
+decoded. When nothing came for a while (this client stood still, or its link), what comes then has waited in queues: it
+is thrown away until fresh frames come, so the first frame handed out is a fresh one. On a link where every frame is
+old, the newest there is counts as fresh.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,9 +23,10 @@ from iris_session.streams.rigid import RigidDecoder
 
 Poses = NDArray[np.float64]
 
-STALLED_NS: Final = 50_000_000  # not drained for this long: what is queued may be old
+STALLED_NS: Final = 50_000_000  # no frame for this long: what comes now may have waited
 QUEUED_NS: Final = 60_000_000  # a frame published this long ago waited in a queue ...
 FLUSH_NS: Final = 150_000_000  # ... but after this long without a fresher one it is the newest there is (slow link)
+_USUAL: Final = 8  # frames over which the usual age of frames on this link is averaged
 
 PRESENCE_WAITING: Final = 8  # presence messages that may wait to be looked at; decoding several at once is cheaper
 
@@ -80,8 +82,7 @@ class StateStream:
         self.scene_epoch = 0
         self.wants_snapshot = False
         self._decoder: RigidDecoder | None = None
-        self._drained_ns = -1
-        self._flush_until = 0
+        self.reconnected()
 
     def reset(self) -> None:
         """Another connection: frames may be numbered anew, nothing held is of use."""
@@ -90,6 +91,13 @@ class StateStream:
         self._presence_ns = 0
         self._presence_waiting = []
         self.wants_snapshot = False
+        self.reconnected()
+
+    def reconnected(self) -> None:
+        """Frames come by another way from now on: nothing waits in queues yet, and the usual age may be another."""
+        self._came_ns = -1  # when a frame came last; on the client's own clock, as the next one
+        self._flush_until = 0  # old frames are thrown away until then
+        self._usual_age = 0
 
     def load_keyframe(self, state_seq: int, poses: Poses) -> None:
         """Takes the poses (n, 7) of a snapshot; poses that came in newer frames are kept."""
@@ -98,14 +106,11 @@ class StateStream:
         self._decoder.load_keyframe(state_seq, poses)
         self.wants_snapshot = False
 
-    def drain(self, messages: Sequence[Sequence[bytes]], now_ns: int) -> SceneState | None:
+    def drain(self, messages: Sequence[Sequence[bytes]], now_ns: int, local_ns: int) -> SceneState | None:
         """Takes every message that was waiting, oldest first; returns the newest scene if there is one.
 
-        `now_ns`: session time now. Call it also when nothing waited, so that standing still is noticed.
+        `now_ns`: session time now, `local_ns`: the client's monotonic clock now.
         """
-        if self._drained_ns >= 0 and now_ns - self._drained_ns > STALLED_NS:
-            self._flush_until = now_ns + FLUSH_NS
-        self._drained_ns = now_ns
         newest: tuple[StateHeader, bytes] | None = None
         for frames in messages:
             self.counters.bytes_received += sum(map(len, frames))
@@ -125,7 +130,7 @@ class StateStream:
                 self.counters.malformed += 1
             else:
                 self.counters.unknown_topic += 1
-        state = None if newest is None else self._decode(*newest, now_ns)
+        state = None if newest is None else self._decode(*newest, now_ns, local_ns)
         if len(self._presence_waiting) >= PRESENCE_WAITING:
             self._take_presence()
         return state
@@ -136,18 +141,22 @@ class StateStream:
         self._take_presence()
         return self._presence
 
+    def keep_presence(self, participants: Container[str]) -> None:
+        """Only these are here: what others sent before they left, and came after, is not shown."""
+        self._take_presence()
+        for key in [key for key in self._presence if key[0] not in participants]:
+            del self._presence[key]
+
     def forget_presence(self, participant: str) -> None:
         """This participant left: nothing of it is shown any more."""
         presence = self.presence
         for key in [key for key in presence if key[0] == participant]:
             del presence[key]
 
-    def _decode(self, header: StateHeader, payload: bytes, now_ns: int) -> SceneState | None:
-        if now_ns < self._flush_until:
-            if now_ns - header.published_ns > QUEUED_NS:
-                self.counters.queued_old += 1
-                return None
-            self._flush_until = 0
+    def _decode(self, header: StateHeader, payload: bytes, now_ns: int, local_ns: int) -> SceneState | None:
+        if self._waited_in_a_queue(now_ns - header.published_ns, local_ns):
+            self.counters.queued_old += 1
+            return None
         decoder = self._decoder
         if decoder is None:
             self.counters.before_snapshot += 1
@@ -172,6 +181,21 @@ class StateStream:
         poses = decoder.poses.view()
         poses.flags.writeable = False
         return SceneState(header, poses, now_ns, now_ns - header.session_time)
+
+    def _waited_in_a_queue(self, age_ns: int, local_ns: int) -> bool:
+        """Whether a frame that comes now is to be thrown away, because fresher ones must be right behind it."""
+        stood_still = self._came_ns >= 0 and local_ns - self._came_ns > STALLED_NS
+        self._came_ns = local_ns
+        old = age_ns > max(QUEUED_NS, 2 * self._usual_age)
+        if old and stood_still and not self._flush_until:
+            self._flush_until = local_ns + FLUSH_NS
+        if old and local_ns < self._flush_until:
+            return True
+        # Where nothing fresher came in time, this is how old frames are on this link from now on.
+        weight = 1 if (old and self._flush_until) or not self._usual_age else _USUAL
+        self._usual_age += (age_ns - self._usual_age) // weight
+        self._flush_until = 0
+        return False
 
     def _take_presence(self) -> None:
         waiting, self._presence_waiting = self._presence_waiting, []

@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass, field
 
+MAX_CODES = 64
+
 
 class Phase(enum.Enum):
     """Where the connection stands, see `connection`."""
@@ -30,7 +32,13 @@ class ConnectionCounters:
     malformed: int = 0  # frames that do not fit the protocol
     other_connection: int = 0  # addressed to an earlier connection of ours
     unexpected_replies: int = 0
+    unasked_denials: int = 0  # of messages that expect no answer; handed to `on_denial`
+    identity_unwritten: int = 0  # the identity file took no new resume token: after a kill it cannot resume
     inbox_dropped: int = 0  # events, feedback and replies that the application did not fetch
     snapshots: int = 0
     reconnects: int = 0
-    faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`
+    faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`, beyond `MAX_CODES` as "other"
+
+    def fault(self, code: str) -> None:
+        code = code if code in self.faults or len(self.faults) < MAX_CODES else "other"
+        self.faults[code] = self.faults.get(code, 0) + 1

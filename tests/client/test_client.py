@@ -23,10 +23,12 @@ from iris_session.client import (
     SceneState,
     poll_all,
 )
-from iris_session.client.sockets import parse_address
-from iris_session.protocol.client_messages import Acquire, Sample
+from iris_session.client.address import Address
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import Acquire, EStop, Sample
+from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.names import DenialReason, Device, HoldReason
-from iris_session.protocol.server_messages import Event, LeaseChanged
+from iris_session.protocol.server_messages import Event, LeaseChanged, PresenceItem
 from tests.client.harness import BODIES, LiveSession
 
 Join = Callable[..., Client]
@@ -194,7 +196,8 @@ def test_a_second_client_with_the_same_identity_takes_over_for_good(
     with pytest.raises(RefusedError, match="identity of its own"):
         first.wait_for(lambda c: False, 5.0)
     assert second.participant_id == first.participant_id
-    assert second.poll(0.0) in (True, False)
+    first.close()
+    assert second.acquire(["left"])[0].holder == second.participant_id, "it took nothing back"
 
 
 def test_a_stalled_session_is_noticed_and_comes_back(session: LiveSession, join: Join) -> None:
@@ -263,6 +266,72 @@ def test_a_thread_can_poll_instead(session: LiveSession, join: Join) -> None:
             time.sleep(0.01)
 
 
+def test_a_callback_that_raises_ends_the_thread_and_everybody_is_told(
+    session: LiveSession, join: Join, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: Event) -> None:
+        raise ZeroDivisionError("mine")
+
+    ann = join(on_event=fail)
+    ann.start()
+    join("bob")
+    with pytest.raises(NotConnectedError, match="ZeroDivisionError: mine"):
+        ann.wait_for(lambda c: False)
+    assert not ann.ready
+    for call in (lambda: ann.acquire(["left"]), lambda: ann.marker("x"), lambda: ann.send_sample(Device.HEAD, HERE)):
+        with pytest.raises(NotConnectedError, match="ZeroDivisionError: mine"):
+            call()
+    with pytest.raises(NotConnectedError):
+        ann.estop("nevertheless")
+    deadline = time.monotonic() + 5.0
+    while not session.kinds(EStop):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert capfd.readouterr().err.count("ZeroDivisionError: mine") == 1
+
+
+def test_a_stop_during_a_restart_of_the_front_arrives(session: LiveSession, join: Join) -> None:
+    ann = join()
+    os.kill(session.front.pid, signal.SIGKILL)
+    assert ann.wait_for(lambda c: not c.ready)
+    ann.estop("while nobody listens")
+    assert ann.wait_for(lambda c: c.ready and c.mirror.estop, 10.0)
+    assert ann.connection.stop.message is None
+
+
+def test_a_stop_into_a_connection_that_is_cut_arrives_after_it(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ann._sockets._close_control(linger_ms=0)  # the network is gone, and nobody has noticed
+    ann.estop("into the void")
+    ann.connection.lost(time.monotonic_ns())
+    assert ann.wait_for(lambda c: c.mirror.estop)
+
+
+def test_who_comes_back_reads_state_by_a_new_socket(session: LiveSession, join: Join) -> None:
+    ann = join()
+    assert ann.wait_for(has_state)
+    half_open = ann._sockets._state
+    ann.connection.lost(time.monotonic_ns())
+    seen = ann.state
+    assert ann.wait_for(lambda c: c.ready and c.state is not seen)
+    assert ann._sockets._state is not half_open
+
+
+def test_a_client_that_cannot_join_leaves_nothing_open(session: LiveSession) -> None:
+    chef = Client(session.address, role="chef")
+    with pytest.raises(RefusedError), chef:
+        pass
+    assert chef.connection.phase is Phase.CLOSED
+
+
+def test_presence_shows_only_who_is_here(session: LiveSession, join: Join) -> None:
+    ann = join()
+    ghost = PresenceItem("p99", "head", IDENTITY)
+    ann.connection.stream._presence["p99", "head"] = ghost
+    assert ann.presence == {}
+    assert ann.presence is not ann.presence
+
+
 def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) -> None:
     ann = join()
     ann.start()
@@ -285,10 +354,11 @@ def test_closing_wakes_a_client_in_its_thread(session: LiveSession, join: Join) 
     ],
 )
 def test_addresses(text: str, expected: tuple[str, int]) -> None:
-    assert parse_address(text) == expected
+    address = Address.parse(text)
+    assert (address.host, address.port) == expected
 
 
 @pytest.mark.parametrize("text", ["", ":7721", "host:", "host:x", "host:70000", "[]:1"])
 def test_bad_addresses_say_what_is_right(text: str) -> None:
     with pytest.raises(ClientError, match="HOST:PORT"):
-        parse_address(text)
+        Address.parse(text)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.clock import BURST, SLEW, ClockSync
+from iris_session.client.clock import BURST, JUMP, SLEW, ClockSync
 
 SECOND = 1_000_000_000
 OFFSET = 5 * SECOND  # session time - local time
@@ -90,3 +90,45 @@ def test_pings_come_in_a_burst_then_slowly() -> None:
     assert 4 <= sum(t >= SECOND // 4 for t in sent) <= 7
     clock.reset()
     assert clock.ping_due(0)
+
+
+def settled(clock: ClockSync, local_ns: int = 0) -> int:
+    for _ in range(16):
+        local_ns = exchange(clock, local_ns, 300_000, 300_000) + SECOND // 2
+    return local_ns
+
+
+def test_a_machine_that_slept_knows_the_time_again_after_four_exchanges() -> None:
+    clock = ClockSync()
+    local = settled(clock)
+    slept = 3600 * SECOND  # our clock stood still, the session's went on
+    for i in range(JUMP):
+        assert abs(clock.session_ns(local) - local - OFFSET) < 1_000_000, "one strange exchange alone says nothing"
+        local = exchange(clock, local, 300_000, 300_000, OFFSET + slept)
+        truth = local + OFFSET + slept
+        assert abs(clock.session_ns(local) - truth) <= clock.error_bound_ns(local), "the bound is honest throughout"
+        assert i == JUMP - 1 or clock.ping_due(local), "found out quickly"
+    assert abs(clock.session_ns(local) - local - OFFSET - slept) < 1_000_000
+    assert clock.error_bound_ns(local) < 1_000_000
+
+
+def test_a_single_strange_exchange_moves_nothing_and_is_forgotten() -> None:
+    clock = ClockSync()
+    local = settled(clock)
+    local = exchange(clock, local, 300_000, 300_000, OFFSET + SECOND)
+    local = exchange(clock, local, 300_000, 300_000)
+    assert clock.session_ns(local) == local + OFFSET
+    assert clock.error_bound_ns(local) < 1_000_000
+
+
+def test_a_new_connection_steps_only_to_what_is_else_impossible() -> None:
+    clock = ClockSync()
+    local = settled(clock)
+    clock.restart()
+    assert not clock.settled
+    assert clock.session_ns(local) == local + OFFSET  # until something better is known
+    local = exchange(clock, local, 100_000, 60_100_000)  # 30 ms wrong, and possible
+    assert abs(clock.session_ns(local) - local - OFFSET) < 100_000
+    clock.restart()
+    local = exchange(clock, local, 300_000, 300_000, OFFSET + 60 * SECOND)
+    assert abs(clock.session_ns(local) - local - OFFSET - 60 * SECOND) < 1_000_000

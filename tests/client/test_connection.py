@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client.clock import SETTLED
-from iris_session.client.connection import (
-    BACKOFF_MAX_NS,
-    HELLO_TIMEOUT_NS,
-    MAX_INBOX,
-    MAX_PENDING,
-    Connection,
-)
-from iris_session.client.errors import NotConnectedError, VersionError
+from iris_session.client.connection import Connection
+from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
 from iris_session.client.identity import Identity
+from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
 from iris_session.client.outgoing import MAX_OUTGOING
 from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import (
@@ -33,7 +30,7 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.codec import decode_client, encode_server
-from iris_session.protocol.common import Lease
+from iris_session.protocol.common import Denial, Lease
 from iris_session.protocol.names import PROTOCOL_VERSION, DenialReason, RefusalCode
 from iris_session.protocol.server_messages import (
     BodyInfo,
@@ -273,10 +270,10 @@ def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
     wire.get(Reply(number, True, leases=(lease,)), MS)
     wire.get(Reply(number, True), MS)
     assert wire.connection.counters.unexpected_replies == 1
-    reply = wire.connection.take_reply(number)
+    reply = wire.connection.answers.take(number)
     assert reply is not None
     assert reply.ok
-    assert wire.connection.take_reply(number) is None
+    assert wire.connection.answers.take(number) is None
     assert wire.connection.lease_version("left") == 4
     wire.connection.lost(SECOND)
     assert wire.connection.lease_version("left") is None
@@ -336,7 +333,7 @@ def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
 
 def test_a_client_whose_identity_was_taken_over_leaves_the_token_to_the_other(wire: Wire) -> None:
     wire.join()
-    wire.get(ProtocolFault("dropped", "the session let this connection go: replaced"), MS)
+    wire.get(ProtocolFault("dropped", "let go", "replaced"), MS)
     assert wire.connection.phase is Phase.REFUSED
     wire.connection.close()
     assert wire.connection.identity.resume_token == b"token"
@@ -349,8 +346,8 @@ def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
         ids.append(wire.connection.request(Acquire(0)))
         wire.get(Reply(ids[-1], True), MS)
     assert wire.connection.counters.inbox_dropped == 5
-    assert wire.connection.take_reply(ids[4]) is None
-    assert wire.connection.take_reply(ids[5]) == Reply(ids[5], True)
+    assert wire.connection.answers.take(ids[4]) is None
+    assert wire.connection.answers.take(ids[5]) == Reply(ids[5], True)
 
 
 @given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))
@@ -362,3 +359,36 @@ def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[lis
         wire.connection.receive(frames, MS)
     assert wire.connection.phase is Phase.READY
     assert wire.connection.counters.malformed == len(messages)
+
+
+def test_a_request_that_cannot_be_queued_raises(wire: Wire) -> None:
+    wire.join()
+    for _ in range(MAX_OUTGOING):
+        wire.connection.send(Marker(0, "x"))
+    with pytest.raises(NotConnectedError, match="takes nothing"):
+        wire.connection.request(Acquire(0))
+
+
+def test_a_denial_that_nobody_waits_for_is_handed_out(wire: Wire) -> None:
+    wire.join()
+    denied = Reply(0, False, Denial(DenialReason.UNALIGNED, "no"))
+    wire.get(denied, MS)
+    assert list(wire.connection.inbox) == [denied]
+    assert wire.connection.counters.unasked_denials == 1
+
+
+def test_a_full_disk_ends_neither_joining_nor_closing(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full() -> None:
+        raise IdentityError("no space left on device")
+
+    wire.connection.identity.path = Path("identity")
+    monkeypatch.setattr(wire.connection.identity, "_write", full)
+    wire.join()
+    assert wire.connection.identity.resume_token == b"token"
+    wire.connection.lost(2 * SECOND)
+    wire.welcome(3 * SECOND, b"next")
+    wire.connection.close()
+    assert wire.connection.counters.identity_unwritten == 3
+    assert len(caplog.records) == 1

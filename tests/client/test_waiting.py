@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from iris_session.client import Client, poll_all, wait_any
+from iris_session.client import Client, ClientGroup, poll_all, wait_any
 from tests.client.harness import LiveSession
 
 Join = Callable[..., Client]
@@ -31,3 +31,15 @@ def test_polling_all_keeps_all_alive(session: LiveSession, join: Join) -> None:
         poll_all(clients, 0.1)
     assert all(client.ready for client in clients)
     assert all(client.counters()["control"]["reconnects"] == 0 for client in clients)
+
+
+def test_a_group_passes_over_those_that_were_closed(session: LiveSession, join: Join) -> None:
+    ann, gone = join(), join("gone")
+    group = ClientGroup([gone, ann])
+    group.poll(0.1)
+    gone.close()
+    deadline = time.monotonic() + 5.0
+    before = ann.counters()["state"]["delivered"]
+    while ann.counters()["state"]["delivered"] < before + 3:
+        assert time.monotonic() < deadline
+        group.poll(0.1)

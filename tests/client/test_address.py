@@ -1,0 +1,44 @@
+"""Addresses as people type them, and the URI of a pairing code."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.client import ClientError
+from iris_session.client.address import Address, host_port, pairing_uri
+from iris_session.keys import KeyPair
+
+KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"
+
+
+@pytest.mark.parametrize("host", ["10.0.0.5", "::1", "lab.local"])
+def test_a_uri_says_everything_and_reads_back(host: str) -> None:
+    uri = pairing_uri(host, 7731, KEY, "7KQ2-M4XD", "lab 1/2")
+    assert uri.startswith(f"iris://{host_port(host, 7731)}/?k=")
+    assert Address.parse(uri) == Address(host, 7731, KEY, "7KQ2M4XD", "lab 1/2")
+    assert str(Address.parse(uri)) == host_port(host, 7731)
+
+
+def test_every_key_survives_a_uri() -> None:
+    for _ in range(50):
+        key = KeyPair.new().public
+        assert Address.parse(pairing_uri("h", 1, key)).server_key == key
+
+
+def test_a_server_may_be_called_as_the_scheme() -> None:
+    assert Address.parse("iris:7731") == Address("iris", 7731)
+
+
+def test_a_uri_may_say_less_and_more() -> None:
+    assert Address.parse("iris://10.0.0.5") == Address("10.0.0.5", 7721)
+    assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd") == Address("10.0.0.5", 7731, "", "7KQ2M4XD")
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["iris://", "iris://h:x/", "iris://h/?k=abc", "iris://h/?k=%20", "iris://h/?c=ABC", "iris://h/?k=" + "A" * 44],
+)
+def test_a_damaged_uri_says_what_one_looks_like(uri: str) -> None:
+    with pytest.raises(ClientError, match="iris://HOST:PORT") as error:
+        Address.parse(uri)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,98 @@
+"""What a client tells of itself, and what it can ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from iris_session.client import Client, NotConnectedError
+from iris_session.client.connection import Connection
+from iris_session.client.identity import Identity
+from iris_session.client.reporting import MAX_AGES, PERIOD_NS, ArrivalMeter
+from iris_session.client.state_stream import SceneState
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.server_messages import StateHeader
+from iris_session.protocol.status import ClientReport
+from tests.client.harness import LiveSession
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def connection() -> Connection:
+    """Of a client that is in."""
+    connection = Connection(Hello("observer", "ann"), Identity.in_memory())
+    connection.phase = Phase.READY
+    return connection
+
+
+def frame(seq: int, age_ns: int) -> SceneState:
+    return SceneState(StateHeader(1, 0, 0, 0.0, 0, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
+
+
+def test_one_report_a_second(connection: Connection) -> None:
+    meter = ArrivalMeter()
+    assert meter.take(connection, 0) is None
+    for n, seq in enumerate((1, 2, 5, 6)):
+        meter.delivered(frame(seq, (n + 1) * MS))
+    connection.stream.counters.bytes_received = 4000
+    assert meter.take(connection, PERIOD_NS - 1) is None
+    report = meter.take(connection, 2 * PERIOD_NS)
+    assert report == ClientReport(2.0, 4.0, 4, 2, 0.0, 2000.0)
+    assert meter.take(connection, 2 * PERIOD_NS) is None
+    assert meter.take(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)
+
+
+def test_another_session_numbers_its_frames_anew(connection: Connection) -> None:
+    meter = ArrivalMeter()
+    meter.delivered(frame(900, MS))
+    connection.phase = Phase.WAITING
+    assert meter.take(connection, 0) is None
+    connection.phase = Phase.READY
+    meter.take(connection, 0)
+    meter.delivered(frame(2000, MS))
+    report = meter.take(connection, PERIOD_NS)
+    assert report is not None
+    assert report.missed == 0
+
+
+def test_memory_is_bounded(connection: Connection) -> None:
+    meter = ArrivalMeter()
+    meter.take(connection, 0)
+    for seq in range(3 * MAX_AGES):
+        meter.delivered(frame(seq, MS))
+    assert len(meter._ages_ns) == MAX_AGES
+    report = meter.take(connection, PERIOD_NS)
+    assert report is not None
+    assert report.delivered == 3 * MAX_AGES
+
+
+def test_status_of_a_session(session: LiveSession, join: Callable[..., Client]) -> None:
+    client = join("ann")
+    report = client.status()
+    assert report.session_id == "s1"
+    assert report.connections == 1
+    client.start()
+    assert client.status().session_time > report.session_time
+
+
+def test_status_while_the_session_stands_still(session: LiveSession, join: Callable[..., Client]) -> None:
+    join("bob")
+    session.pause_steps(True)
+    client = join("ann", connect=False)
+    client.open()
+    report = client.status()
+    assert not client.ready
+    assert report.authority_silent_ns > 0
+
+
+def test_status_without_a_session() -> None:
+    client = Client("127.0.0.1:1", role="observer")
+    try:
+        with pytest.raises(NotConnectedError):
+            client.status(0.2)
+    finally:
+        client.close()

@@ -1,0 +1,87 @@
+"""E-stops of the client: none is lost between connections, and none comes back after it was heard or withdrawn."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.client.errors import NotConnectedError
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import Acquire, ClearEStop, ClockPing, EStop, Hello, Release
+from iris_session.protocol.server_messages import ClockPong, EStopChanged, Event
+from tests.client.test_connection import MS, SAMPLE, SECOND, Wire
+
+STOP = EStop("now")
+
+
+@pytest.fixture
+def wire() -> Wire:
+    one = Wire()
+    one.join()
+    return one
+
+
+def stops(wire: Wire) -> int:
+    return wire.sent().count(STOP)
+
+
+def test_a_stop_that_died_with_its_connection_goes_behind_the_next_hello_and_after_the_welcome(wire: Wire) -> None:
+    assert wire.connection.send(STOP)
+    wire.connection.lost(2 * SECOND)
+    first, second = wire.sent()
+    assert isinstance(first, Hello)
+    assert second == STOP
+    wire.welcome(3 * SECOND)
+    assert stops(wire) == 1
+    wire.snapshot(3 * SECOND)
+    wire.get(Event(1, 0, 0, EStopChanged(True, "p1")), 3 * SECOND)
+    wire.connection.lost(6 * SECOND)
+    assert stops(wire) == 0, "the session has it"
+
+
+def test_a_stop_without_connection_is_kept_and_says_so(wire: Wire) -> None:
+    wire.connection.lost(MS)
+    assert wire.connection.phase is Phase.WAITING
+    assert not wire.connection.send(STOP)
+    wire.connection.tick(5 * SECOND)
+    assert [type(message) for message in wire.sent()] == [Hello, EStop]
+    assert wire.connection.send(STOP)
+    assert stops(wire) == 1
+
+
+def test_a_stop_that_was_withdrawn_does_not_come_back(wire: Wire) -> None:
+    wire.connection.send(STOP)
+    wire.connection.request(ClearEStop(0))
+    wire.sent()
+    wire.connection.lost(2 * SECOND)
+    assert stops(wire) == 0
+
+
+def test_in_a_stopped_session_the_answer_to_a_later_ping_proves_that_it_came(wire: Wire) -> None:
+    wire.get(Event(1, 0, 0, EStopChanged(True, "p2")), MS)
+    wire.connection.send(STOP)
+    wire.get(ClockPong(0, MS, MS), 2 * MS)  # of a ping that was sent before
+    assert wire.connection.stop.message == STOP
+    wire.connection.tick(SECOND)
+    (ping,) = (message for message in wire.sent() if isinstance(message, ClockPing))
+    wire.get(ClockPong(ping.t0_ns, SECOND, SECOND), SECOND + MS)
+    assert wire.connection.stop.message is None
+
+
+def test_who_never_opened_or_was_closed_is_told() -> None:
+    wire = Wire()
+    with pytest.raises(NotConnectedError):
+        wire.connection.send(STOP)
+    wire.join()
+    wire.connection.close()
+    with pytest.raises(NotConnectedError):
+        wire.connection.send(STOP)
+
+
+def test_a_release_passes_samples_but_not_the_acquire_before_it(wire: Wire) -> None:
+    wire.connection.send(SAMPLE)
+    number = wire.connection.request(Acquire(0, ("left",)))
+    wire.connection.send(SAMPLE)
+    wire.connection.send(SAMPLE)
+    wire.connection.send(Release(0))
+    wire.connection.send(STOP)
+    assert wire.sent() == [STOP, SAMPLE, Acquire(number, ("left",)), Release(0), SAMPLE, SAMPLE]
