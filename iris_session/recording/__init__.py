@@ -8,6 +8,7 @@ from iris_session.recording.feed import FeedStats, RecorderFeed
 from iris_session.recording.journal import (
     CLOSED,
     OPEN,
+    Continues,
     JournalRow,
     Keyframe,
     SessionHeader,
@@ -17,6 +18,7 @@ from iris_session.recording.journal import (
     pack_model,
     unpack_model,
 )
+from iris_session.recording.lock import RecordingInUseError, RecordingLock
 from iris_session.recording.reader import RawSample, Recording, State
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
@@ -24,6 +26,7 @@ from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 __all__ = [
     # making one
     "SessionHeader",
+    "Continues",
     "JournalRow",
     "Keyframe",
     "CLOSED",
@@ -48,4 +51,7 @@ __all__ = [
     "RecordingError",
     "RecorderError",
     "NotARecordingError",
+    # who has one in use
+    "RecordingLock",
+    "RecordingInUseError",
 ]

@@ -2,6 +2,7 @@
 
 RecordingError
  +-- RecorderError        the recorder process cannot start
+ |    +-- RecordingInUseError   (lock.py) another process writes or continues it
  +-- WriteError           a file that was begun can no longer be written
  +-- NotARecordingError   the file cannot be read as a recording
 """

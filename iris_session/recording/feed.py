@@ -7,11 +7,12 @@ file. Only when memory and spill are both full are rows dropped: counted, and to
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -35,12 +36,15 @@ WINDOW_BYTES: Final = 16 << 20
 SPILL_BYTES: Final = 2 << 30
 #: Records taken from the spill file per flush: 20 ms of backlog 4 times over, so that a flush stays short.
 UNSPILL_BATCHES: Final = 4
+#: A recorder that writes says so every half second. Longer than this nobody who wants to end waits for its word.
+SILENCE_S: Final = 1.0
 #: Bound on each list of one batch. A flush comes long before; it holds when a caller never takes a step.
 BATCH_ITEMS: Final = 4096
 
 
 class FeedStats(msgspec.Struct):
-    """Counters of one feed. `dropped_rows`: rows that are lost for the recording; `recorder`: its last status."""
+    """Counters of one feed. `dropped_rows`: rows that are lost for the recording, `dropped_items`: states, events
+    and so on that are; `recorder`: its last status."""
 
     rows: int = 0
     batches: int = 0
@@ -48,6 +52,7 @@ class FeedStats(msgspec.Struct):
     window_bytes: int = 0
     spilled_batches: int = 0
     waiting_in_spill: int = 0
+    spilled_bytes: int = 0
     dropped_rows: int = 0
     dropped_items: int = 0
     recorders: int = 0
@@ -111,6 +116,7 @@ class RecorderFeed:
             self._batch_since = row.now_ns
         batch.rows.append(row)
         self._now = (row.step, row.now_ns)
+        self._heard_ns = self._heard_ns or row.now_ns  # a resumed session does not begin at time zero
         self.stats.rows += 1
         if len(batch.rows) >= BATCH_ROWS or row.now_ns - self._batch_since >= BATCH_NS:
             self.flush()
@@ -160,13 +166,17 @@ class RecorderFeed:
         batch = self._batch
         if batch.rows or batch.states or batch.events or batch.denials or batch.metrics or batch.keyframes:
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
-            self._enqueue(messages.encode_batch(batch), len(batch.rows))
+            lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
+            self._enqueue(messages.encode_batch(batch), len(batch.rows), sum(len(items) for items in lists))
         self._exchange()
         self.silence_ns = self._now[1] - self._heard_ns if self._window else 0
 
-    def close(self, timeout_s: float = 5.0) -> bool:
+    def close(
+        self, timeout_s: float = 5.0, alive: Callable[[], bool] = lambda: True, silence_s: float = math.inf
+    ) -> bool:
         """Hands over everything and waits until it is in the file. False: not all of it is known to be there, after
-        `timeout_s`.
+        `timeout_s`, or when the recorder is no longer `alive` or has said nothing for `silence_s`
+        (`SILENCE_S`, unless it was just started and is not there yet).
 
         Without a header nothing was recorded, and there is nothing to wait for. A second call does nothing.
         """
@@ -174,10 +184,13 @@ class RecorderFeed:
             return not self._window
         self.flush()
         waits = max(1, round(timeout_s / 0.02))
-        while waits and self._header and (self._window or self._spill):
+        silent, said = 0, self.stats.recorder
+        while waits and silent < silence_s / 0.02 and alive() and self._header and (self._window or self._spill):
             self._socket.poll(20)
             self._exchange()
             waits -= 1
+            silent = 0 if self.stats.recorder is not said else silent + 1
+            said = self.stats.recorder
         complete = not self._window and not self._spill
         self._spill.close()
         self._socket.close(0)
@@ -190,16 +203,17 @@ class RecorderFeed:
         else:
             self.stats.dropped_items += 1
 
-    def _enqueue(self, body: bytes, rows: int) -> None:
+    def _enqueue(self, body: bytes, rows: int, others: int) -> None:
         if not self._spill and self.stats.window_bytes + len(body) <= self._window_limit:
             self._send_batch(body)
-        elif self._spill.push(body, rows):
+        elif self._spill.push(body, rows, others):
             self.stats.spilled_batches += 1
         else:
-            self._lose(rows, self._spill.fault)
+            self._lose(rows, others, self._spill.fault)
 
-    def _lose(self, rows: int, why: str) -> None:
+    def _lose(self, rows: int, others: int, why: str) -> None:
         self.stats.dropped_rows += rows
+        self.stats.dropped_items += others
         self.stats.spill_fault = why
         self._gap_rows += rows
         self._lost = True
@@ -223,12 +237,13 @@ class RecorderFeed:
             try:
                 record = self._spill.pop()
             except OSError as error:  # a disk that fails must not end the session
-                self._lose(self._spill.rows, f"the spill file cannot be read: {error}")
+                self._lose(self._spill.rows, self._spill.others, f"the spill file cannot be read: {error}")
                 self._spill.close()
                 break
             if record is not None:
                 self._send_batch(record[0])
         self.stats.waiting_in_spill = len(self._spill)
+        self.stats.spilled_bytes = self._spill.waiting_bytes
 
     def _take(self, status: RecorderStatus) -> None:
         self.stats.recorder = status

@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.common import Count, Name, Nanoseconds
+from iris_session.protocol.common import Count, Name, Nanoseconds, Pose
 from iris_session.protocol.entries import Entry, encode_entry
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -24,14 +24,26 @@ FORMAT: Final = 1
 CLOSED: Final = "closed"  # all code ours: re-simulated bit for bit
 OPEN: Final = "open"  # a user's loop or a real robot: the plant's state comes from the rows
 HASH_BYTES: Final = 16
+#: `JournalRow.digest` of a step that raised an error: it gave nothing, and no step follows.
+CRASHED: Final = b""
 
 #: Fields of a row with a CRC of their own, in the order of `JournalRow.field_crcs`. `entry_index` is the array header
 #: of `entries` with `entry_lengths` and `entry_crcs`.
 FIELDS: Final = ("step", "now_ns", "n_ticks", "digest", "plant", "entry_index")
 
-_I64 = struct.Struct("<q")
 _STEP = struct.Struct("<qqq")
 _encoder = msgspec.msgpack.Encoder()
+
+
+class Continues(msgspec.Struct, frozen=True):
+    """What a resumed session goes on from: its state after `step` of the recording whose first file is `file`.
+
+    `chain`: of that row (of the root when no step was taken). `file`: its name in the same folder.
+    """
+
+    file: str
+    step: int
+    chain: bytes
 
 
 class SessionHeader(msgspec.Struct, frozen=True):
@@ -39,7 +51,9 @@ class SessionHeader(msgspec.Struct, frozen=True):
 
     `recording_class`: `closed` or `open`. `config`: the session's configuration as its composer encodes it. `model`:
     `pack_model` of the MuJoCo model's binary form (mjb). `bodies`: the streamed bodies in the order of state poses.
-    `versions`: of Python, the libraries and the platform, see `versions.py`.
+    `versions`: of Python, the libraries and the platform, see `versions.py`. `continues`: the recording that this one
+    goes on from, None for a session's first. `origin_ns`, `boot_id`: session time zero on CLOCK_MONOTONIC, and which
+    boot of which machine that clock is of. `anchors`: `T_world_anchor` of each sheet that headsets are aligned to.
     """
 
     session_id: Name
@@ -55,6 +69,15 @@ class SessionHeader(msgspec.Struct, frozen=True):
     versions: dict[str, str] = {}
     created_utc: str = ""
     format: int = FORMAT
+    continues: Continues | None = None
+    origin_ns: int = 0
+    boot_id: str = ""
+    anchors: dict[str, Pose] = {}
+
+    @property
+    def begins_after(self) -> int:
+        """The step before the first row: -1, or the one that a resumed session continues."""
+        return -1 if self.continues is None else self.continues.step
 
 
 class JournalRow(msgspec.Struct, frozen=True, array_like=True):
@@ -62,7 +85,8 @@ class JournalRow(msgspec.Struct, frozen=True, array_like=True):
 
     `entries`: MessagePack array of `iris_session.protocol.entries.Entry`; `entry_lengths` and `entry_crcs`: bytes and
     CRC-32 of each. `plant`: in class `open`, the plant's `mjSTATE_INTEGRATION` at the start of this step. `digest`:
-    16 bytes over everything the step gave. `chain`: 16 bytes over the previous row's chain and this whole row.
+    16 bytes over everything the step gave, or `CRASHED`. `chain`: 16 bytes over the previous row's chain and this
+    whole row.
     """
 
     step: Count
@@ -108,7 +132,12 @@ class RowProblem(msgspec.Struct, frozen=True):
 
 def header_root(header: SessionHeader) -> bytes:
     """The chain value before the first row: 16 bytes that bind the rows to this header."""
-    return hashlib.blake2b(_encoder.encode(header), digest_size=HASH_BYTES).digest()
+    return root_of(_encoder.encode(header))
+
+
+def root_of(blob: bytes) -> bytes:
+    """`header_root` of an encoded header, also of one with fewer fields than ours."""
+    return hashlib.blake2b(blob, digest_size=HASH_BYTES).digest()
 
 
 def seal_blob(blob: bytes) -> bytes:
@@ -200,7 +229,7 @@ def check_keyframe(keyframe: Keyframe) -> str:
 
 def _keyframe_crcs(keyframe: Keyframe, chain: bytes) -> tuple[int, ...]:
     snapshots = (zlib.crc32(getattr(keyframe, name)) for name in SNAPSHOTS)
-    return (*snapshots, zlib.crc32(chain, zlib.crc32(_I64.pack(keyframe.step))))
+    return (*snapshots, zlib.crc32(chain, zlib.crc32(_packed((keyframe.step,)))))
 
 
 def _rechain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | None = None) -> bytes:
@@ -210,8 +239,16 @@ def _rechain(prev_chain: bytes, row: JournalRow, field_crcs: tuple[int, ...] | N
 
 
 def _chain(prev_chain: bytes, ints: bytes, blob: bytes, digest: bytes, plant: bytes, numbers: tuple[int, ...]) -> bytes:
-    parts = (prev_chain, ints, digest, struct.pack(f"<{len(numbers)}q", *numbers), blob, plant)
+    parts = (prev_chain, ints, digest, _packed(numbers), blob, plant)
     return hashlib.blake2b(b"".join(parts), digest_size=HASH_BYTES).digest()
+
+
+def _packed(numbers: tuple[int, ...]) -> bytes:
+    """As int64. What damage has made larger fits no checksum either, so its form does not matter."""
+    try:
+        return struct.pack(f"<{len(numbers)}q", *numbers)
+    except struct.error:
+        return repr(numbers).encode()
 
 
 def _field_crcs(
@@ -219,7 +256,7 @@ def _field_crcs(
 ) -> tuple[int, ...]:
     """CRCs of `FIELDS`. `ints`: step, now_ns, n_ticks as three int64."""
     crc = zlib.crc32
-    index = head if not lengths else head + struct.pack(f"<{2 * len(lengths)}q", *lengths, *crcs)
+    index = head if not lengths else head + _packed((*lengths, *crcs))
     return (crc(ints[:8]), crc(ints[8:16]), crc(ints[16:]), crc(digest), crc(plant), crc(index))
 
 

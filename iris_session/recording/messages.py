@@ -13,6 +13,7 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
+from iris_session.protocol.decoding import decoder
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
@@ -37,6 +38,17 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     origin_ns: int
     parent: int
     part_chunks: int = PART_CHUNKS
+
+
+class EndMark(msgspec.Struct, frozen=True, array_like=True):
+    """The last thing in a file that was closed. `step`, `chain`: of its newest row.
+
+    `continues_in`: number of the file in which the recording goes on, 0 when the session ended.
+    """
+
+    step: int
+    chain: bytes
+    continues_in: Count = 0
 
 
 HEADER: Final = b"H"
@@ -103,7 +115,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     `expecting`: number of the next batch, -1 until a header came. `cpu_ns`: processor time of the recorder so far.
     `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none, and
     batches of which only the journal could be read.
-    `fault`: one line when the file can no longer be written; the process then ends.
+    `fault`: one line when the file can no longer be written; the process then ends. `disk_free`: bytes that its disk
+    has left, at least 1, 0 when that is not known.
     """
 
     instance: int
@@ -115,15 +128,16 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     samples: int = 0
     samples_refused: int = 0
     fault: str = ""
+    disk_free: int = 0
 
 
 encode_batch = msgspec.msgpack.Encoder().encode
-decode_batch = msgspec.msgpack.Decoder(Batch).decode
-_decode_essence = msgspec.msgpack.Decoder(_Essence).decode
+decode_batch = decoder(Batch)
+_decode_essence = decoder(_Essence)
 encode_header = msgspec.msgpack.Encoder().encode
-decode_header = msgspec.msgpack.Decoder(SessionHeader).decode
+decode_header = decoder(SessionHeader)
 encode_status = msgspec.msgpack.Encoder().encode
-decode_status = msgspec.msgpack.Decoder(RecorderStatus).decode
+decode_status = decoder(RecorderStatus)
 
 
 def decode_journal(data: bytes) -> Batch:

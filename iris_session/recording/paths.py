@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 APPLICATION: Final = "iris-session"
@@ -21,10 +22,19 @@ SCENE: Final = "/scene"
 PRESENCE: Final = "/presence"
 TRANSFORMS: Final = "/tf"
 
+_RESUME: Final = re.compile(r"(?P<stem>.*)\.resume(?P<number>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
+_PART: Final = re.compile(r"(?P<stem>.*)\.part(?P<part>[1-9][0-9]*)(?P<suffix>\.[^./]*)?", re.DOTALL)
+
 STEP: Final = "step"
 TICK: Final = "tick"
 SIM_TIME: Final = "sim_time"
 SESSION_TIME: Final = "session_time"
+
+
+def split_part(path: str) -> tuple[str, int]:
+    """Inverse of `part_path`: path of the first file, and the number of this one."""
+    found = _PART.fullmatch(path)
+    return (found["stem"] + (found["suffix"] or ""), int(found["part"])) if found else (path, 1)
 
 
 def part_path(path: str, part: int) -> str:
@@ -33,3 +43,17 @@ def part_path(path: str, part: int) -> str:
         return path
     stem, dot, suffix = path.rpartition(".")
     return f"{stem}.part{part}.{suffix}" if dot else f"{path}.part{part}"
+
+
+def split_resume(path: str) -> tuple[str, int]:
+    """Inverse of `resume_path`, of the first file of a recording: that of the session's beginning, and its number."""
+    found = _RESUME.fullmatch(path)
+    return (found["stem"] + (found["suffix"] or ""), int(found["number"])) if found else (path, 1)
+
+
+def resume_path(path: str, number: int) -> str:
+    """First file of the `number`-th recording of a session that began with `path`: `session.resume2.rrd`."""
+    if number == 1:
+        return path
+    stem, dot, suffix = path.rpartition(".")
+    return f"{stem}.resume{number}.{suffix}" if dot else f"{path}.resume{number}"

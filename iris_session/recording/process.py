@@ -22,6 +22,7 @@ import zmq
 
 from iris_session.recording.errors import RecorderError, WriteError
 from iris_session.recording.journal import SessionHeader
+from iris_session.recording.lock import RecordingLock
 from iris_session.recording.messages import (
     BATCH,
     FAULT_PREFIX,
@@ -48,7 +49,12 @@ DRAIN_MESSAGES: Final = 4096
 #: After SIGTERM or the parent's end: quiet for this long means that everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
+#: An orphan whose file did not grow for so long has no disk to finish on: Rerun waits for one without end.
+ORPHAN_S: Final = 20.0
+ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
+#: A file begins with some 22 KB, mostly the blueprint.
+TRIAL_BYTES: Final = 128 << 10
 
 _decode_sample = msgspec.msgpack.Decoder(tuple[int, int, bytes]).decode
 
@@ -63,8 +69,10 @@ class Recorder:
         self._front = self._bind(zmq.PULL, config.samples_endpoint)
         self._part = config.part
         self._begin_part()
+        with suppress(OSError):
+            self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
         self._header: SessionHeader | None = None
-        self._instance = time.time_ns()
+        self._instance = time.monotonic_ns()  # differs from that of every recorder before it
         self._expecting = -1
         self._received = -1
         self._newest_ns = 0  # session time of the newest row received
@@ -76,6 +84,7 @@ class Recorder:
 
     def run(self) -> int:
         """Records until told to stop. Returns the exit status of the process."""
+        threading.Thread(target=self._give_up_as_orphan, name="orphan", daemon=True).start()
         try:
             self._say(-1)
             self._loop()
@@ -96,13 +105,26 @@ class Recorder:
                 shutil.rmtree(Path(self._config.feed_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
         return 0
 
+    def _give_up_as_orphan(self) -> None:
+        """Thread: ends the process when its parent is gone and it cannot write on."""
+        size, since = -1, time.monotonic()
+        while True:
+            time.sleep(SYNC_S)
+            try:
+                now = os.stat(self._writer.path).st_size
+            except OSError:
+                now = size
+            if now != size or os.getppid() == self._config.parent:
+                size, since = now, time.monotonic()
+            elif time.monotonic() - since > ORPHAN_S:
+                os._exit(ORPHANED)
+
     def _remove(self) -> None:
         """Of a session that never began (its port was in use) nothing stays behind: not the file, nor its folder."""
-        path = Path(self._writer.path)
-        path.unlink(missing_ok=True)
+        self._writer.abandon()
         if self._made_folder:
             with suppress(OSError):
-                path.parent.rmdir()
+                Path(self._writer.path).parent.rmdir()
 
     def stop(self) -> None:
         """Asks the loop to finish the file."""
@@ -112,12 +134,16 @@ class Recorder:
         path = part_path(self._config.path, self._part)
         self._made_folder = claim(Path(path))
         self._writer = RrdWriter(path, self._config.recording_id)
-        self._writer.flush()
+        try:
+            self._writer.flush()
+        except WriteError:
+            self._remove()  # the next attempt takes the same number
+            raise
         self._syncer = _Syncer(path)
 
     def _next_part(self) -> None:
         """Goes on in a new file: each is whole, and Rerun's memory for the footer is bounded."""
-        self._writer.close()
+        self._writer.close(continues_in=self._part + 1)
         self._syncer.stop()
         self._part += 1
         try:
@@ -226,6 +252,7 @@ class Recorder:
             self._samples,
             self._refused,
             self._fault,
+            disk_free(Path(self._writer.path)),
         )
         with suppress(zmq.Again):
             self._feed.send(encode_status(status), zmq.NOBLOCK)
@@ -272,7 +299,7 @@ def claim(path: Path) -> bool:
     made_folder = not path.parent.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
+        _try_to_write(path)
         free = os.statvfs(path.parent)
     except OSError as error:
         raise RecorderError(f"cannot record to {path}: {error.strerror or error}") from error
@@ -280,6 +307,30 @@ def claim(path: Path) -> bool:
         path.unlink(missing_ok=True)
         raise RecorderError(f"cannot record to {path}: less than {MIN_FREE_BYTES >> 20} MiB of the disk are free")
     return made_folder
+
+
+def _try_to_write(path: Path) -> None:
+    """Creates the empty file, after writing more than its beginning: Rerun hangs where that cannot be written."""
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    try:
+        left = bytes(TRIAL_BYTES)
+        while left:
+            left = left[os.write(fd, left) :]
+        os.ftruncate(fd, 0)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(fd)
+
+
+def disk_free(path: Path) -> int:
+    """Bytes that we may still write on the disk of `path`, at least 1; 0 when the system does not tell."""
+    try:
+        free = os.statvfs(path)
+    except OSError:
+        return 0
+    return max(1, free.f_bavail * free.f_frsize)
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
@@ -22,14 +23,14 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, open_blob
-from iris_session.recording.messages import DenialRecord, decode_header
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, open_blob, root_of
+from iris_session.recording.messages import DenialRecord, EndMark, decode_header
 from iris_session.recording.probe import Prober
 
 _decode_event = msgspec.msgpack.Decoder(Event).decode
 _decode_denial = msgspec.msgpack.Decoder(DenialRecord).decode
 _decode_keyframe = msgspec.msgpack.Decoder(Keyframe).decode
-_decode_end = msgspec.msgpack.Decoder(tuple[int, bytes]).decode
+_decode_end = msgspec.msgpack.Decoder(EndMark).decode
 _decode_mark = msgspec.msgpack.Decoder(rrd_file.Mark).decode
 _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 _decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
@@ -63,9 +64,10 @@ class State(NamedTuple):
 class Recording:
     """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
 
-    `damage`: one line per thing that could not be read. `cuts`: parts that end in the middle of a write, as a kill
-    leaves them. `end`: last step and its chain value as noted when the last part was closed, None when its recorder
-    was killed.
+    `damage`: one line per thing that could not be read. `missing`: one per part that ought to be there. `notes`: parts
+    in which nothing is. `cuts`: parts that end in the middle of a write, as a kill leaves them. `root`: the chain value
+    before the first row. `end`: as noted when
+    the last part was closed, None when its recorder was killed or when a part is missing at the end.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -73,12 +75,17 @@ class Recording:
         self.files: list[str] = []
         self._readable: list[str] = []
         self.damage: list[str] = []
+        self.missing: list[str] = []
+        self.notes: list[str] = []
         self.cuts: list[str] = []
         with Prober() as prober:
             for path in files:
                 self._add_part(path, prober)
         self.header = self._header(files[0])
-        self.end = self._end()
+        ends = {part: _decode_end(_values(batch, "end")[0]) for part, batch in self._batches(paths.END)}
+        self._find_missing(files, [end.continues_in for end in ends.values()])
+        last = ends.get(len(self.files) - 1)
+        self.end = None if last is None or last.continues_in else last
 
     @property
     def finished(self) -> bool:
@@ -86,22 +93,36 @@ class Recording:
         return self.end is not None
 
     @classmethod
-    def open(cls, path: str | Path) -> Recording:
+    def open(cls, path: str | Path, *, warn: bool = True) -> Recording:
         """Opens the recording whose first file (or only surviving part) is `path`.
+
+        Later parts are found by their names, also behind one that is missing. Warns (`UserWarning`) of damage.
 
         Raises `NotARecordingError` with one line: no such file, no Rerun file, no session in it.
         """
         first = str(path)
         if not os.path.isfile(first):
             raise NotARecordingError(f"there is no recording {first}")
-        files = [first]
-        while os.path.isfile(following := paths.part_path(first, len(files) + 1)):
-            files.append(following)
-        return cls(files)
+        base, number = paths.split_part(first)
+        folder = os.path.dirname(first)
+        found = (paths.split_part(os.path.join(folder, name)) for name in os.listdir(folder or "."))
+        later = sorted(part for stem, part in found if stem == base and part > number)
+        recording = cls([first, *(paths.part_path(base, part) for part in later)])
+        problems = recording.damage + recording.missing
+        if problems and warn:
+            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            warnings.warn(f"{first} is damaged: {problems[0]}{more}", stacklevel=2)
+        return recording
 
-    def rows(self) -> Iterator[JournalRow]:
-        """The journal in order. Where rows are missing, `step` jumps."""
-        return self._unique(paths.ROWS, _rows, lambda row: row.chain)
+    def rows(self, after: int | None = None) -> Iterator[JournalRow]:
+        """The journal in order, or what comes after a step of it. Where rows are missing, `step` jumps."""
+        if after is None:
+            return self._unique(paths.ROWS, _rows, lambda row: row.chain)
+
+        def later(batch: Any) -> Iterator[JournalRow]:
+            return _rows(batch) if max(_index(batch, paths.STEP), default=-1) > after else iter(())
+
+        return (row for row in self._unique(paths.ROWS, later, lambda row: row.chain) if row.step > after)
 
     def count_rows(self) -> int:
         """Number of rows in the files, for showing progress."""
@@ -198,7 +219,10 @@ class Recording:
     def _add_part(self, path: str, prober: Prober) -> None:
         """A part that holds nothing (its recorder ended before the first write) is said, not fatal."""
         try:
-            found = rrd_file.scan(path)
+            found = rrd_file.scan(path) if os.path.getsize(path) else None
+            if found is None or not (found.messages or found.holes):
+                self.notes.append(f"{os.path.basename(path)}: nothing was written into it")
+                return
             if found.cut:
                 self.cuts.append(f"{os.path.basename(path)}: ends in the middle of a write, at byte {found.good_bytes}")
             whole = found.good_bytes == found.size and not found.holes and prober.readable(path)
@@ -215,15 +239,18 @@ class Recording:
         self.damage += [f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)]
         return copy
 
-    def _end(self) -> tuple[int, bytes] | None:
-        for part, batch in self._batches(paths.END):
-            if part == len(self.files) - 1:
-                return _decode_end(_values(batch, "end")[0])
-        return None
+    def _find_missing(self, files: list[str], named: list[int]) -> None:
+        """`files`: what was found; `named`: the parts that closed ones say the recording goes on in, 0 for none."""
+        base, first = paths.split_part(files[0])
+        there = {paths.split_part(path)[1] for path in files}
+        for part in range(first, max(*there, *named, first) + 1):
+            if part not in there:
+                self.missing.append(f"{os.path.basename(paths.part_path(base, part))} is missing")
 
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._batches(paths.HEADER):
             blob, intact = open_blob(_values(batch, "blob")[0])
+            self.root = root_of(blob)
             try:
                 header = decode_header(blob)
             except msgspec.DecodeError as error:
@@ -231,7 +258,8 @@ class Recording:
             if not intact:
                 self.damage.append("header: its bytes were changed (checksum)")
             return header
-        why = f" ({self.damage[0]})" if self.damage else ": nothing was recorded, or it is not ours"
+        said = self.damage + self.notes
+        why = f" ({said[0]})" if said else ": nothing was recorded, or it is not ours"
         raise NotARecordingError(f"{path} holds no session header{why}")
 
 

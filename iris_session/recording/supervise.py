@@ -46,6 +46,7 @@ class RecorderProcess:
         self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
         self._process: subprocess.Popen[bytes] | None = None
+        self.starts = 0
 
     @property
     def part_path(self) -> str:
@@ -126,6 +127,7 @@ class RecorderProcess:
                 env=environment,
                 start_new_session=True,
             )
+        self.starts += 1
         assert self._process.stdin is not None
         with suppress(BrokenPipeError):  # it ended before reading; its answer says why
             self._process.stdin.write(msgspec.msgpack.encode(config))

@@ -8,6 +8,7 @@ knows no room but its own.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +18,11 @@ import msgspec
 
 from iris_session.protocol.entries import Entry, decode_entries
 from iris_session.recording import versions
+from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
+    CRASHED,
     SNAPSHOTS,
+    Continues,
     JournalRow,
     Keyframe,
     RowProblem,
@@ -27,8 +31,8 @@ from iris_session.recording.journal import (
     check_fields,
     check_keyframe,
     check_row,
-    header_root,
 )
+from iris_session.recording.messages import EndMark
 from iris_session.recording.reader import Recording
 
 #: Problems kept in a report; more are counted.
@@ -67,8 +71,10 @@ class VerifyReport(msgspec.Struct):
     """`ok`: every step was checked and simulated again with the same result.
 
     `gaps`: `(first, last)` missing steps. `unverified_steps`: rows between a gap or divergence and the next keyframe.
-    `finished`: the recorder closed the file, so nothing can be missing at its end. `cuts`: see `Recording`.
-    `keyframes`: how many were met and equal. `seconds`: session time simulated. `problems`: the first ones, in order.
+    `finished`: the recorder closed the file, so nothing can be missing at its end. `files`: names of the parts. `cuts`,
+    `missing`, `notes`: see `Recording`. `crash`: of the last step, when an error in it ended the session.
+    `continues`: what a resumed session goes on from. `keyframes`: how many were met and equal. `seconds`: session time
+    simulated. `problems`: the first ones, in order.
     """
 
     path: str
@@ -87,6 +93,11 @@ class VerifyReport(msgspec.Struct):
     last_step: int = -1
     damage: list[str] = []
     cuts: list[str] = []
+    files: list[str] = []
+    missing: list[str] = []
+    notes: list[str] = []
+    crash: str = ""
+    continues: str = ""
     version_differences: list[str] = []
 
     def line(self) -> str:
@@ -96,7 +107,14 @@ class VerifyReport(msgspec.Struct):
         parts.append(f"{self.keyframes} keyframes equal, class {self.recording_class}")
         if self.unverified_steps:
             parts.append(f"{self.unverified_steps} steps could not be verified")
-        if not self.finished:
+        if self.crash:
+            parts.append(self.crash)
+        if self.parts > 1:
+            parts.append(f"{self.parts} parts: {', '.join(self.files)}")
+        if self.continues:
+            parts.append(f"continues {self.continues}")
+        parts += self.notes
+        if not self.finished and not self.missing:
             parts.append(f"good up to step {self.last_step}, then the recorder was killed")
         if self.ok:
             return "ok: " + "; ".join(parts)
@@ -131,7 +149,7 @@ def verify(
     finding is in the report.
     """
     began = time.perf_counter()
-    with Recording.open(path) as recording:
+    with Recording.open(path, warn=False) as recording:
         header = recording.header
         report = VerifyReport(str(path), recording_class=header.recording_class, parts=len(recording.files))
         report.version_differences = versions.differences(header.versions)
@@ -154,6 +172,13 @@ def verify(
         report.last_step = run.last_step
         report.damage = list(recording.damage)
         report.cuts = list(recording.cuts)
+        report.missing = list(recording.missing)
+        report.notes = list(recording.notes)
+        report.files = [os.path.basename(file) for file in recording.files]
+        if header.continues is not None:
+            run.compare(header.continues)
+        for line in recording.missing:
+            run.found(Problem(run.last_step, "missing", "file", line))
         for line in recording.damage:
             run.found(Problem(run.last_step, "unreadable", "file", line))
         for line in recording.changed_spans():
@@ -168,15 +193,17 @@ class _Run:
 
     def __init__(self, recording: Recording, core: Core | None, report: VerifyReport) -> None:
         self.report = report
-        self.last_step = -1
-        self.simulating = True
+        self.last_step = recording.header.begins_after
+        #: A resumed session begins at the keyframe that it was resumed from.
+        self.simulating = recording.header.continues is None
         self._core = core
-        self._chain: bytes | None = header_root(recording.header)
+        self._chain: bytes | None = recording.root
         self._stored_chain: bytes | None = None  # of the last row, when it is not what it ought to be
         self._now_ns: int | None = None
         self._keyframes = recording.keyframes()
         self._next_keyframe = next(self._keyframes, None)
-        self._meet_keyframe(-1)
+        self._first = self.last_step
+        self._meet_keyframe(self._first)
 
     def take(self, row: JournalRow) -> None:
         """Checks one row, simulates it, and meets the keyframe taken after it."""
@@ -206,14 +233,16 @@ class _Run:
             return check_row(self._stored_chain, row)
         return problem
 
-    def end(self, mark: tuple[int, bytes] | None) -> None:
+    def end(self, mark: EndMark | None) -> None:
         """Checks that the rows reach as far as the recorder noted at its end."""
-        if mark is None or not mark[1]:
+        if mark is None or not mark.chain:
             return
-        if mark[0] > self.last_step:
-            self._gap(self.last_step + 1, mark[0])
-        elif self._chain is not None and mark != (self.last_step, self._chain):
-            text = f"the end mark names step {mark[0]}, the journal ends at step {self.last_step} or with another chain"
+        if mark.step > self.last_step:
+            self._gap(self.last_step + 1, mark.step)
+        elif self._chain is not None and (mark.step, mark.chain) != (self.last_step, self._chain):
+            text = (
+                f"the end mark names step {mark.step}, the journal ends at step {self.last_step} or with another chain"
+            )
             self.found(Problem(self.last_step, "changed", "end", text))
 
     def _gap(self, first: int, last: int) -> None:
@@ -235,10 +264,27 @@ class _Run:
             return
         self.report.steps += 1
         self.report.seconds += elapsed / 1e9
+        if row.digest == CRASHED:
+            self._crashed(row)
+        elif self._core is not None:
+            self._step(self._core, row, compare)
+
+    def _crashed(self, row: JournalRow) -> None:
+        """The step that ended the session: taken again, it says why."""
+        self.report.crash = f"an error in step {row.step} ended the session"
+        self.simulating = False
         if self._core is None:
             return
         try:
-            digest = self._core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
+            self._core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
+        except Exception as error:
+            self.report.crash += f", and comes again: {_one_line(error)}"
+        else:
+            self.report.crash += "; it does not come again"
+
+    def _step(self, core: Core, row: JournalRow, compare: bool) -> None:
+        try:
+            digest = core.step(row.now_ns, decode_entries(row.entries), row.n_ticks, row.plant)
         except Exception as error:  # changed bytes may mean anything to the core; what came of it is the finding
             self._diverged("entries", f"the step cannot be taken again: {_one_line(error)}")
             return
@@ -264,7 +310,7 @@ class _Run:
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         if self._chain is not None and keyframe.chain != self._chain:
-            if keyframe.step < 0:
+            if keyframe.step == self._first:
                 text = "the header is not the one that the journal was begun with"
                 self.found(Problem(keyframe.step, "changed", "header", text))
             else:
@@ -290,6 +336,25 @@ class _Run:
                 self.found(Problem(keyframe.step, "divergence", other[0], text))
                 return
         self.report.keyframes += 1
+
+    def compare(self, past: Continues) -> None:
+        """Whether the recording that this one goes on from is the one beside it."""
+        self.report.continues = f"{past.file} after step {past.step}"
+        path = Path(self.report.path).with_name(past.file)
+        if not path.is_file():
+            self.report.notes.append(f"{past.file} is not there to compare with")
+            return
+        try:
+            with Recording.open(path, warn=False) as recording:
+                rows = recording.rows(after=past.step - 1)
+                root = recording.root if past.step == recording.header.begins_after else b""
+                chain = root or next((row.chain for row in rows if row.step == past.step), b"")
+        except NotARecordingError as error:
+            self.report.notes.append(f"{past.file} cannot be compared with: {error}")
+            return
+        if chain != past.chain:
+            text = f"it does not continue the {past.file} beside it: that has another step {past.step}"
+            self.found(Problem(past.step, "changed", "header", text))
 
     def found(self, problem: Problem) -> None:
         """Adds to the report."""

@@ -1,4 +1,4 @@
-"""What a re-simulation must have in common with the recording: library versions, platform, BLAS threads."""
+"""What a re-simulation must have in common with the recording: library versions, platform, processor, BLAS threads."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import importlib.metadata
 import os
 import platform
 import sys
+from contextlib import suppress
+from pathlib import Path
 from typing import Final
+
+from iris_session.recording import blas
 
 #: Distributions whose version can change the floats of a step.
 LIBRARIES: Final = ("iris-session", "numpy", "scipy", "mujoco", "mink", "daqp", "msgspec", "rerun-sdk")
@@ -25,7 +29,18 @@ def environment() -> dict[str, str]:
     found["platform"] = f"{platform.system()}-{platform.machine()}-{platform.libc_ver()[1] or 'unknown'}"
     for name in BLAS_VARIABLES:
         found[name] = os.environ.get(name, "unset")
+    found["blas_threads"] = blas.threads()
+    found["cpu"] = cpu_model()
     return found
+
+
+def cpu_model() -> str:
+    """The processor's own name: another one may take other vector instructions, which round differently."""
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"
 
 
 def differences(recorded: dict[str, str], here: dict[str, str] | None = None) -> list[str]:
@@ -36,3 +51,11 @@ def differences(recorded: dict[str, str], here: dict[str, str] | None = None) ->
         for name, value in sorted(recorded.items())
         if now.get(name, "absent") != value
     ]
+
+
+def boot_id() -> str:
+    """Which boot of which machine this is; empty where the system does not tell. CLOCK_MONOTONIC begins with it."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return ""

@@ -25,7 +25,7 @@ from iris_session.recording import paths, scene
 from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob, unpack_model
-from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame, encode_header
+from iris_session.recording.messages import Batch, DenialRecord, EndMark, MetricRecord, StateFrame, encode_header
 from iris_session.recording.text import describe_denial, describe_event, describe_session
 
 #: Colours of participants in the order of their appearance.
@@ -114,15 +114,19 @@ class RrdWriter:
         except (RuntimeError, ValueError, OSError) as error:
             raise WriteError(f"{self.path} cannot be written: {' '.join(str(error).split())}") from error
 
-    def close(self) -> None:
-        """Writes the rest and the end mark, and closes the file."""
+    def close(self, continues_in: int = 0) -> None:
+        """Writes the rest and the end mark, and closes the file. `continues_in`: the part that follows, 0 for none."""
         self._write_latencies()
         self.flush()
         self._mark()
-        step, chain = self._newest_row
-        self._static(paths.END, rr.AnyValues(end=pa.array([_encode((step, chain))], pa.binary())))
+        mark = EndMark(*self._newest_row, continues_in)
+        self._static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         self.flush()
         self._rec.disconnect()
+
+    def abandon(self) -> None:
+        """Removes the file, in which nothing is."""
+        Path(self.path).unlink(missing_ok=True)
 
     def _mark(self) -> None:
         """Notes the CRC of all bytes since the last mark, so that any later change of the file is found."""

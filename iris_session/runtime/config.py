@@ -13,6 +13,8 @@ from typing import Final
 from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
+from iris_session.protocol.discovery import DISCOVERY_PORT
+from iris_session.runtime.config_checks import check_anchors, check_types
 from iris_session.runtime.errors import ConfigError
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
@@ -24,33 +26,47 @@ class SessionConfig:
     """Settings of one session.
 
     `record`: True writes `sessions/<UTC stamp>-<name>/session.rrd` below the current folder, a path writes there,
-    False records nothing. Port 0 takes any free one. `anchors`: `T_world_anchor` per anchor id. `curve_key`: file with
-    the server's CURVE secret key, required for any `host` that is not loopback; `curve_clients`: folder with the public
-    certificates of the clients that may connect. `keyframe_s`: distance of the
-    recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes on without when refused.
+    False records nothing. Port 0 takes any free one. `interfaces`: names or addresses of the networks to listen on,
+    instead of `host`; `advertise`: the address that others are told when it is none of ours (a forwarding router).
+    `beacon_port`: UDP port on which the session tells of itself, 0 for not at all. `anchors`: `T_world_anchor` per
+    anchor id. Off loopback everything is encrypted, with `curve` on loopback too: with the key and the allow-list of
+    the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates `curve_clients`.
+    `keyframe_s`: distance of the recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes
+    on without when refused. `resume`: a recording (or its folder) of our loop to go on from; scene, robots, name,
+    authority and control come with it, and what is left at its default here is as it was: addresses, ports, keys.
     """
 
     name: str = "session"
     host: str = "127.0.0.1"
+    interfaces: tuple[str, ...] = ()
+    advertise: str = ""
+    beacon_port: int = DISCOVERY_PORT
     control_port: int = 7721
     state_port: int = 7722
     state_hz: float = 60.0
     record: bool | str | Path = True
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
+    curve: bool = False
     curve_key: str = ""
     curve_clients: str = ""
     keyframe_s: float = 5.0
     realtime: bool = True
+    resume: str | Path | None = None
     authority: AuthorityConfig = field(default_factory=AuthorityConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
 
     def __post_init__(self) -> None:
+        check_types(self)
+        check_anchors(self.anchors)
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}", self.name):
             raise ConfigError(
                 f"session name {self.name!r} cannot be used: 1 to 48 letters, digits, '.', '_' or '-', "
                 "beginning with a letter or digit"
             )
-        for label, port in (("control_port", self.control_port), ("state_port", self.state_port)):
+        if not re.fullmatch(r"[A-Za-z0-9._:-]{0,64}", self.advertise):
+            raise ConfigError(f"advertise {self.advertise!r} is not an address without port, for example 203.0.113.7")
+        for label in ("control_port", "state_port", "beacon_port"):
+            port = getattr(self, label)
             if not 0 <= port <= 65535:
                 raise ConfigError(f"{label} {port} is not a port: 0 (any free one) to 65535")
         if not 1.0 <= self.state_hz <= 240.0:

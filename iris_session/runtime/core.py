@@ -8,19 +8,27 @@ where the plant's state comes from outside (a user's loop, a real robot) and is 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import mujoco
 import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.control import ControlConfig, Controller
+from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
 from iris_session.protocol.entries import HOST, Entry, ExternalReset
+from iris_session.protocol.names import LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision
+from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.errors import ConfigError
+
+
+def unmeasured(cause: str) -> None:
+    """Nobody asks how long the parts of a step take."""
+
 
 _encoder = msgspec.msgpack.Encoder()
 _decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
@@ -77,11 +85,19 @@ class SessionCore:
         self._status: tuple[ControlStatus, ...] = ()
 
     def step(
-        self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"", *, digest: bool = True
+        self,
+        now_ns: int,
+        entries: Sequence[Entry],
+        n_ticks: int,
+        plant: bytes = b"",
+        *,
+        digest: bool = True,
+        lap: Callable[[str], None] = unmeasured,
     ) -> StepOutcome:
         """One pass at session time `now_ns`, `n_ticks` >= 0 ticks of physics.
 
         Without `digest` the outcome has an empty one: it takes a sixth of a step, and only a recording needs it.
+        `lap` is called after each part with the `LateCause` that its time counts as; it has no influence.
 
         `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
         write `world.data.ctrl` for the caller to apply, and do not advance physics.
@@ -90,6 +106,7 @@ class SessionCore:
         if plant:
             world.set_state_bytes(plant)
         decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
+        lap(LateCause.AUTHORITY)
         if decision.reset:
             self._reset_world()
             self.controller.reset(world.data)
@@ -98,10 +115,20 @@ class SessionCore:
         self.controller.begin(now_ns, n_ticks, decision, world.view())
         for _ in range(0 if world.diverged else n_ticks):
             self.controller.tick(world.data)
+            lap(LateCause.CONTROL)
             if not plant and not self._tick():
                 break
+            lap(LateCause.PHYSICS)
         self._status = self.controller.status()
         return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
+
+    def rest(self, plant: bytes) -> None:
+        """Writes the last `world.data.ctrl` for the plant in state `plant`: robots at rest, objects let go.
+
+        No step may follow: this one is in no journal.
+        """
+        self.world.set_state_bytes(plant)
+        self.controller.rest(self.world.data)
 
     def _tick(self) -> bool:
         """One tick of physics; False when the state is no longer finite: physics then stands still until a reset."""
@@ -152,3 +179,26 @@ def plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
     state = np.empty(mujoco.mj_stateSize(model, STATE))
     mujoco.mj_getState(model, data, state, STATE)
     return state.tobytes()
+
+
+def core_of(
+    session: SessionConfig,
+    model: mujoco.MjModel,
+    data: mujoco.MjData | None,
+    robots: tuple[RobotSpec, ...],
+    objects: tuple[ObjectSpec, ...],
+    user_owned: bool,
+    known: SessionCore | None = None,
+) -> SessionCore:
+    """The core of a session that begins with `data` as it is now; `known` when that is the one."""
+    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned)
+    initial = b"" if data is None else plant_state(model, data)
+    config = CoreConfig(authority, session.control, robots, objects, initial)
+    if known is not None and known.config == config:
+        return known
+    try:
+        return SessionCore(model, config)
+    except ControlError:
+        raise
+    except ValueError as error:  # the authority's own check of its numbers and names
+        raise ConfigError(str(error)) from error

@@ -1,11 +1,12 @@
-"""The demos: a session in this process, emulated people in others, and a result that says whether it worked.
+"""Runs a demo: a session in this process, emulated people in others, and a result that says whether it worked.
 
-`handover`: two operators, each with an arm, pass a hammer through the air. It counts only if the session's own detector
-saw the object change hands by contact alone, and if the recording verifies bit for bit.
+It counts only if the session's own detector saw every object change hands by contact alone, and if the recording
+verifies bit for bit. What is played is in `plays`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import subprocess
@@ -13,20 +14,23 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import msgspec
 
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.physics.scenes import scene_path
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.links import address_over, link_address, links_before
+from iris_session.runtime.plays import Play
 from iris_session.runtime.session import Session
 from iris_session.runtime.status import HandoverStatus, SessionStatus
 from iris_session.runtime.verification import verify_recording
 
 #: How often the reports of the emulated people are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
-DEMOS: Final = ("handover",)
+#: People who work share a process in pairs, people who only look in fours.
+WORKERS_PER_PROCESS: Final = 2
+OBSERVERS_PER_PROCESS: Final = 4
 
 
 class EmulatorProcess:
@@ -47,11 +51,18 @@ class EmulatorProcess:
         self._fd = self._process.stdout.fileno()
         os.set_blocking(self._fd, False)
         self._rest = b""
+        self._awaited = [spec.name for spec in specs if not spec.endless]
         self.reports: dict[str, HeadsetReport] = {}
 
     @property
     def running(self) -> bool:
         return self._process.poll() is None
+
+    @property
+    def busy(self) -> bool:
+        """Whether somebody here has not yet come to the end of a task that has one."""
+        reports = [self.reports.get(name) for name in self._awaited]
+        return any(r is None or not (r.done or r.failed) for r in reports)
 
     @property
     def pid(self) -> int:
@@ -72,7 +83,10 @@ class EmulatorProcess:
                 self.reports[report.name] = report
 
     def close(self) -> None:
-        """Ends the process if it still runs, and reads its last words."""
+        """Ends the process if it still runs, and reads its last words. Can be called twice."""
+        assert self._process.stdout is not None
+        if self._process.stdout.closed:
+            return
         if self.running:
             self._process.terminate()
         try:
@@ -81,7 +95,6 @@ class EmulatorProcess:
             self._process.kill()
             self._process.wait()
         self.poll()
-        assert self._process.stdout is not None
         self._process.stdout.close()
 
 
@@ -108,63 +121,62 @@ class DemoResult(msgspec.Struct, frozen=True):
     lateness_ms_p99: float
     state_age_ms_p99: dict[str, float]
     problems: tuple[str, ...]
+    real_time_factor: float = 0.0
+    notes: tuple[str, ...] = ()
     interrupted: bool = False
 
 
-def handover_specs(seed: int) -> tuple[HeadsetSpec, HeadsetSpec]:
-    """The two operators of the handover demo: they stand on the two sides of the sheet."""
-    giver = HeadsetSpec(name="ann", behaviour="giver", robot="left", seed=seed, eye=(-0.35, -0.95, 0.55))
-    receiver = HeadsetSpec(name="bob", behaviour="receiver", robot="right", seed=seed + 1, eye=(0.35, -0.95, 0.55))
-    return giver, receiver
-
-
-def run_handover(
+def run_demo(
+    play: Play,
     config: SessionConfig,
-    seed: int = 0,
     timeout_s: float = 90.0,
     on_session: Callable[[Session], AbstractContextManager[Callable[[], object]]] | None = None,
+    profile: str = "",
+    seed: int = 0,
 ) -> DemoResult:
-    """Runs the handover demo. `on_session`: a context around the running session; gives what its loop calls always."""
-    emulators: list[EmulatorProcess] = []
-    next_read_ns = 0
+    """Runs `play` to its end. `on_session`: a context around the running session; gives what its loop calls always.
 
-    session = Session(scene_path("handover"), config=config)
+    `profile`: every process of people joins over a bad link like this, with the weather of `seed`; empty: directly.
+    """
+    session = Session(play.model, config=dataclasses.replace(config, anchors=play.anchors))
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
         update = stack.enter_context(on_session(session)) if on_session is not None else (lambda: None)
+        groups = _groups(play.people)
+        links = {link_address(i): profile for i in range(len(groups))} if profile else {}
+        if links:
+            stack.enter_context(links_before(session, links, seed))
+        addresses = [address_over(session, link) for link in links] or [session.address] * len(groups)
+        people = stack.enter_context(_People(addresses, groups, timeout_s))
+        next_read_ns = began_ns = 0
 
         def finished() -> bool:
-            nonlocal next_read_ns
+            nonlocal next_read_ns, began_ns
             update()
             now_ns = session.clock()
+            began_ns = began_ns or now_ns  # making the loop ready is no part of its pace
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            for emulator in emulators:
-                emulator.poll()
-            return not any(emulator.running for emulator in emulators)
+            return people.finished()
 
-        try:
-            for spec in handover_specs(seed):
-                emulators.append(EmulatorProcess(session.address, [spec], timeout_s))
-            session.run(seconds=timeout_s + 5.0, until=finished)
-        finally:
-            for emulator in emulators:
-                emulator.close()
+        session.run(seconds=timeout_s + 5.0, until=finished)
+        run_s = max(session.clock() - began_ns, 1) * 1e-9
+        people.close()
         interrupted = session.stopping
         status = session.status()
         seconds = session.clock() * 1e-9
         recording = session.recording
-    reports = {name: report for emulator in emulators for name, report in emulator.reports.items()}
+    reports = people.reports
     # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
-    problems = ["interrupted before its end"] if interrupted else _problems(reports, status, timeout_s)
+    problems = ["interrupted before its end"] if interrupted else _problems(play, reports, status, timeout_s)
     if verified is False:
         problems.append(verification)
     return DemoResult(
-        ok=not problems and len(reports) == 2,
-        demo="handover",
+        ok=not problems and len(reports) == len(play.people),
+        demo=play.name,
         seconds=round(seconds, 3),
         participants=tuple(sorted(reports)),
         handovers=status.handovers,
@@ -178,22 +190,74 @@ def run_handover(
         },
         late_tick_share=status.lateness.get("late_share", 0.0),
         lateness_ms_p99=round(status.lateness.get("p99_ms", 0.0), 3),
+        real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
+        notes=play.notes,
         interrupted=interrupted,
     )
 
 
-def _problems(reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
-    """Why this was no handover; empty when it was one."""
+def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
+    """Who shares a process: nobody as long as two people work, else see `WORKERS_PER_PROCESS`."""
+    workers = [spec for spec in specs if not spec.observer]
+    observers = [spec for spec in specs if spec.observer]
+    each = 1 if len(workers) <= 2 else WORKERS_PER_PROCESS
+    groups: list[Sequence[HeadsetSpec]] = [workers[i : i + each] for i in range(0, len(workers), each)]
+    return groups + [observers[i : i + OBSERVERS_PER_PROCESS] for i in range(0, len(observers), OBSERVERS_PER_PROCESS)]
+
+
+class _People:
+    """The emulated people of a demo, in processes of their own."""
+
+    def __init__(self, addresses: Sequence[str], groups: Sequence[Sequence[HeadsetSpec]], timeout_s: float) -> None:
+        self._workers: list[EmulatorProcess] = []
+        self._observers: list[EmulatorProcess] = []
+        try:
+            for address, group in zip(addresses, groups, strict=True):
+                if group[0].observer:
+                    self._observers.append(EmulatorProcess(address, group, timeout_s + 5.0))
+                else:
+                    self._workers.append(EmulatorProcess(address, group, timeout_s))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def reports(self) -> dict[str, HeadsetReport]:
+        """The newest report of everybody, by name."""
+        return {name: r for process in (*self._workers, *self._observers) for name, r in process.reports.items()}
+
+    def finished(self) -> bool:
+        """Reads the reports; whether everybody whose task has an end has come to it."""
+        for process in (*self._workers, *self._observers):
+            process.poll()
+        return not any(process.running and process.busy for process in self._workers)
+
+    def close(self) -> None:
+        for process in (*self._workers, *self._observers):
+            process.close()
+
+
+def _problems(play: Play, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
+    """Why this was no success; empty when it was one."""
+    tasks = {spec.name: spec for spec in play.people}
     problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
     problems += [
         f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
         for name, r in reports.items()
-        if not (r.done or r.failed)
+        if not (r.done or r.failed or tasks[name].endless)
     ]
-    if not status.handovers:
-        problems.append("the detector saw no handover by contact alone")
+    given = {handover.object for handover in status.handovers}
+    problems += [
+        f"the detector saw no handover of the {thing} by contact alone" for thing in play.objects if thing not in given
+    ]
     return problems
 
 

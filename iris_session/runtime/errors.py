@@ -3,6 +3,7 @@
 SessionError
 ├── ConfigError          a value in the configuration cannot be used
 ├── StartError           a process of the session did not come up (port in use, unwritable folder)
+├── ResumeError          a recording that the session cannot go on from
 └── OwnershipError       the call does not fit the way this session is driven
 """
 
@@ -19,6 +20,10 @@ class ConfigError(SessionError):
 
 class StartError(SessionError):
     """A process of the session did not come up."""
+
+
+class ResumeError(SessionError):
+    """The session cannot go on from this recording."""
 
 
 class OwnershipError(SessionError):

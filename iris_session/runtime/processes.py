@@ -8,7 +8,9 @@ is tried at growing distances.
 from __future__ import annotations
 
 import datetime
+import importlib.util
 import logging
+import math
 import secrets
 from collections.abc import Callable
 from typing import Final
@@ -25,16 +27,23 @@ from iris_session.recording import (
     RecorderFeed,
     RecorderProcess,
     RecordingError,
+    RecordingLock,
     SessionHeader,
     header_root,
     pack_model,
 )
-from iris_session.recording.versions import environment
+from iris_session.recording.feed import SILENCE_S
+from iris_session.recording.versions import boot_id, environment
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.continuation import Continuation, wait_until_free
 from iris_session.runtime.core import SessionCore
 from iris_session.runtime.errors import StartError
+from iris_session.runtime.neighbours import Neighbours
+from iris_session.runtime.report import Reporter
+from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path
 from iris_session.runtime.stepper import Stepper
-from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo
+from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
+from iris_session.transport.sockets import host_in_address
 
 WATCH_PERIOD_NS: Final = 50_000_000
 RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
@@ -42,6 +51,14 @@ RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000
 HEALTHY_NS: Final = 30_000_000_000
 #: A recorder says something twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
 HANGING_NS: Final = 5_000_000_000
+
+#: What the recorder gets to take what is left, and one that was just started before.
+TAKING_S: Final = 5.0
+STARTING_S: Final = 15.0
+#: What the front gets to tell its clients, a recorder to finish its file, and one that did not take its rows to end.
+FAREWELL_S: Final = 0.6
+FINISHING_S: Final = 10.0
+ENDING_S: Final = 0.2
 
 _log = logging.getLogger(__name__)
 
@@ -78,11 +95,18 @@ class SessionProcesses:
         config: SessionConfig,
         world: World,
         origin_ns: int,
+        past: Continuation | None = None,
     ) -> None:
         self._config = config
         self._origin_ns = origin_ns
-        self.session_id = secrets.token_hex(8)
-        self.recording = config.recording_path()
+        self._past = past
+        self.session_id = secrets.token_hex(8) if past is None else past.header.session_id
+        self.name = config.name
+        #: What people should know about how the session started.
+        self.notes: list[str] = []
+        self.recording = config.recording_path() if past is None else past.recording
+        self._in_use: RecordingLock | None = None
+        self._keeper: NoteKeeper | None = None
         self._scene, self._tick_period_ns = _scene_info(world), world.tick_period_ns
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
@@ -91,40 +115,89 @@ class SessionProcesses:
         self._front_watch = _Watch()
         self._recorder_watch = _Watch()
         self._recorder_hangs = False
+        #: Why the recorder ended, until its successor has written for a while.
+        self.recorder_failure = ""
+        self._recorder_failed_ns = 0
+        self.reporter = Reporter()
         self._next_watch_ns = 0
         self._address = ""
+        #: What MuJoCo had no room for, since the beginning; and as the world counts it, since its last reset.
+        self._trouble: dict[str, int] = {}
+        self._trouble_seen: dict[str, int] = {}
 
     def start(self) -> None:
         """Starts the recorder, then the front; ends both again when one fails."""
+        if self.recording is not None and importlib.util.find_spec("rerun") is None:
+            raise StartError("recording needs rerun: pip install 'iris-session[recording]', or record nothing")
+        others = Neighbours(self._config.beacon_port)
         try:
             if self.recording is not None:
                 self.recorder = RecorderProcess(self.recording, self._origin_ns)
                 self.recorder.start()
                 self.feed = RecorderFeed(self.recorder.feed_endpoint, self.recording.parent)
+                self._in_use = RecordingLock(self.recording, shared=True)
+                self._keeper = NoteKeeper(note_path(self.recording))
+            self.name = others.free_name(self._config.name, self.session_id)
+            self.notes += others.notes
             self.front = FrontProcess(self._front_config(), self._scene)
+            if self._past is not None:
+                self.notes += self._past.notes
+                self.front.link.handback = self._past.handback
+                wait_until_free(self._config)
             ports = self.front.start()
+            self._note()
             self._address = f"{ports.host}:{ports.control}"
+            others_join_at = [f"{host_in_address(host)}:{ports.control}" for host in ports.reachable]
+            if ports.key_fingerprint:
+                how = "keys in that folder join" if self._config.curve_clients else "new devices: `iris-session pair`"
+                self.notes.append(f"encrypted, key {ports.key_fingerprint}; {how}")
+            if others_join_at != [self._address]:
+                self.notes.append(f"others reach it at {', '.join(others_join_at)}")
         except (FrontError, RecordingError) as error:
             self.close()
             raise StartError(str(error)) from error
         except BaseException:
             self.close()
             raise
+        finally:
+            others.close()
+
+    def _note(self) -> None:
+        """What a resumed session needs and the journal does not have: the front's memory, and where it listens."""
+        if self._keeper is None or self.front is None or self.front.link.ports is None:
+            return
+        config, ports = self._config, self.front.link.ports
+        listening = Listening(
+            config.host,
+            config.interfaces,
+            config.advertise,
+            config.beacon_port,
+            ports.control,
+            ports.state,
+            config.curve,
+            config.curve_key,
+            config.curve_clients,
+        )
+        self._keeper.offer(ResumeNote(self.session_id, listening, self.front.link.handback))
 
     def _front_config(self) -> FrontConfig:
         config = self._config
         return FrontConfig(
             host=config.host,
+            listen=addresses_of(config.interfaces) if config.interfaces else (),
+            advertise=config.advertise,
+            beacon_port=config.beacon_port,
             control_port=config.control_port,
             state_port=config.state_port,
             session_id=self.session_id,
-            session_name=config.name,
+            session_name=self.name,
             origin_ns=self._origin_ns,
             tick_period_ns=self._tick_period_ns,
             state_period_ns=self.state_period_ns,
+            curve=config.curve,
             curve_secret_file=config.curve_key,
             curve_clients_dir=config.curve_clients,
-            anchors={name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()},
+            anchors=anchor_poses(config),
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
 
@@ -142,12 +215,13 @@ class SessionProcesses:
             self.feed.header(header)
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
-        return Stepper(core, self.front.link, self.feed, clock, self.state_period_ns, keyframe_ns, chain)
+        after = None if self._past is None else (self._past.step, self._past.now_ns)
+        return Stepper(core, self.front.link, self.feed, clock, self.state_period_ns, keyframe_ns, chain, after)
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(
             session_id=self.session_id,
-            session_name=self._config.name,
+            session_name=self.name,
             recording_class=recording_class,
             tick_period_ns=self._tick_period_ns,
             config=msgspec.msgpack.encode(core.config),
@@ -158,6 +232,10 @@ class SessionProcesses:
             bodies=core.world.bodies,
             versions=environment(),
             created_utc=datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
+            continues=None if self._past is None else self._past.continues,
+            origin_ns=self._origin_ns,
+            boot_id=boot_id(),
+            anchors=anchor_poses(self._config),
         )
 
     def watch(self, stepper: Stepper) -> None:
@@ -166,15 +244,32 @@ class SessionProcesses:
         if now_ns < self._next_watch_ns:
             return
         self._next_watch_ns = now_ns + WATCH_PERIOD_NS
+        self._note()
         if self.front is not None and not self.front.alive and self._front_watch.dead(now_ns):
             stepper.post(Marker(request_id=0, text=f"the front process ended and {_replaced(self.front.restart)}"))
         if self.recorder is not None and not self.recorder.alive and self._recorder_watch.dead(now_ns):
-            failure = self.recorder.failure or "the recorder ended"
+            failure = self.recorder_failure = self.recorder.failure or "the recorder ended"
+            self._recorder_failed_ns = now_ns
             stepper.post(Marker(request_id=0, text=f"{failure}; it {_replaced(self.recorder.restart)}"))
         hangs = self.feed is not None and self.feed.silence_ns > HANGING_NS
         if hangs and not self._recorder_hangs:
             stepper.post(Marker(request_id=0, text="the recorder hangs: what it does not take waits on the disk"))
         self._recorder_hangs = hangs
+        self._watch_plant(stepper)
+        if self.recorder_failure and now_ns - self._recorder_failed_ns > HANGING_NS and not hangs:
+            self.recorder_failure = ""  # its successor writes
+        if self.front is not None and self.reporter.due(now_ns):
+            self.front.link.send_report(self.reporter.report(stepper, self))
+
+    def _watch_plant(self, stepper: Stepper) -> None:
+        """Contacts that MuJoCo drops change what happens: said once, and counted."""
+        seen = stepper.core.world.trouble
+        for what, count in seen.items():
+            before = self._trouble_seen.get(what, 0)
+            if what not in self._trouble:
+                stepper.post(Marker(request_id=0, text=f"MuJoCo: {what}; give the model <size memory='...'/>"))
+            self._trouble[what] = self._trouble.get(what, 0) + (count - before if count >= before else count)
+        self._trouble_seen = seen
 
     @property
     def front_pid(self) -> int:
@@ -184,32 +279,67 @@ class SessionProcesses:
     def recorder_pid(self) -> int:
         return 0 if self.recorder is None else self.recorder.pid
 
+    @property
+    def recorder_hangs(self) -> bool:
+        """It runs, and has said nothing for `HANGING_NS` though it has something to write."""
+        return self._recorder_hangs
+
     def drops(self) -> dict[str, int]:
         """Everything that was not delivered, by reason."""
+        return {**({} if self.front is None else self.front.link.status.drops), **self.own_drops()}
+
+    def own_drops(self) -> dict[str, int]:
+        """What did not leave this process, by reason; the front counts the rest."""
         drops: dict[str, int] = {}
         if self.front is not None:
-            drops.update(self.front.link.status.drops)
             drops["state_to_front"] = self.front.link.state_drops
         if self.feed is not None:
             drops["journal_rows"] = self.feed.stats.dropped_rows
             drops["recorded_items"] = self.feed.stats.dropped_items
+        drops |= self._trouble
         return {reason: count for reason, count in drops.items() if count}
 
     def restarts(self) -> dict[str, int]:
         return {"front": self._front_watch.restarts, "recorder": self._recorder_watch.restarts}
 
-    def close(self) -> None:
-        """Ends the front (its clients are told), then finishes the recording. May be called twice."""
+    def close(self) -> str:
+        """Ends the front (its clients are told), then finishes the recording. May be called twice.
+
+        Why the recording is incomplete, one line; empty when it holds everything, or when nothing is recorded.
+        """
         if self.front is not None:
-            self.front.close()
+            self.front.link.receive()
+            self._note()
+            self.front.close(FAREWELL_S)
             self.front = None
-        if self.feed is not None:
-            if not self.feed.close():
-                _log.error("the end of the recording is missing: the recorder did not write all of it in time")
-            self.feed = None
-        if self.recorder is not None:
-            self.recorder.close()
-            self.recorder = None
+        feed, self.feed = self.feed, None
+        recorder, self.recorder = self.recorder, None
+        fault, taken = "", True
+        if feed is not None and recorder is not None:
+            known = feed.stats.recorders >= recorder.starts  # a new one says nothing until it is there
+            wait_s, silence_s = (TAKING_S, SILENCE_S) if known else (STARTING_S, math.inf)
+            taken = feed.close(wait_s, lambda: recorder.alive, silence_s)
+            if not taken:
+                fault = recorder.failure or "the recorder did not write all of it in time"
+                fault = f"the end of the recording is missing: {fault}"
+            elif feed.stats.dropped_rows:
+                fault = f"{feed.stats.dropped_rows} steps are missing in the recording: {feed.stats.spill_fault}"
+        # One that hangs has had its time: everything is to end within two seconds.
+        if recorder is not None and not recorder.close(FINISHING_S if taken else ENDING_S) and not fault:
+            fault = "the recorder did not end in order: the end of the recording may be missing"
+        if self._keeper is not None:
+            self._keeper.close()
+        if self._in_use is not None:
+            self._in_use.release()
+        self._keeper = self._in_use = None
+        if fault:
+            _log.error("%s", fault)
+        return fault
+
+
+def anchor_poses(config: SessionConfig) -> dict[str, Pose]:
+    """`T_world_anchor` of each sheet, as it travels."""
+    return {name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()}
 
 
 def _replaced(restart: Callable[[], None]) -> str:

@@ -1,4 +1,4 @@
-"""Asks the operating system to run the tick loop before other work, as far as it is allowed.
+"""What the tick loop wants of the operating system: to run before other work as far as allowed, and signals in order.
 
 On a busy machine the scheduler, not our code, decides whether a 2 ms tick is met. Linux: `SCHED_RR` needs root,
 `CAP_SYS_NICE` or an `rtprio` line in /etc/security/limits.d; without it nothing is changed. What was reached
@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Final
 
 #: Any real-time priority runs before all ordinary threads; a low one stays below the kernel's own threads.
@@ -37,8 +40,11 @@ def tick_priority(wanted: bool = True) -> Iterator[str]:
     try:
         yield "realtime"
     finally:
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, before[0] & ~os.SCHED_RESET_ON_FORK, before[1])
+        try:
+            os.sched_setscheduler(0, *before)
+        except PermissionError:  # ordinary users may give back the priority, but not that children never inherit it
+            with suppress(PermissionError):
+                os.sched_setscheduler(0, before[0] | os.SCHED_RESET_ON_FORK, before[1])
 
 
 @contextmanager
@@ -50,3 +56,23 @@ def quiet_collector() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+
+
+@contextmanager
+def stop_signals(stop: threading.Event) -> Iterator[None]:
+    """Inside, SIGINT and SIGTERM set `stop`; a SIGINT after that raises `KeyboardInterrupt`. Main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        if stop.is_set() and number == signal.SIGINT:
+            raise KeyboardInterrupt  # the second Ctrl-C does not wait
+        stop.set()
+
+    previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for s, handler in previous.items():
+            signal.signal(s, handler)

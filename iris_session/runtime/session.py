@@ -18,32 +18,33 @@ announced when they die (`runtime.processes`).
 from __future__ import annotations
 
 import atexit
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Final, Self
 
-import msgspec
 import mujoco
 
-from iris_session.control import ControlError
-from iris_session.physics import Pacer, PacerStats, find_objects, find_robots, load_model
-from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker
+from iris_session.physics import Pacer, PacerStats
+from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker, SetScale
 from iris_session.protocol.common import Pose
-from iris_session.protocol.entries import EntryMessage, ExternalReset
+from iris_session.protocol.entries import EntryMessage
+from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.server_messages import Event
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.recording import blas
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.core import CoreConfig, SessionCore, plant_state
-from iris_session.runtime.errors import ConfigError, OwnershipError
+from iris_session.runtime.continuation import begin
+from iris_session.runtime.core import SessionCore, core_of
+from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.scheduling import quiet_collector, tick_priority
+from iris_session.runtime.scheduling import quiet_collector, stop_signals, tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
+from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
 
 #: Zero-tick steps while paused come at 100 Hz (at least 50 Hz, so that leases and heartbeats go on).
@@ -57,24 +58,23 @@ class Session:
 
     `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,
     else the model's default). With our loop a copy of it is advanced (`session.data` from then on). `robots`,
-    `objects`: None finds them in the model. Raises `AmbiguousModelError`, `ConfigError`, `StartError`.
+    `objects`: None finds them in the model. With `config.resume` all of them come from the recording. Raises
+    `AmbiguousModelError`, `ConfigError`, `StartError`, `ResumeError`.
     """
 
     def __init__(
         self,
-        model: mujoco.MjModel | str | Path,
+        model: mujoco.MjModel | str | Path | None = None,
         data: mujoco.MjData | None = None,
         config: SessionConfig | None = None,
         *,
         robots: Sequence[RobotSpec] | None = None,
         objects: Sequence[ObjectSpec] | None = None,
     ) -> None:
-        self.config = config or SessionConfig()
-        self.model = load_model(model) if isinstance(model, str | Path) else model
+        self._past, self.config, scene = begin(config, model, data, robots, objects)
+        self.model, self.robots, self.objects = scene
         self.data = data
-        self.robots = tuple(find_robots(self.model) if robots is None else robots)
-        self.objects = tuple(find_objects(self.model) if objects is None else objects)
-        self.origin_ns = time.monotonic_ns()
+        self.origin_ns = time.monotonic_ns() if self._past is None else self._past.origin_ns
         self.clock = session_clock(self.origin_ns)
         self._processes: SessionProcesses | None = None
         self._core: SessionCore | None = None
@@ -84,8 +84,11 @@ class Session:
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
+        self._callback: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
         self._asked_ticks = 0  # by a director, while paused
         self._scheduling = "normal"
+        #: Why the recording is incomplete, known after `close()`; empty when it is not.
+        self.recording_fault = ""
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -105,21 +108,31 @@ class Session:
         afterwards `StartError`: a port in use, a folder that cannot be written, a key that is missing.
         """
         if self._processes is None:
-            self._processes = SessionProcesses(self.config, self._make_core(user_owned=False).world, self.origin_ns)
-            self._processes.start()
+            world = self._make_core(user_owned=False).world
+            processes = SessionProcesses(self.config, world, self.origin_ns, self._past)
+            processes.start()
+            self._processes = processes
 
-    def close(self) -> None:
-        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice."""
+    def close(self) -> bool:
+        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice.
+
+        False: the recording is incomplete, `recording_fault` says why. In a user's loop the robots of `data` are left
+        at rest where they are commanded (torque actuators: with the torques that hold them now).
+        """
         self._stop.set()
         if self._attached:
-            mujoco.set_mjcb_control(None)
+            if mujoco.get_mjcb_control() is self._callback:  # it may be somebody else's by now
+                mujoco.set_mjcb_control(None)
             atexit.unregister(self.close)
             self._attached = False
         if self._user_loop is not None:
             self._user_loop.close()
         if self._processes is not None:
-            self._processes.close()
+            self.recording_fault = self._processes.close()
             self._processes = None
+        if self._past is not None:
+            self._past.close()
+        return not self.recording_fault
 
     # --- our loop ----------------------------------------------------------------------------------------------------
 
@@ -128,32 +141,49 @@ class Session:
 
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
         """
+        blas.use_one_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
         with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
             # Counted from here: collecting garbage in a large process takes longer than a short run.
             end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
             pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())
+            times = self._follow(stepper, pacer)
             while not self._stop.is_set():
                 now_ns = self.clock()
                 if (end_ns is not None and now_ns >= end_ns) or (until is not None and until()):
                     break
+                times.lap(LateCause.OWNER)
                 if stepper.paused:
                     self._paused_step(stepper, pacer)
+                    times.idle()
                 else:
-                    self._tick(stepper, pacer, now_ns)
+                    self._tick(stepper, pacer, times)
                 self._live().watch(stepper)
+                times.lap(LateCause.SUPERVISION)
         pacer.pause(self.clock())  # what nobody asked to run is not late
 
-    def _tick(self, stepper: Stepper, pacer: Pacer, now_ns: int) -> None:
+    def _follow(self, stepper: Stepper, pacer: Pacer) -> TickTimes:
+        """Measures the parts of every tick from here on, for status reports."""
+        times = TickTimes(pacer.period_ns, self.clock)
+        stepper.lap = times.lap
+        reporter = self._live().reporter
+        reporter.pacer, reporter.times, reporter.scheduling = pacer, times, self._scheduling
+        return times
+
+    def _tick(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
         self._asked_ticks = 0
+        now_ns = self.clock()
         pacer.resume(now_ns)
         wait_ns = pacer.next_deadline_ns - now_ns
         if wait_ns > 0:
             time.sleep(wait_ns * 1e-9)
+            times.woke(pacer.next_deadline_ns)
         else:
-            pacer.skip_backlog(now_ns)
+            times.gave_up(pacer.skip_backlog(now_ns))
         stepper.step(1)
-        stepper.lateness_ns = max(stepper.lateness_ns, pacer.finished(self.clock()))
+        lateness_ns = pacer.finished(self.clock())
+        times.finished(lateness_ns)
+        stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
 
     def _paused_step(self, stepper: Stepper, pacer: Pacer) -> None:
         """Zero ticks, or some of those that a director asked for: few, so that an e-stop never waits for many."""
@@ -161,8 +191,8 @@ class Session:
         pacer.pause(self.clock())
         time.sleep(PAUSED_STEP_S)
         decision = stepper.last.decision
-        if decision.step_ticks or decision.reset:
-            self._asked_ticks = decision.step_ticks
+        left = 0 if decision.reset else self._asked_ticks
+        self._asked_ticks = min(left + decision.step_ticks, self.config.authority.max_step_ticks)
         n_ticks = min(self._asked_ticks, PAUSED_STEP_TICKS)
         self._asked_ticks -= n_ticks
         stepper.step(n_ticks)
@@ -179,21 +209,8 @@ class Session:
     @contextmanager
     def signals(self) -> Iterator[None]:
         """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
-        if threading.current_thread() is not threading.main_thread():
+        with stop_signals(self._stop):
             yield
-            return
-
-        def on_signal(number: int, _: FrameType | None) -> None:
-            if self._stop.is_set() and number == signal.SIGINT:
-                raise KeyboardInterrupt  # the second Ctrl-C does not wait
-            self._stop.set()
-
-        previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for s, handler in previous.items():
-                signal.signal(s, handler)
 
     # --- the user's loop ---------------------------------------------------------------------------------------------
 
@@ -208,7 +225,8 @@ class Session:
     def targets(self) -> dict[str, Pose]:
         """End-effector targets `T_world_tip` per robot, for an environment's own controller."""
         self._live()
-        return {} if self._core is None else dict(self._core.controller.targets())
+        with self._unchanging():
+            return {} if self._core is None else dict(self._core.controller.targets())
 
     @classmethod
     def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
@@ -235,9 +253,13 @@ class Session:
                 loop.control_callback()
 
         mujoco.set_mjcb_control(on_control)
-        session._attached = True
+        session._attached, session._callback = True, on_control
         atexit.register(session.close)  # a script may simply end
         return session
+
+    def _unchanging(self) -> AbstractContextManager[object]:
+        """Inside, no step is taken by the helper thread of a user's loop."""
+        return nullcontext() if self._user_loop is None else self._user_loop.lock
 
     def _loop(self) -> UserLoop:
         if self._user_loop is None:
@@ -267,9 +289,12 @@ class Session:
         self.post(Control(request_id=0, action="resume"))
 
     def reset(self) -> None:
-        """Back to the initial state, in a new `scene_epoch`. In a user's loop: tells that the user did so."""
-        owned = self._user_loop is not None
-        self.post(ExternalReset() if owned else Control(request_id=0, action="reset"))
+        """Back to the initial state, in a new `scene_epoch`. In a user's loop: tells that the user does so before the
+        next tick."""
+        if self._user_loop is not None:
+            self._user_loop.reset()
+        else:
+            self.post(Control(request_id=0, action="reset"))
 
     def estop(self, reason: str = "") -> None:
         """Stops every robot, latched. Not a safety-rated stop."""
@@ -282,17 +307,23 @@ class Session:
         """Gives robots to a participant, or frees them, whoever holds them."""
         self.post(Assign(request_id=0, robots=tuple(robots), participant=participant))
 
+    def set_scale(self, robot: str, scale: float) -> None:
+        """How far `robot` moves as its holder's hand moves: 1 as far, 0.1 a tenth. Ends with that holder."""
+        self.post(SetScale(request_id=0, robots=(robot,), scale=scale))
+
     def marker(self, text: str) -> None:
         """A note in the recording."""
         self.post(Marker(request_id=0, text=text))
 
     def status(self) -> SessionStatus:
         """Who is here, who holds what, how late ticks are, what was dropped."""
-        return make_status(self._stepper, self._pacer, self._processes, self._scheduling)
+        with self._unchanging():
+            return make_status(self._stepper, self._pacer, self._processes, self._scheduling)
 
     def recent_events(self) -> list[Event]:
         """The newest events, oldest first (at most 200; the recording has them all)."""
-        return [] if self._stepper is None else list(self._stepper.ledger.recent)
+        with self._unchanging():
+            return [] if self._stepper is None else list(self._stepper.ledger.recent)
 
     @property
     def stepper(self) -> Stepper:
@@ -304,14 +335,24 @@ class Session:
         """Front and recorder, for benchmarks and tests; not part of the public API."""
         return self._live()
 
-    def lateness(self) -> PacerStats | None:
-        """Accounting of ticks of the newest `run()`, None before it."""
-        return None if self._pacer is None else self._pacer.stats(self.clock())
+    def lateness(self, *, anew: bool = False) -> PacerStats | None:
+        """Accounting of ticks of the newest `run()`, None before it. `anew`: its percentiles begin again from here."""
+        return None if self._pacer is None else self._pacer.stats(self.clock(), anew=anew)
 
     @property
     def address(self) -> str:
         """`host:port` of the control channel, which is all that a client needs."""
         return self._live().address
+
+    @property
+    def name(self) -> str:
+        """As the session is known: `config.name`, with a number when another session on the network has that name."""
+        return self.config.name if self._processes is None else self._processes.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What people should know about how the session started: another name, other addresses; one line each."""
+        return () if self._processes is None else tuple(self._processes.notes)
 
     @property
     def recording(self) -> Path | None:
@@ -335,19 +376,16 @@ class Session:
             if not user_owned:
                 self.data = core.world.data
             for message in self._early:
-                self._stepper.post(message)
+                # The data of a user's loop is taken as it is now: there is nothing to go back from.
+                if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
+                    self._stepper.post(message)
         return self._stepper
 
     def _make_core(self, *, user_owned: bool) -> SessionCore:
         """The core for the data as it is now; the one made at the start when nothing has changed since."""
-        authority = msgspec.structs.replace(self.config.authority, user_owned_loop=user_owned)
-        initial = b"" if self.data is None else plant_state(self.model, self.data)
-        config = CoreConfig(authority, self.config.control, self.robots, self.objects, initial)
-        if self._core is None or self._core.config != config:
-            try:
-                self._core = SessionCore(self.model, config)
-            except ControlError:
-                raise
-            except ValueError as error:  # the authority's own check of its numbers and names
-                raise ConfigError(str(error)) from error
+        if self._past is not None:
+            if user_owned:
+                raise OwnershipError("a resumed session is driven by run(): its physics are in the recording")
+            return self._past.core
+        self._core = core_of(self.config, self.model, self.data, self.robots, self.objects, user_owned, self._core)
         return self._core

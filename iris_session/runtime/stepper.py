@@ -15,13 +15,22 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.client_messages import Control, Marker
+from iris_session.protocol.client_messages import Control, GetSnapshot, Marker
 from iris_session.protocol.common import MAX_TEXT, Applied
-from iris_session.protocol.entries import HOST, Entry, EntryMessage, RecordingGap, decode_entry, encode_entry
+from iris_session.protocol.entries import (
+    HOST,
+    Entry,
+    EntryMessage,
+    RecordingGap,
+    SessionResumed,
+    decode_entry,
+    encode_entry,
+)
+from iris_session.protocol.names import LateCause
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.steps import Decision
-from iris_session.recording.journal import JournalRow, Keyframe, make_row
-from iris_session.runtime.core import SessionCore, StepOutcome
+from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
+from iris_session.runtime.core import SessionCore, StepOutcome, unmeasured
 from iris_session.runtime.status import SessionLedger
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
@@ -46,6 +55,8 @@ class RecorderPort(Protocol):
 
     def row(self, row: JournalRow) -> None: ...
 
+    def flush(self) -> None: ...
+
     def keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
 
     def state(
@@ -69,7 +80,8 @@ class Stepper:
     """Drives one `SessionCore` against a front and a recorder.
 
     `clock` gives session time in nanoseconds. `state_period_ns`: how often rigid state is published and recorded.
-    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded).
+    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded). `resumed_from`: newest step
+    and session time of the recording that `core` goes on from.
     """
 
     def __init__(
@@ -81,12 +93,14 @@ class Stepper:
         state_period_ns: int,
         keyframe_period_ns: int,
         chain: bytes = b"",
+        resumed_from: tuple[int, int] | None = None,
     ) -> None:
         self.core = core
         self.front = front
         self.recorder = recorder
         self.clock = clock
-        self.step_count = 0
+        self.step_count = 0 if resumed_from is None else resumed_from[0] + 1
+        self._newest_step = 0
         self.last: StepOutcome | None = None
         self._host: deque[EntryMessage] = deque()
         self._state_period_ns = state_period_ns
@@ -100,7 +114,10 @@ class Stepper:
         #: Called with what was published, and with the entries of every step: for measurements and tests.
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
-        self._last_now_ns = -1
+        #: Called after each part of a step with the `LateCause` that its time counts as. Set by the pacing loop.
+        self.lap: Callable[[str], None] = unmeasured
+        self._resumed_from = resumed_from
+        self._last_now_ns = -1 if resumed_from is None else resumed_from[1]
         self._poses = np.zeros((len(core.world.bodies), 7))
 
     @property
@@ -116,36 +133,55 @@ class Stepper:
             raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
         self._host.append(_checked(message))
 
-    def step(self, n_ticks: int, plant: bytes = b"") -> StepOutcome:
-        """Takes one step now. `plant`: see `SessionCore.step` (open sessions)."""
+    def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:
+        """Takes one step now. `plant`: see `SessionCore.step` (open sessions).
+
+        `publish` false: the state that this step leads to is not there yet, its maker calls `publish` when it is.
+        """
         now_ns = self.clock()
         if now_ns <= self._last_now_ns:  # one step per instant: session time strictly grows
             now_ns = self._last_now_ns + 1
+        if self.last is None and self._resumed_from is not None:
+            n_ticks = 0  # it may be paused
         entries = self._gather(now_ns)
-        if self.step_count == 0:
+        if self.last is None:
             self._keyframe(now_ns)
         self._last_now_ns = now_ns
-        outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None)
+        try:
+            outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.lap)
+        except Exception:
+            if self.recorder is not None:  # what led to it is worth more than all before
+                self.recorder.row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
+                self.recorder.flush()
+            raise
         end_ns = self.clock()
         if self.on_entries is not None:
             self.on_entries(entries)
-        if outcome.diverged and (self.last is None or not self.last.diverged):
+        anew = self.last is None or not self.last.diverged
+        if outcome.diverged and (anew or not (plant or outcome.decision.paused)):  # no resume but by a reset
             if not plant:  # a user's loop is not ours to pause
                 self.post(Control(request_id=0, action="pause"))
             self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
-        self.publish(end_ns)
+        self._newest_step = self.step_count
+        if publish:
+            self.publish(end_ns)
         self.ledger.follow(outcome.decision, outcome.status)
         if self.recorder is not None:
             self._record(self.recorder, now_ns, n_ticks, entries, plant)
         self.step_count += 1
+        self.lap(LateCause.OUTPUT)
         return outcome
 
     def _gather(self, now_ns: int) -> list[Entry]:
         """Host entries first. A long time between two steps is no entry: the authority sees it in `now_ns`."""
         entries = self.front.poll()
         host: list[Entry] = []
+        if self.last is None and self._resumed_from is not None:
+            # The ledger knows nobody yet: it learns the roster as a client would.
+            begin = (SessionResumed(now_ns - self._resumed_from[1]), GetSnapshot())
+            host += [Entry(HOST, HOST, now_ns, message) for message in begin]
         while self._host:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
         return host + entries if host else entries
@@ -167,7 +203,7 @@ class Stepper:
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:
-            self.recorder.state(self.step_count, tick, sim_time, end_ns, self._poses, applied)
+            self.recorder.state(self._newest_step, tick, sim_time, end_ns, self._poses, applied)
             self.recorder.metric("lateness_ms", self.lateness_ns * 1e-6)
             self.lateness_ns = 0
 
@@ -188,12 +224,12 @@ class Stepper:
             self._keyframe(now_ns)
 
     def _keyframe(self, now_ns: int) -> None:
-        """Stores the state after the newest step (-1: the initial state), so that verification can begin there."""
+        """Stores the state after the newest step, first that before any, so that verification can begin there."""
         if self.recorder is None:
             return
         self._next_keyframe_ns = now_ns + self._keyframe_period_ns
         state = self.core.snapshot()
-        step = self.step_count if self.last is not None else -1
+        step = self.step_count if self.last is not None else self.step_count - 1
         frame = Keyframe(step, state.plant, state.authority, state.controller, state.status)
         self.recorder.keyframe(frame, self._chain)
 

@@ -9,6 +9,9 @@ robots hold, everyone is told, and must clutch again afterwards.
 
 A helper thread takes zero-tick steps, on the twin alone, when the user's loop is silent for 20 ms: leases, heartbeats
 and e-stops go on while a script plots, trains or waits at a prompt.
+
+What one step computes is applied until the next `begin_tick`, however many `mj_step` lie between: control counts the
+ticks of the round before, so that robots keep their speed. At the end robots are left at rest.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import numpy as np
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import ExternalReset, StalledGap
 from iris_session.runtime.core import plant_state
+from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.stepper import Stepper
 
@@ -31,10 +35,15 @@ IDLE_PERIOD_S: Final = 0.01
 #: Silence after which robots must be clutched again (the freshness bound of samples). The authority cannot see it,
 #: because zero-tick steps go on meanwhile.
 GAP_NS: Final = 150_000_000
+#: Most ticks that control takes for one round of the user's loop; a time that jumps further is no motion.
+MAX_TICKS: Final = 100
 
 
 class UserLoop:
-    """Ties a stepper to the user's `model` and `data`. All methods but `close` belong to the user's thread."""
+    """Ties a stepper to the user's `model` and `data`. All methods but `close` and `reset` belong to the user's thread.
+
+    `lock`: held while a step is taken; hold it to read what steps change.
+    """
 
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, stepper: Stepper, processes: SessionProcesses
@@ -47,7 +56,7 @@ class UserLoop:
         names = [a for r in config.robots for a in (*r.actuators, r.gripper_actuator) if a]
         self._actuators = [model.actuator(name).id for name in names]
         self._objects = [model.body(spec.body).id for spec in config.objects]
-        self._lock = threading.Lock()
+        self.lock = threading.RLock()
         self._closed = threading.Event()
         self._diverged = False
         self._diverged_ns = 0
@@ -55,15 +64,22 @@ class UserLoop:
         self._plant = plant_state(model, data)
         self._last_tick_ns = stepper.clock()
         self._last_time = -1.0
+        self._began_time: float | None = None  # of the newest round, None after a reset
+        self._calls = -1  # of MuJoCo's functions on the data, at the last callback
+        self._in_tick = False
+        self._was_reset = False
+        self._wrote = False
         self._helper_error: BaseException | None = None
         self._helper = threading.Thread(target=self._idle, name="iris-session-idle", daemon=True)
         self._helper.start()
 
     def begin_tick(self) -> None:
-        """One step with one tick: writes `ctrl` (and wrenches on hand-held objects) into the user's data."""
-        with self._lock:
-            if self._helper_error is not None:
-                raise self._helper_error
+        """One step: writes `ctrl` (and wrenches on hand-held objects) into the user's data. Ends a tick that began."""
+        with self.lock:
+            self._check_open()
+            if self._in_tick:
+                self._end()
+            self._in_tick = True
             self._follow_time()
             now_ns = self._stepper.clock()
             silence_ns = now_ns - self._last_tick_ns
@@ -73,39 +89,84 @@ class UserLoop:
             if not self._take_plant():
                 self._stepper.step(0, self._plant)
                 return
-            self._stepper.step(1, self._plant)
-            twin = self._stepper.core.world.data
-            self._data.ctrl[self._actuators] = twin.ctrl[self._actuators]
-            self._data.xfrc_applied[self._objects] = twin.xfrc_applied[self._objects]
+            self._tell_reset()
+            self._stepper.step(self._ticks(), self._plant, publish=False)
+            self._apply()
+            self._wrote = True
 
     def end_tick(self) -> None:
-        """Publishes what the user's `mj_step` made."""
-        with self._lock:
-            if self._take_plant():
-                self._stepper.core.world.set_state_bytes(self._plant)
-            self._stepper.publish(self._stepper.clock())
+        """Publishes what the user's `mj_step` made. Raises `OwnershipError` when no tick began."""
+        with self.lock:
+            self._check_open()
+            if not self._in_tick:
+                raise OwnershipError("end_tick() ends a tick: call begin_tick() before it, then mj_step")
+            if self._end():
+                self._tell_reset()  # the next step, be it the helper's, is on the state after it
             self._last_tick_ns = self._stepper.clock()
-            self._follow_time()
-            self._processes.watch(self._stepper)
 
     def control_callback(self) -> None:
         """MuJoCo asks for controls at the present state: a tick if time has moved, nothing for `mj_forward`."""
-        if self._data.time == self._last_time:
-            return
-        self.begin_tick()
-        self._processes.watch(self._stepper)
+        # A reset after exactly one step leaves the time of the last callback. MuJoCo counts its calls on the data and a
+        # reset begins anew, but so does the passive viewer at every sync; only a reset forgets the warm start too.
+        calls = int(self._data.timer.number.sum())
+        counted_anew, self._calls = calls <= self._calls, calls
+        if counted_anew and self._data.time == self._last_time and not self._data.qacc_warmstart.any():
+            self.reset()
+        if self._was_reset or self._data.time != self._last_time:
+            self.begin_tick()
+
+    def reset(self) -> None:
+        """The user has put the data into another state, or is about to: robots hold where the next tick finds them."""
+        self._was_reset = True
 
     def close(self) -> None:
-        """Ends the helper thread."""
+        """Ends the helper thread and leaves the robots of the user's data at rest, without our forces on objects."""
         self._closed.set()
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
+        with self.lock:
+            if self._wrote and self._take_plant():
+                self._wrote = False
+                self._stepper.core.rest(self._plant)
+                self._apply()
 
-    def _follow_time(self) -> None:
+    def _check_open(self) -> None:
+        if self._closed.is_set():
+            raise OwnershipError("the session is closed: no tick can be taken any more")
+        if self._helper_error is not None:
+            raise self._helper_error
+
+    def _end(self) -> bool:
+        """True when the state that was taken is one after time went back."""
+        self._in_tick = False
+        went_back = self._follow_time()
+        good = self._take_plant()
+        if good and not self._was_reset:  # the epoch of a state after a reset is that of the next step
+            self._stepper.core.world.set_state_bytes(self._plant)
+            self._stepper.publish(self._stepper.clock())
+        self._processes.watch(self._stepper)
+        return good and went_back
+
+    def _apply(self) -> None:
+        """`ctrl` of the robots and wrenches on the objects, from the twin into the user's data."""
+        twin = self._stepper.core.world.data
+        self._data.ctrl[self._actuators] = twin.ctrl[self._actuators]
+        self._data.xfrc_applied[self._objects] = twin.xfrc_applied[self._objects]
+
+    def _ticks(self) -> int:
+        """Ticks that this round stands for: as many as the one before took, if any time passed in it."""
+        began, self._began_time = self._began_time, float(self._data.time)
+        if began is None:
+            return 1
+        return min(MAX_TICKS, max(1, round((self._began_time - began) / float(self._model.opt.timestep))))
+
+    def _follow_time(self) -> bool:
         """Time that goes back is a reset: by the user between two ticks, or by MuJoCo itself within `mj_step`."""
-        if self._data.time < self._last_time:
-            self._stepper.post(ExternalReset())
+        went_back = bool(self._data.time < self._last_time)
+        if went_back:
+            self.reset()
         self._last_time = self._data.time
+        return went_back
 
     def _take_plant(self) -> bool:
         """Reads the user's state; False, and said once, while it is not finite."""
@@ -118,16 +179,24 @@ class UserLoop:
         elif self._diverged and not diverged:
             self._stepper.post(StalledGap(self._stepper.clock() - self._diverged_ns))
         self._diverged = diverged
-        if not diverged:
-            self._plant = plant
-        return not diverged
+        if diverged:
+            return False
+        self._plant = plant
+        return True
+
+    def _tell_reset(self) -> None:
+        """The step that reads a reset must be one on the state after it."""
+        if self._was_reset:
+            self._was_reset = False
+            self._began_time = None
+            self._stepper.post(ExternalReset())
 
     def _idle(self) -> None:
         try:
             while not self._closed.wait(IDLE_PERIOD_S):
                 if self._stepper.clock() - self._last_tick_ns <= IDLE_AFTER_NS:
                     continue
-                with self._lock:
+                with self.lock:
                     if self._stepper.clock() - self._last_tick_ns > IDLE_AFTER_NS and not self._closed.is_set():
                         self._stepper.step(0, self._plant)
                         self._processes.watch(self._stepper)

@@ -9,7 +9,7 @@ import msgspec
 
 from iris_session.physics import model_from_bytes
 from iris_session.protocol.entries import Entry
-from iris_session.recording import Keyframe, SessionHeader, VerifyReport, unpack_model, verify
+from iris_session.recording import Keyframe, SessionHeader, VerifyReport, blas, unpack_model, verify
 from iris_session.runtime.core import CoreConfig, CoreState, SessionCore
 
 
@@ -17,6 +17,7 @@ class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
     def __init__(self, header: SessionHeader) -> None:
+        blas.use_one_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
         self.core = SessionCore(model_from_bytes(unpack_model(header.model)), config)
 

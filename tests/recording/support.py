@@ -202,7 +202,7 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
     return header, batch
 
 
-def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
+def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20, continues_in: int = 0) -> Path:
     """A finished file with this content."""
     writer = RrdWriter(path, "id")
     writer.header(header)
@@ -212,5 +212,5 @@ def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int =
         batch.keyframes = [k for k in batch.keyframes if k not in keyframes]
         writer.add(Batch(rows=batch.rows[i : i + rows_per_chunk], keyframes=keyframes))
         writer.flush()
-    writer.close()
+    writer.close(continues_in)
     return path

@@ -61,6 +61,9 @@ def test_a_long_recording_goes_on_in_parts(tmp_path: Path) -> None:
     assert report.steps == session.step_count
     with Recording.open(path) as recording:
         assert len(list(recording.states())) == len(session.poses)
+    Path(part_path(str(path), report.parts)).unlink()
+    report = verify(path, SmallCore)
+    assert (report.ok, report.finished, len(report.missing)) == (False, False, 1), report.line()
 
 
 def test_rerun_itself_takes_the_file(tmp_path: Path) -> None:
@@ -261,6 +264,32 @@ def test_a_full_disk_is_said_and_the_session_goes_on_elsewhere(tmp_path: Path) -
     report = verify(path, SmallCore)
     assert report.steps == 300
     assert report.ok, report.line()
+
+
+def test_a_part_that_cannot_be_begun_leaves_no_file(tmp_path: Path) -> None:
+    """The disk stays full for a while: each attempt takes the same number, and nothing is missing afterwards."""
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        wait_until(lambda: _status(feed).written >= 4)
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        os.kill(process.pid, signal.SIGKILL)
+        wait_until(lambda: not process.alive)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+        try:
+            process.restart()
+            wait_until(lambda: not process.alive)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not os.path.exists(part_path(str(path), 2))
+        process.restart()
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.parts, report.notes) == (100, 2, [])
 
 
 def _no_memory(*_: object, **__: object) -> None:

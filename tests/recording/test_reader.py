@@ -79,7 +79,9 @@ def test_a_damaged_message_is_left_out_and_the_rest_is_read(path: Path) -> None:
     for i in range(victim.offset + 60, victim.offset + victim.length, 7):
         data[i] ^= 0xFF
     path.write_bytes(data)
-    with Recording.open(path) as recording:
+    with pytest.warns(UserWarning, match="is damaged"):
+        recording = Recording.open(path)
+    with recording:
         steps = [row.step for row in recording.rows()]
         assert steps[0] == 0
         assert steps[-1] == 199
@@ -104,13 +106,49 @@ def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) ->
 
 
 def test_an_empty_part_is_said_and_skipped(tmp_path: Path, path: Path) -> None:
+    """A recorder that could not begin its file (the disk was full) has lost nothing by that."""
     Path(part_path(str(path), 2)).write_bytes(b"")
+    Path(part_path(str(path), 3)).write_bytes(path.read_bytes()[:40])
     with Recording.open(path) as recording:
         assert len(list(recording.rows())) == 200
-        assert "part2" in recording.damage[0]
+        assert [note.partition(":")[0] for note in recording.notes] == ["session.part2.rrd", "session.part3.rrd"]
+    report = verify(path, SmallCore)
+    assert report.ok, report.line()
+    assert "part2" in report.line()
 
 
-@pytest.mark.parametrize(("data", "reason"), [(None, "no recording"), (b"", "not a Rerun"), (b"x" * 99, "not a Rerun")])
+def test_a_part_that_is_missing_at_the_end_or_between_is_found(tmp_path: Path) -> None:
+    header, batch = journal(200)
+    rows, keyframes = batch.rows, batch.keyframes
+    files = [tmp_path / name for name in ("session.rrd", "session.part2.rrd", "session.part3.rrd")]
+    for i, file in enumerate(files):
+        batch.rows, batch.keyframes = rows[i * 70 : i * 70 + 70], keyframes[i * 2 : i * 2 + 2]
+        write(file, header, batch, continues_in=(i + 2) % 4)
+    report = verify(files[0], SmallCore)
+    assert report.ok, report.line()
+    assert report.finished
+    assert "session.part3.rrd" in report.line()
+    late = files[2].rename(tmp_path / "elsewhere")
+    report = verify(files[0], SmallCore)
+    assert (report.ok, report.finished) == (False, False)
+    assert report.missing == ["session.part3.rrd is missing"]
+    late.rename(files[2])
+    files[1].unlink()
+    with pytest.warns(UserWarning, match="part2"):
+        recording = Recording.open(files[0])
+    with recording:
+        assert [row.step for row in recording.rows()][-1] == 199
+    report = verify(files[0], SmallCore)
+    assert report.gaps == [(70, 139)]
+    assert (report.ok, report.missing) == (False, ["session.part2.rrd is missing"])
+    files[0].unlink()
+    with Recording.open(files[2]) as recording:
+        assert recording.finished
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"), [(None, "no recording"), (b"", "nothing was written"), (b"x" * 99, "not a Rerun")]
+)
 def test_what_is_no_recording_is_one_line(tmp_path: Path, data: bytes | None, reason: str) -> None:
     path = tmp_path / "x.rrd"
     if data is not None:

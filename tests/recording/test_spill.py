@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,23 @@ def test_the_limit_refuses_and_says_so(tmp_path: Path) -> None:
     spill.close()
 
 
+def test_the_limit_is_on_what_waits(tmp_path: Path) -> None:
+    """A queue that is never empty goes round in its file; sizes and order are those of a plain queue."""
+    spill, rng, plain, most = SpillFile(tmp_path / "s", 1000), random.Random(1), [], 0
+    for i in range(3000):
+        data = bytes([i % 256]) * rng.randrange(1, 120)
+        if spill.push(data, i, 2):
+            plain.append((data, i))
+        while len(plain) > rng.randrange(2, 12):
+            assert spill.pop() == plain.pop(0)
+        assert (len(spill), spill.rows, spill.others) == (len(plain), sum(n for _, n in plain), 2 * len(plain))
+        assert spill.waiting_bytes == sum(len(d) + 12 for d, _ in plain)
+        most = max(most, os.fstat(spill._fd).st_size)
+    assert spill.push(b"x" * 100, 0)
+    assert most <= 1000
+    spill.close()
+
+
 def test_a_folder_that_cannot_be_written_refuses(tmp_path: Path) -> None:
     spill = SpillFile(tmp_path / "missing" / "s", 1 << 20)
     assert not spill.push(b"x", 1)
@@ -46,7 +64,7 @@ def test_a_file_that_cannot_be_read_back_is_an_error(tmp_path: Path) -> None:
         spill.push(b"x" * 100, 10)
     os.ftruncate(spill._fd, 150)
     assert spill.pop() == (b"x" * 100, 10)
-    with pytest.raises(OSError, match="holds 34 of 100 bytes"):
+    with pytest.raises(OSError, match="holds 26 of 100 bytes"):
         spill.pop()
     assert spill.rows == 20
     spill.close()

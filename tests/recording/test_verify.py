@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.recording import Recording, SessionHeader, verify
-from iris_session.recording.journal import Keyframe, make_row, seal
+from iris_session.recording.journal import CRASHED, Keyframe, make_row, seal
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
 
@@ -50,6 +51,24 @@ def test_a_changed_field_is_named_with_its_step(path: Path, field: str) -> None:
     changed = [p for p in report.problems if p.kind == "changed"]
     assert len(changed) == 1, "the rows behind it are as they were"
     assert report.steps == (200 if field in {"digest", "chain"} else 171)
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_a_step_that_ended_the_session_is_shown(path: Path, again: bool) -> None:
+    class Core(SmallCore):
+        def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
+            if again and now_ns == last.now_ns + 1:
+                raise KeyError("the\nreason")
+            return super().step(now_ns, entries, n_ticks, plant)
+
+    header, batch = journal(200)
+    last = batch.rows[-1]
+    batch.rows.append(make_row(last.chain, 200, last.now_ns + 1, 1, [], CRASHED))
+    report = verify(write(path, header, batch), Core)
+    assert report.ok
+    assert report.steps == 201
+    assert "an error in step 200 ended the session" in report.line()
+    assert ("comes again: KeyError" if again else "does not come again") in report.crash
 
 
 def test_a_changed_step_number_is_no_gap(path: Path) -> None:
@@ -106,7 +125,7 @@ def test_missing_first_and_last_rows_are_found(path: Path) -> None:
     assert report.gaps == [(0, 9)]
     with Recording.open(full) as recording:
         assert recording.end is not None
-        assert recording.end[0] == 199
+        assert recording.end.step == 199
 
 
 def test_a_rewritten_journal_is_told_by_the_simulation(path: Path) -> None:

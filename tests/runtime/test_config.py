@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
+import sys
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
 
-from iris_session import ConfigError, SessionConfig, SessionError
+from iris_session import ConfigError, Session, SessionConfig, SessionError, StartError
+from iris_session.control import ControlConfig
 
 
 @pytest.mark.parametrize(
@@ -18,6 +23,8 @@ from iris_session import ConfigError, SessionConfig, SessionError
         ({"name": "x" * 49}, "1 to 48"),
         ({"control_port": -1}, "control_port -1 is not a port"),
         ({"state_port": 65536}, "state_port 65536"),
+        ({"beacon_port": 70000}, "beacon_port 70000"),
+        ({"advertise": "lab:pc/7"}, "an address without port"),
         ({"state_hz": 0.5}, "1 to 240"),
         ({"state_hz": float("nan")}, "1 to 240"),
         ({"keyframe_s": 0.0}, "0.5 to 60"),
@@ -43,3 +50,47 @@ def test_where_it_records_to() -> None:
 
 def test_defaults_listen_on_loopback_only() -> None:
     assert SessionConfig().host == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"name": 5}, "name must be str, not int 5"),
+        ({"control_port": "7721"}, "control_port must be int"),
+        ({"state_hz": True}, "state_hz must be float"),
+        ({"record": 3}, r"record must be bool \| str \| Path"),
+        ({"interfaces": "eth0"}, "interfaces must be tuple"),
+        ({"authority": ControlConfig()}, "authority must be AuthorityConfig, not ControlConfig"),
+        ({"anchors": {"a": (0.0, 0.0, 0.0)}}, r"anchor 'a': .* must be T_world_anchor as"),
+        ({"anchors": {"a": ((0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}}, "must be T_world_anchor as"),
+        ({"anchors": {"a": ((0.0, 0.0, math.nan), (1.0, 0.0, 0.0, 0.0))}}, "not finite"),
+        ({"anchors": {"a": ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))}}, "has length 1.41, it must be 1"),
+    ],
+)
+def test_wrong_types_and_anchors_say_what_is_right(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        SessionConfig(**fields)
+
+
+def test_what_is_no_scene_says_what_is_right() -> None:
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    other = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    for arguments, error, text in (
+        ((mujoco.MjSpec(),), TypeError, "call its compile"),
+        ((model, SessionConfig()), TypeError, "data must be MjData"),
+        ((model, None, {"name": "x"}), TypeError, "config must be a SessionConfig, not dict"),
+        ((model, mujoco.MjData(other)), ConfigError, "data is of another model: it has 7 positions"),
+    ):
+        with pytest.raises(error, match=text):
+            Session(*arguments)  # type: ignore[arg-type]
+
+
+def test_recording_without_rerun_is_said_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rerun" else find(name))
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "x.rrd")
+    with pytest.raises(StartError, match=r"iris-session\[recording\]"):
+        Session(mujoco.MjModel.from_xml_string("<mujoco/>"), config=config).start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -19,6 +20,25 @@ def test_it_is_given_back() -> None:
     assert reached in ("realtime", "normal")
     assert (inside & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR) == (reached == "realtime")
     assert os.sched_getscheduler(0) == before
+
+
+#: Root has `CAP_SYS_NICE` until it becomes somebody else; whoever has an `rtprio` limit never had it.
+WITHOUT_CAPABILITY = """
+import os
+from iris_session.runtime.scheduling import tick_priority
+with tick_priority() as reached:
+    if os.getuid() == 0:
+        os.setuid(65534)
+    inside = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+print(reached, inside == os.SCHED_RR, os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER)
+"""
+
+
+def test_it_is_given_back_without_the_capability() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_CAPABILITY], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() in (["realtime", "True", "True"], ["normal", "False", "True"])
 
 
 def test_without_permission_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +18,8 @@ from iris_session.control import ControlConfig, ControlError
 from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol.client_messages import Control
-from iris_session.protocol.server_messages import EStopChanged, MarkerAdded, PauseChanged, SceneChanged
+from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
+from iris_session.runtime.verification import verify_recording
 
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
 
@@ -45,7 +49,7 @@ def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
     session.run(until=lambda: session.status().estop)
     session.clear_estop()
     session.run(until=lambda: not session.status().estop)
-    kinds = [type(body) for body in _bodies(session)]
+    kinds = [type(body) for body in _bodies(session) if not isinstance(body, Gap)]  # of a busy machine
     # The e-stop takes the urgent lane, before what was said with it.
     assert kinds == [EStopChanged, PauseChanged, PauseChanged, SceneChanged, EStopChanged]
 
@@ -61,6 +65,19 @@ def test_ticks_asked_for_while_paused_are_taken_a_few_at_a_time(session: Session
     assert session.stepper.step_count - steps >= 5
     session.run(seconds=0.05)
     assert session.status().tick - start == 35
+
+
+def test_ticks_asked_for_twice_are_all_taken(session: Session) -> None:
+    session.pause()
+    session.run(until=lambda: session.status().paused)
+    start = session.status().tick
+    for ticks in (25, 5):
+        session.post(Control(request_id=0, action="step", ticks=ticks))
+    session.run(until=lambda: session.status().tick - start >= 10)
+    session.post(Control(request_id=0, action="step", ticks=7))
+    session.run(until=lambda: session.status().tick - start >= 37)
+    session.run(seconds=0.05)
+    assert session.status().tick - start == 37
 
 
 def test_run_ends_after_its_seconds_and_from_another_thread(session: Session) -> None:
@@ -144,3 +161,75 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "taken" / "session.rrd")
     with pytest.raises(StartError, match="taken"):
         Session(scene_path("handover"), config=config).start()
+
+
+def test_a_start_that_failed_can_be_tried_again(tmp_path: Path) -> None:
+    blocked = tmp_path / "session.rrd"
+    blocked.write_bytes(b"somebody else's")
+    config = SessionConfig(control_port=0, state_port=0, record=blocked, realtime=False)
+    session = Session(scene_path("handover"), config=config)
+    with pytest.raises(StartError, match="never overwritten"):
+        session.start()
+    blocked.unlink()
+    with session:
+        session.run(seconds=0.05)
+        assert session.status().tick > 1
+    assert session.close()
+    assert not session.recording_fault
+
+
+def test_a_recording_that_ends_early_is_said(tmp_path: Path) -> None:
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)
+    session = Session(scene_path("handover"), config=config)
+    session.start()
+    session.run(seconds=0.1)
+    os.kill(session.processes.recorder_pid, signal.SIGKILL)
+    before = time.monotonic()
+    assert not session.close()
+    assert time.monotonic() - before < 4.0, "nobody waits for a recorder that is gone"
+    assert "killed by signal 9" in session.recording_fault
+
+
+def test_a_recorder_that_was_just_replaced_gets_its_time(tmp_path: Path) -> None:
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)
+    with Session(scene_path("handover"), config=config) as session:
+        session.run(seconds=0.3)
+        os.kill(session.processes.recorder_pid, signal.SIGKILL)
+        session.run(until=lambda: session.status().restarts["recorder"] == 1)
+        session.run(seconds=0.05)
+    assert not session.recording_fault
+    report = verify_recording(tmp_path / "session.rrd")
+    assert report.ok, report.line()
+    assert (report.parts, report.finished) == (2, True)
+
+
+def test_dropped_contacts_are_said_once_and_counted() -> None:
+    """MuJoCo without room for contacts goes on silently: things fall through each other."""
+    boxes = "".join(
+        f'<body pos="0 0 {0.09 + 0.02 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(20)
+    )
+    xml = f'<mujoco><size memory="300K"/><worldbody><geom type="plane" size="1 1 1"/>{boxes}</worldbody></mujoco>'
+    with Session(mujoco.MjModel.from_xml_string(xml), config=QUIET) as session:
+        session.run(until=lambda: any("MuJoCo:" in str(body) for body in _bodies(session)))
+        before = sum(count for reason, count in session.status().drops.items() if "dropped" in reason)
+        assert before > 0
+        session.reset()
+        session.run(seconds=0.3)
+        assert sum(count for reason, count in session.status().drops.items() if "dropped" in reason) >= before
+        texts = [body.text for body in _bodies(session) if isinstance(body, MarkerAdded)]
+        assert len([text for text in texts if "MuJoCo:" in text]) == len({t for t in texts if "MuJoCo:" in t})
+
+
+def test_a_diverged_session_is_resumed_by_a_reset_only(session: Session) -> None:
+    session.run(seconds=0.05)
+    session.data.qpos[0] = float("nan")
+    session.run(until=lambda: session.status().paused)
+    told = len([body for body in _bodies(session) if isinstance(body, MarkerAdded)])
+    session.resume()
+    session.run(until=lambda: len([b for b in _bodies(session) if isinstance(b, MarkerAdded)]) > told)
+    session.run(until=lambda: session.status().paused)
+    session.reset()
+    session.resume()
+    tick = session.status().tick
+    session.run(until=lambda: not session.status().paused and session.status().tick > 5)
+    assert tick >= 0

@@ -15,7 +15,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.entries import HOST, Entry, RecordingGap, decode_entries
 from iris_session.protocol.server_messages import Gap, StateHeader
 from iris_session.protocol.steps import Decision
-from iris_session.recording.journal import JournalRow, Keyframe, check_row
+from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
 from iris_session.transport import link_messages
 from tests.runtime.play import TICK_NS, entries, make_core
@@ -57,6 +57,9 @@ class Recorder:
 
     def row(self, row: JournalRow) -> None:
         self.rows.append(row)
+
+    def flush(self) -> None:
+        self.flushed = len(self.rows)
 
     def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         assert chain == (self.rows[-1].chain if self.rows else b"root")
@@ -120,6 +123,20 @@ def test_every_step_is_a_row_of_one_chain(rig: Rig) -> None:
         assert check_row(chain, row) is None
         chain = row.chain
     assert len(rig.recorder.rows) == 120
+
+
+def test_the_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
+    rig.steps(3)
+    rig.stepper.post(Marker(0, "the last words"))
+    step = rig.stepper.core.controller.begin
+    rig.stepper.core.controller.begin = lambda *_: {}["key"]  # type: ignore[method-assign,assignment]
+    with pytest.raises(KeyError):
+        rig.steps(1)
+    row = rig.recorder.rows[-1]
+    assert (row.step, row.digest, rig.recorder.flushed) == (3, CRASHED, 4)
+    assert check_row(rig.recorder.rows[-2].chain, row) is None
+    assert [e.message for e in decode_entries(row.entries)] == [Marker(0, "the last words")]
+    rig.stepper.core.controller.begin = step  # type: ignore[method-assign]
 
 
 def test_keyframes_at_the_start_and_at_their_distance(rig: Rig) -> None:

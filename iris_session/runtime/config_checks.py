@@ -1,0 +1,83 @@
+"""Checks of what a session is given in Python: types and anchors, each mistake one line that says what is right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from types import NoneType
+from typing import Any, Final
+
+import msgspec
+import mujoco
+import numpy as np
+
+from iris_session.runtime.errors import ConfigError
+
+#: Annotations of `SessionConfig`, and what may stand there. A bool is no number.
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (float, int),
+    "bool": (bool,),
+    "bool | str | Path": (bool, str, Path),
+    "str | Path | None": (str, Path, NoneType),
+    "tuple[str, ...]": (tuple,),
+    "Mapping[str, PoseTuple]": (Mapping,),
+    "AuthorityConfig": (msgspec.Struct,),
+    "ControlConfig": (msgspec.Struct,),
+}
+#: Quaternions of people's files have few digits.
+UNIT_TOLERANCE: Final = 1e-3
+
+
+def check_types(config: Any) -> None:
+    """Raises `ConfigError` for a field of another type than its annotation says."""
+    for item in fields(config):
+        value, annotation = getattr(config, item.name), str(item.type)
+        kinds = _KINDS.get(annotation, (object,))
+        right = isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
+        if kinds == (msgspec.Struct,):
+            right = type(value).__name__ == annotation
+        if kinds == (tuple,):
+            right = right and all(isinstance(part, str) for part in value)
+        if not right:
+            raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
+
+
+def check_anchors(anchors: Mapping[str, Any]) -> None:
+    """Raises `ConfigError` for a pose that is no `((x, y, z), (w, x, y, z))` in metres, finite, of unit length."""
+    for name, pose in anchors.items():
+        where = f"anchor {name!r}: {pose!r:.80}"
+        try:
+            p, q = (tuple(float(v) for v in part) for part in pose)
+        except (TypeError, ValueError):
+            p, q = (), ()
+        if not isinstance(name, str) or (len(p), len(q)) != (3, 4):
+            raise ConfigError(
+                f"{where} must be T_world_anchor as ((x, y, z), (w, x, y, z)), metres and unit quaternion"
+            )
+        if not all(map(math.isfinite, (*p, *q))):
+            raise ConfigError(f"{where} holds a number that is not finite")
+        if abs(math.hypot(*q) - 1.0) > UNIT_TOLERANCE:
+            raise ConfigError(f"{where}: the quaternion (w, x, y, z) has length {math.hypot(*q):.3g}, it must be 1")
+
+
+def check_arguments(model: object, data: object, config: object) -> None:
+    """Raises `TypeError` for what is no model, data and `SessionConfig`, `ConfigError` for data of another model."""
+    if type(config).__name__ != "SessionConfig":
+        raise TypeError(f"config must be a SessionConfig, not {type(config).__name__}: Session(model, data, config)")
+    if not isinstance(model, mujoco.MjModel):
+        kind = type(model).__name__
+        advice = "; call its compile() first" if kind == "MjSpec" else ""
+        raise TypeError(f"model must be an MjModel or the path of a model file, not {kind}{advice}")
+    if data is None:
+        return
+    if not isinstance(data, mujoco.MjData):
+        raise TypeError(f"data must be MjData of the model, not {type(data).__name__}: Session(model, data, config)")
+    if np.shape(data.qpos) != (model.nq,) or np.shape(data.ctrl) != (model.nu,):
+        raise ConfigError(
+            f"data is of another model: it has {np.size(data.qpos)} positions and {np.size(data.ctrl)} controls, "
+            f"the model {model.nq} and {model.nu}"
+        )

@@ -1,0 +1,52 @@
+"""Other sessions on the network while ours starts: nobody shall take one for the other by its name."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from iris_session.client import ClientError
+from iris_session.client.discovery import BeaconListener
+
+#: Beacons come five times a second: who is there is heard twice in this time.
+LISTEN_S: Final = 0.5
+MAX_NAME: Final = 48  # as `SessionConfig.name`
+
+
+class Neighbours:
+    """Listens from when it is made, beside whatever else starts; never when `port` is 0.
+
+    `notes`: what people should be told.
+    """
+
+    def __init__(self, port: int) -> None:
+        self.notes: list[str] = []
+        self._until = time.monotonic() + LISTEN_S
+        self._listener: BeaconListener | None = None
+        if port:
+            try:
+                self._listener = BeaconListener(port)
+            except ClientError as error:
+                self.notes.append(f"other sessions cannot be heard: {error}")
+
+    def free_name(self, name: str, session_id: str = "") -> str:
+        """`name`, or with a number when a session other than `session_id` has it. Waits for the rest of `LISTEN_S`."""
+        if self._listener is None:
+            return name
+        while (left := self._until - time.monotonic()) > 0.0:
+            self._listener.wait(left)
+            self._listener.sessions()
+        heard = {
+            session.name: session.address for session in self._listener.sessions() if session.session_id != session_id
+        }
+        if name not in heard:
+            return name
+        numbered = (f"{name[: MAX_NAME - 4]}-{n}" for n in range(2, len(heard) + 3))
+        free = next(one for one in numbered if one not in heard)
+        self.notes.append(f"another session called {name!r} is at {heard[name]}: this one is called {free!r}")
+        return free
+
+    def close(self) -> None:
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None

@@ -1,0 +1,127 @@
+"""`resume.tokens` beside a recording: what of a running session is in no journal, kept for `serve --resume`.
+
+The memory of its front (hashes of resume tokens, connection numbers) and where it listened. Readable by its owner
+only. Written by a thread of its own whenever it changes, as a whole and durably: a disk that hangs delays no step.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+import tempfile
+import threading
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.discovery import DISCOVERY_PORT
+from iris_session.recording.paths import split_part, split_resume
+
+FILE: Final = "resume.tokens"
+#: Changes that come faster are written together.
+PERIOD_S: Final = 0.05
+MAX_BYTES: Final = 4_000_000
+_log = logging.getLogger(__name__)
+_decode = msgspec.msgpack.Decoder
+
+
+class Listening(msgspec.Struct, frozen=True):
+    """Where a session listened, as in `SessionConfig`; ports as they were in the end."""
+
+    host: str = ""
+    interfaces: tuple[str, ...] = ()
+    advertise: str = ""
+    beacon_port: int = DISCOVERY_PORT
+    control_port: int = 0
+    state_port: int = 0
+    curve: bool = False
+    curve_key: str = ""
+    curve_clients: str = ""
+
+
+class ResumeNote(msgspec.Struct, frozen=True):
+    """`handback`: opaque memory of the newest front."""
+
+    session_id: str
+    listening: Listening = Listening()
+    handback: bytes = b""
+
+
+def note_path(recording: Path) -> Path:
+    """The note of the session whose recording this is, or one of its later ones."""
+    first, _ = split_resume(split_part(str(recording))[0])
+    stem = Path(first).stem
+    return Path(first).with_name(FILE if stem == "session" else f"{stem}.{FILE}")
+
+
+def read_note(recording: Path, session_id: str) -> tuple[ResumeNote | None, str]:
+    """The note of session `session_id`, and why there is none that can be used."""
+    path = note_path(recording)
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            data = file.read(MAX_BYTES)
+    except FileNotFoundError:
+        return None, f"there is no {path.name}"
+    except OSError as error:
+        return None, f"{path.name} cannot be read: {error.strerror}"
+    if stat.S_IMODE(status.st_mode) & 0o077 or status.st_uid != os.geteuid():
+        return None, f"{path.name} is not ours alone, so it is not trusted: chmod 600 {path}"
+    try:
+        note = _decode(ResumeNote).decode(data)
+    except msgspec.DecodeError as error:
+        return None, f"{path.name} is damaged: {error}"
+    if note.session_id != session_id:
+        return None, f"{path.name} is of another session"
+    return note, ""
+
+
+class NoteKeeper:
+    """Keeps the note of one session. `offer` never waits; `close` writes what is left, for at most `patience_s`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._note: ResumeNote | None = None
+        self._changed = threading.Event()
+        self._closed = threading.Event()
+        self._warned = False
+        self._thread = threading.Thread(target=self._run, name="iris-session-note", daemon=True)
+        self._thread.start()
+
+    def offer(self, note: ResumeNote) -> None:
+        """Another note, to be written soon."""
+        if note != self._note:
+            self._note = note
+            self._changed.set()
+
+    def close(self, patience_s: float = 0.5) -> None:
+        self._closed.set()
+        self._changed.set()
+        self._thread.join(patience_s)
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            self._changed.wait()
+            self._closed.wait(PERIOD_S)
+            self._changed.clear()
+            if self._note is not None:
+                self._write(self._note)
+
+    def _write(self, note: ResumeNote) -> None:
+        try:
+            descriptor, temporary = tempfile.mkstemp(prefix=f".{self._path.name}-", dir=self._path.parent)  # mode 0600
+            try:
+                with os.fdopen(descriptor, "wb") as file:
+                    file.write(msgspec.msgpack.encode(note))
+                    file.flush()
+                    os.fsync(file.fileno())
+                os.replace(temporary, self._path)
+            except BaseException:
+                Path(temporary).unlink(missing_ok=True)
+                raise
+        except OSError as error:
+            if not self._warned:
+                _log.warning("%s cannot be written (%s): nobody resumes after a restart", self._path, error.strerror)
+            self._warned = True
