@@ -3,7 +3,8 @@
 Public API, nothing else is public:
 
 - `Session`, `SessionConfig`: share a MuJoCo scene from your own process. Errors: `SessionError` and its subclasses.
-- `Client`: join a session from any process. Errors: `ClientError` and its subclasses.
+- `Client`: join a session from any process. Errors: `ClientError` and its subclasses. `find_sessions`: those on this
+  network, as `FoundSession`.
 
 Names are imported on first use, so that a light client does not load MuJoCo.
 """
@@ -14,9 +15,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from iris_session.client import Client, ClientError
+    from iris_session.client import Client, ClientError, FoundSession, find_sessions
     from iris_session.runtime.config import SessionConfig
-    from iris_session.runtime.errors import ConfigError, OwnershipError, SessionError, StartError
+    from iris_session.runtime.errors import ConfigError, OwnershipError, ResumeError, SessionError, StartError
     from iris_session.runtime.session import Session
 
 _HOME: Final = {
@@ -25,9 +26,12 @@ _HOME: Final = {
     "SessionError": "iris_session.runtime.errors",
     "ConfigError": "iris_session.runtime.errors",
     "StartError": "iris_session.runtime.errors",
+    "ResumeError": "iris_session.runtime.errors",
     "OwnershipError": "iris_session.runtime.errors",
     "Client": "iris_session.client",
     "ClientError": "iris_session.client",
+    "FoundSession": "iris_session.client",
+    "find_sessions": "iris_session.client",
 }
 
 __all__ = [
@@ -36,9 +40,12 @@ __all__ = [
     "SessionError",
     "ConfigError",
     "StartError",
+    "ResumeError",
     "OwnershipError",
     "Client",
     "ClientError",
+    "FoundSession",
+    "find_sessions",
 ]
 
 

@@ -1,4 +1,7 @@
-"""What `state` and `input` share: a session in this process, clients in others, one measured window."""
+"""What the benchmarks of a session share: a session in this process, clients in others, one measured window.
+
+Clients join directly, or over a bad link: then the proxy of `emulator.impairment` runs too, in a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import msgspec
@@ -19,11 +23,14 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
+from iris_session.bench.contract import BenchError
+from iris_session.emulator.impairment_process import ImpairmentProcess
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.links import link_address, links_before
 from iris_session.runtime.session import Session
 
 #: The bars are stated for at most four clients in one process.
@@ -32,9 +39,27 @@ WARM_UP_S: Final = 3.0
 Log = dict[str, NDArray[Any]]
 
 
+Group = tuple[ClientJob, ...]  # the clients of one process
+
+
+def grouped(specs: Sequence[ClientJob]) -> list[Group]:
+    """`specs` in processes of at most `CLIENTS_PER_PROCESS`."""
+    return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
+
+
+def linked(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
+    """Each of `specs` on a link of its own, and the profile by link; as they are when `profile` is empty."""
+    if not profile:
+        return list(specs), {}
+    placed = [msgspec.structs.replace(spec, link=link_address(i)) for i, spec in enumerate(specs)]
+    return placed, dict.fromkeys((spec.link for spec in placed), profile)
+
+
 @dataclass
 class Measured:
-    """One window. `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
+    """One window, from session time `begin_ns` on.
+
+    `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
     session time of receipt. `logs`: by client name."""
 
     seconds: float
@@ -47,9 +72,12 @@ class Measured:
     rejected: dict[str, int] = field(default_factory=dict)
     connections: dict[str, int] = field(default_factory=dict)
     drops: dict[str, int] = field(default_factory=dict)
+    begin_ns: int = 0
 
 
-class _ClientProcess:
+class ClientProcess:
+    """The clients of one group."""
+
     def __init__(self, job: Job) -> None:
         self.job = job
         self._process = subprocess.Popen(
@@ -65,7 +93,7 @@ class _ClientProcess:
         """True once its clients have joined. Raises when it died."""
         assert self._process.stdout is not None
         if self._process.poll() is not None:
-            raise RuntimeError(f"a client process ended with status {self._process.returncode} before it was ready")
+            raise BenchError(f"a client process ended with status {self._process.returncode} before it was ready")
         return (self._process.stdout.read(6) or b"").startswith(b"ready")
 
     def window(self, begin_ns: int, end_ns: int) -> None:
@@ -76,7 +104,7 @@ class _ClientProcess:
     def result(self) -> dict[str, Log]:
         """The logs by client name, once the process has ended."""
         if self._process.wait(60.0) != 0:
-            raise RuntimeError(f"a client process failed with status {self._process.returncode}")
+            raise BenchError(f"a client process failed with status {self._process.returncode}")
         with np.load(self.job.log) as columns:
             logs: dict[str, Log] = {}
             for key in columns.files:
@@ -88,22 +116,46 @@ class _ClientProcess:
     def running(self) -> bool:
         return self._process.poll() is None
 
+    def signal(self, number: int) -> None:
+        """Stops or continues the process, for example."""
+        self._process.send_signal(number)
+
     def kill(self) -> None:
         if self.running:
             self._process.kill()
         self._process.wait()
 
 
+@dataclass
+class Arena:
+    """What an action of `measure` acts on. `processes`: by the name of each of their clients."""
+
+    session: Session
+    processes: list[ClientProcess]
+    by_client: dict[str, ClientProcess]
+    proxy: ImpairmentProcess | None
+
+
+#: Seconds after the beginning of the window, and what happens then; it must be quick.
+Action = tuple[float, Callable[[Arena], None]]
+
+
 def measure(
     model: mujoco.MjModel,
-    specs: Sequence[ClientJob],
+    groups: Sequence[Group],
     seconds: float,
     *,
+    links: Mapping[str, str] = MappingProxyType({}),
+    seed: int = 0,
+    actions: Sequence[Action] = (),
     keep_poses: bool = False,
     curve: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Runs a session over `model` with `specs` as clients and measures `seconds` of it, warm-up excluded."""
+    """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
+
+    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times.
+    """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
         keys = _keys(folder) if curve else None
@@ -116,34 +168,34 @@ def measure(
             curve_clients="" if keys is None else str(folder / "clients"),
         )
         session = stack.enter_context(Session(model, config=config))
-        processes = []
-        for i in range(0, len(specs), CLIENTS_PER_PROCESS):
+        proxy = stack.enter_context(links_before(session, links, seed)) if links else None
+        arena = Arena(session, [], {}, proxy)
+        for i, group in enumerate(groups):
             job = Job(
                 session.address,
                 session.origin_ns,
                 str(folder / f"log{i}.npz"),
-                tuple(specs[i : i + CLIENTS_PER_PROCESS]),
+                group,
                 keep_poses,
                 **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
             )
-            process = _ClientProcess(job)
+            process = ClientProcess(job)
             stack.callback(process.kill)
-            processes.append(process)
-        return _run(session, processes, seconds, keep_poses, progress)
+            arena.processes.append(process)
+            arena.by_client.update((spec.name, process) for spec in group)
+        return _run(arena, seconds, actions, keep_poses, progress)
 
 
 def _run(
-    session: Session,
-    processes: list[_ClientProcess],
-    seconds: float,
-    keep_poses: bool,
-    progress: Callable[[str], None],
+    arena: Arena, seconds: float, actions: Sequence[Action], keep_poses: bool, progress: Callable[[str], None]
 ) -> Measured:
+    session, processes = arena.session, arena.processes
     waiting = list(processes)
     progress(f"waiting for {len(processes)} client processes")
     session.run(seconds=60.0, until=_every(0.05, session.clock, lambda: _all_ready(waiting)))
+    _unless_stopped(session)
     if waiting:
-        raise RuntimeError("the clients did not join within 60 s")
+        raise BenchError("the clients did not join within 60 s")
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
@@ -155,10 +207,14 @@ def _run(
     end = begin + round(seconds * 1e9)
     for process in processes:
         process.window(begin, end)
+    restart = [] if arena.proxy is None else [(0.0, _begin_profiles)]
     meter = _Meter(session, begin, end)
-    session.run(until=meter.passed)
+    script = _Script(arena, begin, [*restart, *actions])
+    session.run(until=lambda: script.due() or meter.passed())
+    _unless_stopped(session)
     stats, cpu_share = meter.result()
     session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    _unless_stopped(session)
     received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
     logs = {name: log for process in processes for name, log in process.result().items()}
     status = session.status()
@@ -174,7 +230,34 @@ def _run(
         {"/".join(key): count for key, count in ledger.rejected.items()},
         {names[p]: c for c, p in connections.items()},
         status.drops,
+        begin,
     )
+
+
+def _unless_stopped(session: Session) -> None:
+    """Ctrl-C ends a session in order; a benchmark then has no result."""
+    if session.stopping:
+        raise KeyboardInterrupt
+
+
+def _begin_profiles(arena: Arena) -> None:
+    """The moments of a profile count from the beginning of the window."""
+    assert arena.proxy is not None
+    arena.proxy.post("start")
+
+
+class _Script:
+    """Does what is to happen during the window, each thing once."""
+
+    def __init__(self, arena: Arena, begin_ns: int, actions: Sequence[Action]) -> None:
+        self._arena = arena
+        self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
+
+    def due(self) -> bool:
+        """Does what is due; never true."""
+        while self._actions and self._arena.session.clock() >= self._actions[0][0]:
+            self._actions.pop(0)[1](self._arena)
+        return False
 
 
 class _Meter:
@@ -189,15 +272,15 @@ class _Meter:
         """Whether the window is over; for `Session.run(until=...)`."""
         now = self._session.clock()
         if now >= (self._end_ns if self._readings else self._begin_ns):
-            stats = self._session.lateness()
+            stats = self._session.lateness(anew=not self._readings)
             assert stats is not None
             self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))
         return len(self._readings) == 2
 
     def result(self) -> tuple[PacerStats, float]:
-        """Ticks of the window (percentiles: warm-up too), and CPU of authority and front as a share of one core."""
+        """Ticks of the window, and CPU of authority and front as a share of one core."""
         if len(self._readings) < 2:
-            raise RuntimeError("the session ended before the window was over")
+            raise BenchError("the session ended before the window was over")
         (before, cpu0), (after, cpu1) = self._readings
         ticks, late = after.ticks - before.ticks, after.late - before.late
         stats = after._replace(
@@ -206,7 +289,7 @@ class _Meter:
         return stats, (cpu1 - cpu0) / ((self._end_ns - self._begin_ns) * 1e-9)
 
 
-def _all_ready(waiting: list[_ClientProcess]) -> bool:
+def _all_ready(waiting: list[ClientProcess]) -> bool:
     waiting[:] = [process for process in waiting if not process.ready()]
     return not waiting
 

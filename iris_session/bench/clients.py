@@ -35,12 +35,14 @@ JOIN_S: Final = 30.0
 
 
 class ClientJob(msgspec.Struct, frozen=True):
-    """One client. `robot`: drives it with the right controller. `samples`: sends 3 devices x 72 Hz."""
+    """One client. `robot`: drives it with the right controller. `samples`: sends 3 devices x 72 Hz. `link`: address
+    of the bad link that it joins over; empty: directly."""
 
     name: str
     role: str
     robot: str = ""
     samples: bool = False
+    link: str = ""
 
 
 class Job(msgspec.Struct, frozen=True):
@@ -67,7 +69,7 @@ class BenchClient:
             curve = CurveKeys(job.server_public.encode(), job.public.encode(), job.secret.encode())
         devices = DEVICES if spec.samples else ()
         self.client = Client(
-            job.address,
+            f"{spec.link}:{job.address.rpartition(':')[2]}" if spec.link else job.address,
             role=spec.role,
             name=spec.name,
             devices=devices,
@@ -123,10 +125,12 @@ class BenchClient:
             return
         self._next_ns = max(self._next_ns + SAMPLE_NS, now_ns - SAMPLE_NS)
         t = now_ns * 1e-9
+        samples = []
         for i, device in enumerate(DEVICES):
             robots = [self.spec.robot] if self.spec.robot and device == Device.CONTROLLER_RIGHT else []
             clutch = bool(robots) and self._open_samples == 0
-            self.sent += self.client.send_sample(device, self._pose(t, i), robots=robots, clutch=clutch)
+            samples.append(self.client.make_sample(device, self._pose(t, i), robots=robots, clutch=clutch))
+        self.sent += len(samples) * self.client.send_samples(samples)
         self._open_samples = max(0, self._open_samples - 1)
 
     def _pose(self, t: float, device: int) -> PoseTuple:

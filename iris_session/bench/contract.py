@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from importlib.metadata import version
@@ -10,11 +11,17 @@ from typing import Any, Final
 import msgspec
 
 VERSION: Final = 1
+#: Parameter `bars` of a benchmark over an impaired link.
+NO_BARS: Final = "none: the figures include the link"
 _OPERATORS: Final = {
     "<=": lambda value, bound: value <= bound,
     ">=": lambda value, bound: value >= bound,
     "<": lambda value, bound: value < bound,
 }
+
+
+class BenchError(Exception):
+    """A benchmark that gives no figures: one line for the person who started it."""
 
 
 class Bar(msgspec.Struct, frozen=True):
@@ -48,15 +55,15 @@ class BenchReport(msgspec.Struct, frozen=True):
         return all(b.ok for b in self.bars)
 
     def as_dict(self) -> dict[str, Any]:
-        """The JSON object of the contract."""
+        """The JSON object of the contract. What never came (an infinite age) is null: JSON has no infinity."""
         return {
             "name": self.name,
             "version": self.version,
             "machine": machine(),
             "params": self.params,
-            "results": self.results,
+            "results": {key: _finite(value) for key, value in self.results.items()},
             "reference": self.reference,
-            "bars": [msgspec.to_builtins(b) for b in self.bars],
+            "bars": [{**msgspec.to_builtins(b), "value": _finite(b.value)} for b in self.bars],
         }
 
     def lines(self) -> str:
@@ -71,6 +78,10 @@ class BenchReport(msgspec.Struct, frozen=True):
                 note = f"   bar {b.op} {b.bound:g}  {'ok' if b.ok else 'MISSED'}"
             rows.append(f"  {key:<{width}}  {value}{note}")
         return "\n".join(rows)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def machine() -> dict[str, Any]:

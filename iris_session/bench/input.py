@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from iris_session.bench.arena import Measured, measure
+from iris_session.bench.arena import Measured, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import BenchReport, bar
+from iris_session.bench.contract import NO_BARS, BenchReport, bar
 from iris_session.physics.scenes import n_arms_scene
 from iris_session.physics.scenes.generators import arm_names
 from iris_session.protocol.names import Device
@@ -24,14 +24,20 @@ def run_input(
     observers: int = 8,
     seconds: float = 20.0,
     curve: bool = False,
+    profile: str = "",
+    seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`operators` drive one arm each (3 devices x 72 Hz), `observers` look on, 500 Hz physics."""
+    """`operators` drive one arm each (3 devices x 72 Hz), `observers` look on, 500 Hz physics.
+
+    `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
+    """
     model = n_arms_scene(robots).compile()
     arms = arm_names(robots)
     specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
     specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
-    got = measure(model, specs, seconds, curve=curve, progress=progress)
+    specs, links = linked(specs, profile)
+    got = measure(model, grouped(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
     responses = response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))
@@ -45,6 +51,7 @@ def run_input(
         "samples_per_s": round(received / got.seconds, 1),
         "rejected": got.rejected,
         "server_cpu_share": round(got.cpu_share, 3),
+        "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
         "scheduling": got.scheduling,
         "drops": got.drops,
     }
@@ -56,8 +63,16 @@ def run_input(
         bar(results, "samples_per_s", ">=", 0.98 * sent),
         bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
     ]
-    params = {"operators": operators, "robots": robots, "observers": observers, "seconds": seconds, "curve": curve}
-    return BenchReport("input", params, results, tuple(bars))
+    params: dict[str, Any] = {
+        "operators": operators,
+        "robots": robots,
+        "observers": observers,
+        "seconds": seconds,
+        "curve": curve,
+    }
+    if profile:
+        params |= {"profile": profile, "seed": seed, "bars": NO_BARS}
+    return BenchReport("input", params, results, () if profile else tuple(bars))
 
 
 def response_ms(got: Measured, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from iris_session.bench.arena import Measured, measure
+from iris_session.bench.arena import Measured, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import BenchReport, bar
+from iris_session.bench.contract import NO_BARS, BenchReport, bar
 from iris_session.physics.scenes import free_bodies_scene
 
 #: The bar is stated under input: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
@@ -22,12 +22,19 @@ def run_state(
     seconds: float = 20.0,
     seed: int = 0,
     curve: bool = False,
+    profile: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """`bodies` free bodies in motion without contact, `clients` observers, 60 Hz."""
+    """`bodies` free bodies in motion without contact, `clients` observers, 60 Hz.
+
+    `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
+    """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
-    got = measure(model, specs, seconds, keep_poses=True, curve=curve, progress=progress)
+    specs, links = linked(specs, profile)
+    got = measure(
+        model, grouped(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
+    )
     progress("comparing every delivered frame with the state at its tick")
     ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
     inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
@@ -51,6 +58,7 @@ def run_state(
         "lateness_ms_p99": round(got.stats.p99_ns * 1e-6, 3),
         "ticks": got.stats.ticks,
         "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
+        "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
         "scheduling": got.scheduling,
         "drops": got.drops,
     }
@@ -62,8 +70,17 @@ def run_state(
         bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
         bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}
-    return BenchReport("state", params, results, tuple(bars))
+    params: dict[str, Any] = {
+        "clients": clients,
+        "bodies": bodies,
+        "seconds": seconds,
+        "seed": seed,
+        "curve": curve,
+        "hz": 60,
+    }
+    if profile:
+        params |= {"profile": profile, "bars": NO_BARS}
+    return BenchReport("state", params, results, () if profile else tuple(bars))
 
 
 def errors(got: Measured) -> tuple[float, float]:

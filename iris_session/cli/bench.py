@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from iris_session.cli.common import add_json, positive_seconds, print_json
+from iris_session.cli.common import CommandError, add_json, positive_seconds, print_json
+
+if TYPE_CHECKING:
+    from iris_session.bench.contract import BenchReport
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -16,16 +21,26 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session bench state --check\n"
         "  iris-session bench state --curve --json\n"
-        "  iris-session bench input --operators 4 --robots 4 --seconds 10",
+        "  iris-session bench input --operators 4 --robots 4 --seconds 10\n"
+        "  iris-session bench slow-client --check\n"
+        "  iris-session bench state --profile busy-wifi",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input"))
-    parser.add_argument("--clients", type=int, default=16, help="state: how many (default: %(default)s)")
-    parser.add_argument("--bodies", type=int, default=300, help="state: moving bodies (default: %(default)s)")
+    parser.add_argument("bench", choices=("state", "input", "slow-client"))
+    parser.add_argument("--clients", type=int, default=16, help="state, slow-client: how many (default: %(default)s)")
+    parser.add_argument(
+        "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
+    )
     parser.add_argument("--operators", type=int, default=8, help="input: people who drive (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
     parser.add_argument("--observers", type=int, default=8, help="input: people who look (default: %(default)s)")
-    parser.add_argument("--seconds", type=positive_seconds, default=20.0, help="measured part (default: %(default)s)")
+    parser.add_argument("--seconds", type=positive_seconds, help="measured part (default: 20; slow-client: 50)")
+    parser.add_argument(
+        "--profile",
+        default="",
+        metavar="NAME",
+        help="everybody joins over a link like this (docs/links.md); no bars then",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
     crypto = parser.add_mutually_exclusive_group()
     crypto.add_argument("--curve", action="store_true", help="encrypted and authenticated")
@@ -38,28 +53,51 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Runs one benchmark and prints its report."""
 
+    from iris_session.emulator.weather import load_profile
+
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
 
-    if arguments.bench == "state":
-        from iris_session.bench.state import run_state
+    from iris_session.bench.contract import BenchError
 
-        report = run_state(
-            arguments.clients, arguments.bodies, arguments.seconds, arguments.seed, arguments.curve, progress
-        )
-    else:
-        from iris_session.bench.input import run_input
-
-        report = run_input(
-            arguments.operators,
-            arguments.robots,
-            arguments.observers,
-            arguments.seconds,
-            arguments.curve,
-            progress,
-        )
+    _check(arguments)
+    if arguments.bench == "slow-client" and arguments.clients < 3:
+        raise CommandError(f"--clients {arguments.clients}: slow-client needs two that are slow and one other, so 3")
+    if arguments.profile:
+        load_profile(arguments.profile)  # before anything is started
+    try:
+        report = _report(arguments, progress)
+    except BenchError as error:
+        raise CommandError(str(error), 1) from error
     if arguments.json:
         print_json(report.as_dict())
     else:
         print(report.lines())
     return 0 if report.ok or not arguments.check else 1
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Numbers that a scene or a session cannot have."""
+    limits = {"clients": (1, 64), "bodies": (1, 2000)}
+    if arguments.bench == "input":
+        limits = {"robots": (1, 12), "operators": (1, arguments.robots), "observers": (0, 64)}
+    for name, (low, high) in limits.items():
+        if not low <= (value := getattr(arguments, name)) <= high:
+            per = ", one robot each" if name == "operators" else ""
+            raise CommandError(f"--{name} {value}: bench {arguments.bench} takes {low} to {high}{per}")
+
+
+def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> BenchReport:
+    common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
+    if arguments.bench == "state":
+        from iris_session.bench.state import run_state
+
+        return run_state(arguments.clients, arguments.bodies, arguments.seconds or 20.0, **common)
+    if arguments.bench == "slow-client":
+        from iris_session.bench.slow_client import run_slow_client
+
+        return run_slow_client(arguments.clients, arguments.bodies, arguments.seconds or 50.0, **common)
+    from iris_session.bench.input import run_input
+
+    people = (arguments.operators, arguments.robots, arguments.observers)
+    return run_input(*people, arguments.seconds or 20.0, **common)

@@ -26,12 +26,25 @@ def expected_errors() -> tuple[type[Exception], ...]:
     """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
     from iris_session.client import ClientError
     from iris_session.control import ControlError
+    from iris_session.emulator.impairment_process import ImpairmentError
+    from iris_session.emulator.weather import ProfileError
+    from iris_session.keys import KeysError
     from iris_session.physics import PhysicsError
     from iris_session.recording import RecordingError
     from iris_session.runtime.errors import SessionError
     from iris_session.transport import FrontError
 
-    return (SessionError, PhysicsError, ControlError, FrontError, RecordingError, ClientError)
+    return (
+        SessionError,
+        PhysicsError,
+        ControlError,
+        FrontError,
+        RecordingError,
+        ClientError,
+        ImpairmentError,
+        ProfileError,
+        KeysError,
+    )
 
 
 def positive_seconds(text: str) -> float:
@@ -45,6 +58,13 @@ def positive_seconds(text: str) -> float:
     return seconds
 
 
+def port_base(text: str) -> int:
+    """Type of `--port-base`."""
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65530:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the first of six ports: 1 to 65530, for example 7730")
+    return int(text)
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
@@ -54,15 +74,41 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("session")
     group.add_argument("--name", default=None, help="name of the session (default: that of the scene)")
     group.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDR", help="address to listen on (default: %(default)s)"
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDR",
+        help="address to listen on, 0.0.0.0 for all (default: %(default)s)",
     )
+    group.add_argument(
+        "--interface",
+        action="append",
+        default=[],
+        metavar="NAME_OR_ADDR",
+        help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
+    )
+    group.add_argument(
+        "--advertise", default="", metavar="ADDR", help="address that others are told, behind a router that forwards"
+    )
+    group.add_argument(
+        "--port-base",
+        type=port_base,
+        default=None,
+        metavar="N",
+        help="block of ports: introduction N, control N+1, state N+2, ... N+5 (default: 7720)",
+    )
+    group.add_argument("--no-beacon", action="store_true", help="do not tell the network that this session is here")
     group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free one")
     group.add_argument("--state-port", type=int, default=None, metavar="PORT", help="0: any free one")
-    group.add_argument("--curve-key", default="", metavar="FILE", help="the server's CURVE secret key (off loopback)")
+    group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and let listed keys in only")
+    group.add_argument(
+        "--curve-key", default="", metavar="FILE", help="another CURVE secret key of the server than the user's"
+    )
     group.add_argument(
         "--record", default=None, metavar="FILE", help="path of the recording (default: below sessions/)"
     )
-    group.add_argument("--curve-clients", default="", metavar="DIR", help="public certificates of clients to let in")
+    group.add_argument(
+        "--curve-clients", default="", metavar="DIR", help="public certificates to let in instead of the allow-list"
+    )
     group.add_argument("--no-record", action="store_true", help="record nothing")
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,20 +19,50 @@ if TYPE_CHECKING:
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "demo",
-        help="two emulated operators hand a hammer over",
-        description="Runs a whole session with emulated people in other processes. Exit status 0 only if the object "
-        "really changed hands by contact alone and the recording verifies bit for bit.",
-        epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json",
+        help="emulated operators hand things over, in one of three scenes",
+        description="Runs a whole session with emulated people in other processes. Exit status 0 only if every object "
+        "really changed hands by contact alone and the recording verifies bit for bit.\n\n"
+        "  handover   arms drawn from primitives hand a hammer over; needs no data\n"
+        "  iiwa       the same with KUKA iiwa 14 arms\n"
+        "  aloha      two ALOHA stations: two people with two arms each exchange a red and a blue board\n\n"
+        "The models of iiwa and aloha come from the folder that IRIS_DATA names.",
+        epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
+        "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
+        "  iris-session demo iiwa --latency 40",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("demo", choices=("handover",))
+    parser.add_argument("demo", choices=("handover", "iiwa", "aloha"))
+    parser.add_argument(
+        "--operators", type=int, default=2, metavar="N", help="people who drive, in pairs; 2 to 8 (default: 2)"
+    )
+    parser.add_argument(
+        "--observers", type=int, default=0, metavar="N", help="people who only look; 0 to 16 (default: 0)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything random in the emulated people")
     parser.add_argument(
         "--timeout", type=positive_seconds, default=90.0, metavar="S", help="give up after this many seconds"
     )
+    link = parser.add_mutually_exclusive_group()
+    link.add_argument(
+        "--profile", default="", metavar="NAME", help="people join over links like this (docs/links.md), e.g. busy-wifi"
+    )
+    link.add_argument(
+        "--latency", type=milliseconds, metavar="MS", help="people join over links that delay by this much each way"
+    )
     add_session_options(parser)
     add_json(parser)
     parser.set_defaults(run=run, control_port=0, state_port=0)
+
+
+def milliseconds(text: str) -> float:
+    """Type of an option that takes a delay [ms]."""
+    try:
+        delay = float(text)
+    except ValueError:
+        delay = math.nan
+    if not 0.0 <= delay <= 10_000.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a delay: give 0 to 10000 milliseconds, for example 40")
+    return delay
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -40,15 +71,21 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iris_session.cli.live import LiveView
     from iris_session.cli.serve import session_config
-    from iris_session.runtime.demo import run_handover
+    from iris_session.emulator.weather import load_profile
+    from iris_session.runtime.demo import run_demo
+    from iris_session.runtime.plays import make_play
 
+    profile = arguments.profile if arguments.latency is None else f"{arguments.latency:f}ms"
+    if profile:
+        load_profile(profile)  # before anything is started
+    play = make_play(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
     config = session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
     def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
         return LiveView(session, out, f"demo {arguments.demo} on {session.address}").open()
 
-    result = run_handover(config, arguments.seed, arguments.timeout, show)
+    result = run_demo(play, config, arguments.timeout, show, profile, arguments.seed)
     if arguments.json:
         print_json(msgspec.to_builtins(result))
     else:
@@ -68,8 +105,10 @@ def summary(result: DemoResult) -> str:
         f"  alignment of {name}: stated {a['stated_p95']:.1f} mm (95 %), true {a['at_sheet']:.1f} mm at the sheet"
         for name, a in result.alignment_mm.items()
     ]
-    lines.append(f"  late ticks {result.late_tick_share * 100:.3f} %, lateness p99 {result.lateness_ms_p99:.2f} ms")
+    pace = f"lateness p99 {result.lateness_ms_p99:.2f} ms, real-time factor {result.real_time_factor:.3f}"
+    lines.append(f"  late ticks {result.late_tick_share * 100:.3f} %, {pace}")
     lines += [f"  state age p99 at {name}: {age:.1f} ms" for name, age in result.state_age_ms_p99.items()]
     lines.append(f"  recording {result.recording}: {result.verification}" if result.recording else "  not recorded")
+    lines += [f"  note: {note}" for note in result.notes]
     lines += [f"  problem: {problem}" for problem in result.problems]
     return "\n".join(lines)

@@ -16,11 +16,17 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session emulate                                   one person who moves a robot about\n"
         "  iris-session emulate --behaviour observer --count 3    three people who only look\n"
+        "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD     the first time at a session in the lab\n"
+        "  iris-session emulate --session lab-1                   later, by its name\n"
         "  iris-session emulate --headset name=ann,behaviour=giver,robot=left "
         "--headset name=bob,behaviour=receiver,robot=right",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("address", nargs="?", default="127.0.0.1:7721", help="HOST:PORT (default: %(default)s)")
+    parser.add_argument(
+        "address", nargs="?", default="", help="HOST:PORT, or the iris:// URI of a pairing code (default: this machine)"
+    )
+    parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
+    parser.add_argument("--code", default="", metavar="CODE", help="join code of `iris-session pair`, the first time")
     parser.add_argument("--behaviour", default="wander", help="giver, receiver, wander, idle or observer")
     parser.add_argument("--robot", default="", help="robot to take (default: the policy of the session chooses)")
     parser.add_argument("--count", type=int, default=1, help="how many people with --behaviour")
@@ -45,7 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
         f"seed={arguments.seed + i}"
         for i in range(arguments.count)
     ]
-    options = ["--address", arguments.address, "--join-timeout", str(arguments.join_timeout)]
+    options = ["--address", arguments.address, "--session", arguments.session, "--code", arguments.code]
+    options += ["--join-timeout", str(arguments.join_timeout)]
     options += ["--curve-server", arguments.curve_server, "--curve-key", arguments.curve_key]
     for headset in headsets:
         options += ["--headset", headset]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Refresh of the display [s].
 REFRESH_S: Final = 0.5
+#: Longest wait for the display at the end [s].
+END_S: Final = 3.0
 #: Event bodies that come in great numbers and say little to a person.
 QUIET: Final = frozenset({"engagement_changed", "samples_rejected"})
 
@@ -66,6 +69,7 @@ class LiveView:
         self._next_s = 0.0
         self._seen = 0
         self._pipe = -1
+        self._pending = b""  # of a refresh that did not fit into the pipe: its rest goes out before any other
         self.skipped = 0
 
     @contextmanager
@@ -82,8 +86,15 @@ class LiveView:
             yield self.update
         finally:
             self.update(force=True)
+            until = time.monotonic() + END_S
+            while not self._send() and child.poll() is None and time.monotonic() < until:
+                select.select([], [self._pipe], [], 0.1)
             child.stdin.close()
-            child.wait(timeout=10.0)
+            try:
+                child.wait(timeout=END_S)
+            except subprocess.TimeoutExpired:  # a terminal that takes nothing must not keep the session's end
+                child.kill()
+                child.wait()
 
     def update(self, force: bool = False) -> None:
         """Sends what is new to the display."""
@@ -91,18 +102,26 @@ class LiveView:
         if now < self._next_s and not force:
             return
         self._next_s = now + REFRESH_S
-        fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
-        lines = [event_line(e) for e in fresh if e.body.__struct_config__.tag not in QUIET]
-        line = json.dumps({"status": self._session.status().as_dict(), "events": lines}).encode() + b"\n"
-        try:
-            # A pipe takes a write of up to its free space: a refresh is either written whole or tried again later.
-            if os.write(self._pipe, line) != len(line):
-                self.skipped += 1
-        except (BlockingIOError, BrokenPipeError):
+        if not self._send():
             self.skipped += 1
             return
+        fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
+        lines = [event_line(e) for e in fresh if e.body.__struct_config__.tag not in QUIET]
+        status = self._session.status().as_dict()
+        status["handovers"] = len(status.get("handovers", ()))  # the list grows as long as the session lasts
+        self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"
+        self._send()
         if fresh:
             self._seen = fresh[-1].event_seq
+
+    def _send(self) -> bool:
+        """Writes what the pipe takes; True when nothing is left."""
+        try:
+            while self._pending:
+                self._pending = self._pending[os.write(self._pipe, self._pending) :]
+        except (BlockingIOError, BrokenPipeError):
+            return False
+        return True
 
 
 def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableType:
@@ -124,7 +143,7 @@ def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableT
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
     footer = (
         f"{state}  tick {status['tick']}  late {late.get('late_share', 0.0) * 100:.2f} %  "
-        f"lateness p99 {late.get('p99_ms', 0.0):.2f} ms  handovers {len(status['handovers'])}  "
+        f"lateness p99 {late.get('p99_ms', 0.0):.2f} ms  handovers {status['handovers']}  "
         f"drops {sum(status['drops'].values())}"
     )
     log = Text("\n".join(events[-8:]), style="dim", no_wrap=True, overflow="ellipsis")

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from importlib.metadata import version
 
-from iris_session.cli import bench, demo, emulate, robots, serve, verify
+from iris_session.cli import bench, demo, doctor, emulate, keys, pair, robots, serve, sessions, status, verify
 from iris_session.cli.common import CommandError, expected_errors
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand a hammer over
   iris-session serve scene.xml               share a MuJoCo scene on this machine
+  iris-session pair                          a join code and a QR code for one new device
+  iris-session keys list                     who may join
+  iris-session sessions                      what can be joined on this network
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
+  iris-session status --watch                people, robots, ages, late ticks, recorder of a session
+  iris-session doctor 192.168.1.20           what is wrong, why, and what to do
   iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
   iris-session bench state --check           measure the state stream against its bars
 """
@@ -29,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, serve, verify, emulate, robots, bench):
+    for module in (demo, serve, pair, keys, sessions, status, doctor, verify, emulate, robots, bench):
         module.register(commands)
     return parser
 
@@ -42,6 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         status: int = arguments.run(arguments)
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # one more must not interrupt the interpreter's own end
         return 130
     except BrokenPipeError:  # the reader of a pipe has gone (`| head`)
         sys.stderr.close()
@@ -50,11 +57,17 @@ def main(argv: list[str] | None = None) -> int:
         print(f"iris-session: {error}", file=sys.stderr)
         return error.status
     except expected_errors() as error:
-        print(f"iris-session: {error}", file=sys.stderr)
+        print(f"iris-session: {error}{_option_for(error)}", file=sys.stderr)
         if isinstance(error, AmbiguousModelError):  # to standard output: `iris-session robots scene.xml > robots.toml`
             print(error.toml)
         return 2
     return status
+
+
+def _option_for(error: Exception) -> str:
+    """What the library says without naming options, which a script does not have."""
+    in_use = str(error).startswith("port ") and "is in use" in str(error)
+    return " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""
 
 
 if __name__ == "__main__":

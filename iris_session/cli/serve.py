@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import re
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
     from iris_session.runtime.config import SessionConfig
+    from iris_session.runtime.session import Session
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,10 +34,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
         "  iris-session serve handover --assign ann=left --assign bob=right\n"
-        "  iris-session serve handover --seconds 30     (a scene that comes with the package)",
+        "  iris-session serve handover --seconds 30     (a scene that comes with the package)\n"
+        "  iris-session serve handover --interface wlan0 --name lab-1\n"
+        "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
+        "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (go on where it ended)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", help="MJCF or MJB file, or the name of a packaged scene")
+    parser.add_argument("scene", nargs="?", help="MJCF or MJB file, or the name of a packaged scene")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
     parser.add_argument(
         "--assign",
@@ -43,6 +48,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         default=[],
         metavar="NAME=ROBOT[,ROBOT]",
         help="robots of a participant, repeatable; implies --assignment config",
+    )
+    parser.add_argument(
+        "--resume",
+        type=Path,
+        metavar="RECORDING",
+        help="go on from the end of a recording (a .rrd or its folder): same session, people, leases, scene",
     )
     parser.add_argument("--seconds", type=positive_seconds, help="stop after this many seconds")
     add_session_options(parser)
@@ -64,12 +75,22 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
         raise CommandError(f"--assign goes with --assignment {AssignmentPolicy.CONFIG}, not with {policy}")
     changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
+    if arguments.interface and arguments.host != defaults.host:
+        raise CommandError("--interface and --host both say where to listen: give one of them")
+    base = arguments.port_base
+    if base is not None and (arguments.control_port or arguments.state_port):
+        raise CommandError("--port-base names all ports: give it without --control-port and --state-port")
+    control, state = (defaults.control_port, defaults.state_port) if base is None else (base + 1, base + 2)
     return SessionConfig(
         name=arguments.name or name,
         host=arguments.host,
-        control_port=defaults.control_port if arguments.control_port is None else arguments.control_port,
-        state_port=defaults.state_port if arguments.state_port is None else arguments.state_port,
+        interfaces=tuple(arguments.interface),
+        advertise=arguments.advertise,
+        beacon_port=0 if arguments.no_beacon else defaults.beacon_port,
+        control_port=control if base or arguments.control_port is None else arguments.control_port,
+        state_port=state if base or arguments.state_port is None else arguments.state_port,
         record=False if arguments.no_record else arguments.record or True,
+        curve=arguments.curve,
         curve_key=arguments.curve_key,
         curve_clients=arguments.curve_clients,
         authority=authority,
@@ -93,32 +114,58 @@ def session_name(path: Path) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).strip("._-")[:48] or "session"
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
-    from iris_session.cli.live import LiveView
+def new_session(arguments: argparse.Namespace) -> Session:
+    """A session that begins."""
     from iris_session.physics import load_model, load_robots_toml
     from iris_session.runtime.session import Session
 
+    if arguments.scene is None:
+        raise CommandError("which scene? give an MJCF or MJB file, the name of a packaged scene, or --resume RECORDING")
     path = scene_file(arguments.scene)
     model = load_model(path)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, model)
-    session = Session(model, config=session_config(arguments, session_name(path)), robots=robots)
+    return Session(model, config=session_config(arguments, session_name(path)), robots=robots)
+
+
+def resumed_session(arguments: argparse.Namespace) -> Session:
+    """A session that goes on from its recording."""
+    from iris_session.runtime.session import Session
+
+    had = ("robots", "assign", "assignment", "mode", "record", "no_record")
+    given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
+    if given:
+        raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")
+    model = None if arguments.scene is None else scene_file(arguments.scene)
+    config = dataclasses.replace(session_config(arguments, "session"), resume=arguments.resume)
+    return Session(model, config=config)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
+    from iris_session.cli.live import LiveView
+
+    session = resumed_session(arguments) if arguments.resume is not None else new_session(arguments)
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         names = ", ".join(r.name for r in session.robots) or "none"
-        print(f"session '{session.config.name}' on {session.address}, robots: {names}", file=out, flush=True)
+        print(f"session '{session.name}' on {session.address}, robots: {names}", file=out, flush=True)
+        for note in session.notes:
+            print(note, file=out, flush=True)
         if not session.robots:
             tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
-            print(f"{no_robots(model)}; {tip}", file=out, flush=True)
+            print(f"{no_robots(session.model)}; {tip}", file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
-        view = LiveView(session, out, f"iris-session {session.config.name} on {session.address}")
+        view = LiveView(session, out, f"iris-session {session.name} on {session.address}")
         with view.open():
             session.run(seconds=arguments.seconds, until=view.update)
         status = session.status()
         recording = None if session.recording is None else str(session.recording)
+    fault = session.recording_fault
     if arguments.json:
-        print_json({"ok": True, "recording": recording, **status.as_dict()})
+        print_json({"ok": not fault, "recording": recording, "recording_fault": fault, **status.as_dict()})
     elif recording:
         print(f"recording: {recording}    check it: iris-session verify {recording}")
-    return 0
+    if fault:
+        print(f"iris-session: {fault}", file=sys.stderr)
+    return 1 if fault else 0

@@ -11,7 +11,8 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.client import ClientError
-from iris_session.client.sockets import parse_address
+from iris_session.client.joining import wanted
+from iris_session.client.meeting import Wanted, settle
 from iris_session.emulator.person import behaviour_of, curve_of
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
@@ -25,20 +26,27 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     options = _parser().parse_args(argv)
     try:
         specs = _specs(options)
-        parse_address(options.address)
+        sought = wanted(options.address, options.session, None, options.code)
         for spec in specs:
             behaviour_of(spec, spec.robot)
             curve_of(spec)
     except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
+    try:
+        if sought.address is None or sought.join_code or sought.address.join_code:
+            # Everybody here has the key of this user: it is paired once, not by each of them.
+            sought = Wanted(settle(sought, options.join_timeout).address)
+    except ClientError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 1
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
     say = _say_json if options.json else _say_line
     try:
         reports = run_headsets(
-            options.address, specs, options.seconds, say, lambda: bool(stopped), options.join_timeout
+            str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout
         )
         for report in reports:
             say(report, final=True)
@@ -52,7 +60,9 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m iris_session.emulator", description=__doc__)
-    parser.add_argument("--address", default="127.0.0.1:7721", help="control channel of the session, HOST:PORT")
+    parser.add_argument("--address", default="", help="control channel of the session, HOST:PORT, or an iris:// URI")
+    parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
+    parser.add_argument("--code", default="", metavar="CODE", help="join code, the first time at a session")
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person, see specs")
     parser.add_argument("--specs", default="", metavar="FILE", help="JSON list of HeadsetSpec, - for standard input")
     parser.add_argument("--seconds", type=float, default=None, help="at most this long")

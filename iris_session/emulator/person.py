@@ -25,33 +25,24 @@ from anchors.pose import (
     quat_from_yaw,
 )
 from iris_session.client import Client, CurveKeys, SceneState
-from iris_session.emulator.behaviours import Behaviour, HandInput, make_behaviour
+from iris_session.emulator.behaviours import Behaviour, HandInput, Hands, make_behaviour
+from iris_session.emulator.clutching import Clutch
 from iris_session.emulator.display import Display
 from iris_session.emulator.headset import Headset, look_at
 from iris_session.emulator.link import DelayLine
-from iris_session.emulator.specs import OBSERVER, HeadsetReport, HeadsetSpec
+from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.emulator.viewpoints import between, viewpoint_pose
 from iris_session.protocol.client_messages import Acquire, Sample
 from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlignmentKind, CommandKind, DenialReason, Device, HoldReason, Role
+from iris_session.protocol.names import AlignmentKind, DenialReason, Device, Role
 from iris_session.protocol.server_messages import Event, Handover, Notice, Reply
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
 MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
-RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...
-RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
 AGES_KEPT: Final = 4_000  # a minute of frames
 RETRY_S: Final = 1.0
-
-#: Reasons of a hold that end by clutching again.
-CLUTCH_AGAIN: Final = frozenset(
-    {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.SCENE_CHANGED,
-     HoldReason.NO_SAMPLE, HoldReason.DISCONNECTED, HoldReason.ESTOP, HoldReason.UNTRACKED, HoldReason.NOT_WORN,
-     HoldReason.UNALIGNED}
-)  # fmt: skip
-
 
 #: Denials that no waiting mends.
 FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, DenialReason.UNKNOWN_VALUE})
@@ -59,9 +50,13 @@ FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, Den
 
 def behaviour_of(spec: HeadsetSpec, robot: str) -> Behaviour | None:
     """The behaviour of one person, `None` for an observer. Raises `ValueError` naming what is available."""
-    if spec.behaviour == OBSERVER:
-        return None
-    return make_behaviour(spec.behaviour, robot, spec.object, spec.partner, spec.device, spec.seed)
+    hands = [
+        make_behaviour(
+            task.behaviour, task.robot or robot, task.object, task.partner, task.device, spec.seed, task.arm, task.place
+        )
+        for task in spec.tasks
+    ]
+    return None if not hands else hands[0] if len(hands) == 1 else Hands(hands)
 
 
 def curve_of(spec: HeadsetSpec) -> CurveKeys | None:
@@ -78,15 +73,16 @@ class Person:
         self.spec = spec
         self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
         self.headset = Headset(spec.model, spec.seed, start_ns)
-        self.observer = spec.behaviour == OBSERVER
+        self.observer = spec.observer
         #: What this person drives; empty until the session's policy has chosen, when the spec names none.
-        self.robot = spec.robot
-        self.behaviour = behaviour_of(spec, self.robot)
+        self.robots = tuple(task.robot for task in spec.tasks if task.robot)
+        self.behaviour = behaviour_of(spec, spec.robot)
+        hands = tuple(task.device for task in spec.tasks)
         self.client = Client(
             address,
             role=Role.OBSERVER if self.observer else Role.OPERATOR,
             name=spec.name,
-            devices=(Device.HEAD,) if self.observer else (Device.HEAD, spec.device),
+            devices=(Device.HEAD, *hands),
             identity=spec.identity_file or None,
             curve=curve_of(spec),
             software="iris-session emulator",
@@ -107,13 +103,14 @@ class Person:
         self._request: tuple[int, int] | None = None
         self._retry_ns = 0
         self._refused_because = ""
-        self._holding_since = 0
-        self._open_clutch = RECLUTCH_SAMPLES
-        self._lease_version: int | None = None
+        self._clutches = {device: Clutch() for device in hands}
         self._jumps = sorted(spec.recentre_at_s)
         self.head = self._head_from = self._head_to = self._seat = look_at(spec.eye, spec.T_world_anchor[0])
         yaw = math.atan2(spec.T_world_anchor[0][1] - spec.eye[1], spec.T_world_anchor[0][0] - spec.eye[0])
-        self.display.hands[spec.device] = compose((spec.eye, quat_from_yaw(yaw)), (HAND_AT_REST, (1.0, 0.0, 0.0, 0.0)))
+        for device in hands:
+            x, y, z = HAND_AT_REST
+            at_rest = (x, -y if device.endswith("left") else y, z)
+            self.display.hands[device] = compose((spec.eye, quat_from_yaw(yaw)), (at_rest, (1.0, 0.0, 0.0, 0.0)))
         self.client.open()
 
     @property
@@ -157,6 +154,7 @@ class Person:
             report.age_ms_p99 = ages[min(len(ages) - 1, int(0.99 * len(ages)))]
         report.participant = client.participant_id
         report.rejected = self._rejected()
+        report.reclutches = sum(clutch.reclutches for clutch in self._clutches.values())
         report.samples_not_sent = client.connection.counters.samples_not_sent
         report.reconnects = client.connection.counters.reconnects
         report.clock_error_ms = client.clock_error_ns() / 1e6
@@ -197,8 +195,9 @@ class Person:
             sent = True
             self.display.hands[hand.device] = hand.pose_world
             self._send_hand(hand, alignment, now_ns)
-        if not sent:
-            rest = HandInput(self.spec.device, self.robot, self.display.hands[self.spec.device], False, math.nan)
+        for task in self.spec.tasks if not sent else ():
+            robot = task.robot or next(iter(self.robots), "")
+            rest = HandInput(task.device, robot, self.display.hands[task.device], False, math.nan)
             self._send_hand(rest, alignment, now_ns)
 
     def _send_hand(self, hand: HandInput, alignment: Alignment, now_ns: int) -> None:
@@ -210,7 +209,7 @@ class Person:
             pose,
             now_ns,
             robots=(hand.robot,) if self.client.lease_version(hand.robot) is not None else (),
-            clutch=self._clutch(hand, now_ns),
+            clutch=self._clutches[hand.device].sample(hand, self.client, self.display.estop, now_ns),
             gripper=None if math.isnan(hand.gripper) else hand.gripper,
         )
 
@@ -219,27 +218,6 @@ class Person:
             device, pose, tracking_epoch=self.headset.tracking_epoch, worn=self.headset.worn, **fields
         )
         self._uplink.push(sample, now_ns)
-
-    def _clutch(self, hand: HandInput, now_ns: int) -> bool:
-        """The clutch as a person works it: when the robot holds although it is closed, open it and close it again."""
-        lease_version = self.client.lease_version(hand.robot)
-        if lease_version != self._lease_version:  # a new lease arms only after it has seen the clutch open
-            self._lease_version = lease_version
-            self._open_clutch = RECLUTCH_SAMPLES
-        if self._open_clutch > 0:
-            self._open_clutch -= 1
-            return False
-        feedback = self.client.feedback.get(hand.robot)
-        holds = feedback is not None and feedback.state == CommandKind.HOLD and feedback.hold_reason in CLUTCH_AGAIN
-        if not (hand.clutch and holds) or self.display.estop:
-            self._holding_since = 0
-        elif not self._holding_since:
-            self._holding_since = now_ns
-        elif now_ns - self._holding_since > RECLUTCH_AFTER_S * 1e9:
-            self._holding_since = 0
-            self._open_clutch = RECLUTCH_SAMPLES
-            self.report.reclutches += 1
-        return hand.clutch
 
     # --- phases -------------------------------------------------------------------------------------------------------
 
@@ -277,11 +255,11 @@ class Person:
         self.head = between(self._head_from, self._head_to, fraction)
 
     def _acquire(self, now_ns: int) -> None:
-        if self.robot and self.client.lease_version(self.robot) is not None:
+        if self.robots and self._have_robots():
             self._request = None
             self._enter("work", now_ns)
         elif self._request is None and now_ns >= self._retry_ns:
-            number = self.client.submit(Acquire(0, (self.robot,) if self.robot else (), wait=True))
+            number = self.client.submit(Acquire(0, self.robots, wait=True))
             self._request = (self.client.connection.generation, number)
         elif self._request is not None:
             generation, number = self._request
@@ -298,16 +276,19 @@ class Person:
             self._refused_because = f"{reply.denial.reason}: {reply.denial.message}; {reply.denial.advice}"
             if reply.denial.reason in FOR_GOOD:
                 self.fail(self._refused_because, now_ns)
-        elif not self.robot and reply.leases:
-            self.robot = reply.leases[0].target
-            self.behaviour = behaviour_of(self.spec, self.robot)
+        elif not self.robots and reply.leases:
+            self.robots = (reply.leases[0].target,)
+            self.behaviour = behaviour_of(self.spec, self.robots[0])
+
+    def _have_robots(self) -> bool:
+        return all(self.client.lease_version(robot) is not None for robot in self.robots)
 
     def _fall_back(self, now_ns: int) -> None:
         """What was won can be lost: the alignment with a jump or a new session, the robot to somebody else."""
         if self.report.phase in ("watch", "acquire", "work") and self._alignment() is None:
             self._viewpoint = 0
             self._enter("look", now_ns)
-        elif self.report.phase == "work" and self.client.lease_version(self.robot) is None:
+        elif self.report.phase == "work" and not self._have_robots():
             self._enter("acquire", now_ns)
 
     def _scheduled(self, now_ns: int) -> None:
@@ -317,7 +298,8 @@ class Person:
             self._jumps.pop(0)
             self.headset.recentre(now_ns)
             self.client.new_tracking_frame()
-            self._open_clutch = RECLUTCH_SAMPLES
+            for clutch in self._clutches.values():
+                clutch.open()
         doff, don = self.spec.doff_at_s, self.spec.don_at_s
         worn = not (doff is not None and elapsed >= doff and (don is None or elapsed < don))
         if worn != self.headset.worn:

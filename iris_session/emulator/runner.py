@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from iris_session.client import RefusedError, wait_any
+from iris_session.client import ClientError, wait_any
 from iris_session.emulator.person import Person
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
@@ -65,7 +65,7 @@ def _drive(person: Person, ready: bool) -> None:
     try:
         if ready:
             person.client.poll(0.0)
-    except RefusedError as error:
+    except ClientError as error:
         if not person.finished:
             person.fail(str(error), time.monotonic_ns())
         return
@@ -76,8 +76,8 @@ def _give_up_joining(people: Sequence[Person], timeout_s: float, now_ns: int) ->
     for person in people:
         waited_s = (now_ns - person.started_ns) * 1e-9
         if person.report.phase == "join" and waited_s >= timeout_s:
-            text = f"no session let us in at {person.client.address} within {waited_s:.1f} s"
-            person.fail(f"{text}: is `iris-session serve` running there?", now_ns)
+            text = person.client.why_not_in(f"within {waited_s:.1f} s")
+            person.fail(f"no session let us in at {text}", now_ns)
 
 
 def _all_finished(people: Sequence[Person]) -> bool:

@@ -10,12 +10,31 @@ from iris_session.protocol.names import Device
 
 #: Behaviour of somebody who only looks.
 OBSERVER = "observer"
+#: Behaviours that are never done.
+ENDLESS = ("wander", "idle")
+
+
+class HandTask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What one hand does: `behaviour` (a name of `emulator.behaviours`) with `device` on `robot`.
+
+    `object`, `partner`: what is handed over, and the other robot. `arm`: kind of both robots (`behaviours.arms`).
+    `place`: where a receiver lays the object, x and y [m, world].
+    """
+
+    behaviour: str
+    robot: str
+    device: str = Device.CONTROLLER_RIGHT
+    object: str = "hammer"
+    partner: str = ""
+    arm: str = "arm"
+    place: tuple[float, float] | None = None
 
 
 class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One emulated person with one headset.
 
-    `behaviour`: `observer`, or a name of `emulator.behaviours`; then `robot` is what they drive with `device`.
+    `behaviour`: `observer`, or a name of `emulator.behaviours`; then `robot` is what they drive with `device`. A person
+    who works with both hands has `hands` instead, and takes all their robots or none.
     `eye`: where the head is while working [m, world]. `T_world_anchor`: where the sheet truly lies, which need not be
     what the session believes. `recentre_at_s`, `doff_at_s`, `don_at_s`: seconds after joining at which the tracking
     frame jumps, the headset is taken off, and put on again. `display_delay_s`: how old the picture is on purpose
@@ -28,7 +47,10 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     robot: str = ""
     object: str = "hammer"
     partner: str = ""
+    arm: str = "arm"
+    place: tuple[float, float] | None = None
     device: str = Device.CONTROLLER_RIGHT
+    hands: tuple[HandTask, ...] = ()
     seed: int = 0
     model: HeadsetModel = HeadsetModel()
     eye: Vec3 = (0.0, -0.95, 0.55)
@@ -45,6 +67,32 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     identity_file: str = ""
     curve_server: str = ""
     curve_key: str = ""
+
+    @property
+    def observer(self) -> bool:
+        return self.behaviour == OBSERVER and not self.hands
+
+    @property
+    def endless(self) -> bool:
+        """Whether what this person does never ends by itself."""
+        return all(task.behaviour in ENDLESS for task in self.tasks)
+
+    @property
+    def tasks(self) -> tuple[HandTask, ...]:
+        """What the hands do; nothing for an observer. The robot is empty where the session's policy chooses it."""
+        if self.hands or self.observer:
+            return self.hands
+        return (
+            HandTask(
+                behaviour=self.behaviour,
+                robot=self.robot,
+                device=self.device,
+                object=self.object,
+                partner=self.partner,
+                arm=self.arm,
+                place=self.place,
+            ),
+        )
 
 
 class HeadsetReport(msgspec.Struct, kw_only=True):

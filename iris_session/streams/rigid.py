@@ -1,4 +1,4 @@
-"""Rigid-state stream: poses of all bodies as one small payload per frame, 11 bytes per moving body.
+"""Rigid-state stream: poses of all bodies as one small payload per frame, 12 bytes per moving body.
 
 Error of every body of every delivered frame against the state at its tick: at most `MAX_POSITION_ERROR_M` (0.1 mm,
 Euclidean) and `MAX_ROTATION_ERROR_RAD` (0.05 deg). How it is kept:
@@ -11,7 +11,8 @@ Euclidean) and `MAX_ROTATION_ERROR_RAD` (0.05 deg). How it is kept:
   becomes complete even without a snapshot.
 - A body that cannot be quantised (not finite, far away from the others) escapes verbatim as float64.
 
-Payload, little-endian (normative: docs/protocol.md): header, mask, positions, rotations, escapes.
+Payload, little-endian (normative: docs/protocol.md): header, codes, mask, escapes. Codes are rows of 32-bit words, one
+row per axis: 18 bits of position and 14 bits of rotation, so that every client decodes them with two operations.
 """
 
 from __future__ import annotations
@@ -26,22 +27,18 @@ import numpy.typing as npt
 from iris_session.streams.errors import StreamError
 from iris_session.streams.quantise import (
     LATTICE_M,
-    PADDING,
     POSITION_QUANTUM_ERROR_M,
-    ROTATION_BYTES,
     ROTATION_QUANTUM_ERROR_RAD,
     Floats,
     Ints,
-    pack_words,
-    rotation_codes,
+    rotation_levels,
     rotations,
-    words_at,
 )
 
 MAX_POSITION_ERROR_M: Final = 1e-4
 MAX_ROTATION_ERROR_RAD: Final = math.radians(0.05)
 #: What a pose may drift from its anchor before it is sent again: the bound less the quantisation error, less a little
-#: for rounding in float64. 7.0 um and 0.0065 deg.
+#: for rounding in float64. 46 um and 0.025 deg.
 DRIFT_ALLOWANCE_M: Final = 0.995 * MAX_POSITION_ERROR_M - POSITION_QUANTUM_ERROR_M
 DRIFT_ALLOWANCE_RAD: Final = 0.995 * MAX_ROTATION_ERROR_RAD - ROTATION_QUANTUM_ERROR_RAD
 
@@ -51,17 +48,23 @@ WINDOW: Final = 30
 REFRESH_FRAMES: Final = 600
 MAX_BODIES: Final = 65535
 
-FORMAT: Final = 1
-#: format u8, position_bytes u8, n_bodies u16, n_quantised u16, n_escaped u16, origin 3 x i32, nx u32, ny u32.
-_HEADER: Final = struct.Struct("<BBHHH3iII")
+FORMAT: Final = 2
+#: Layouts of codes. Narrow: one word per axis, position (18 bits, a box of 16 m) below rotation (14 bits).
+#: Wide: rows of 32-bit positions, then rows of 16-bit rotation levels.
+NARROW: Final = 0
+WIDE: Final = 1
+POSITION_BITS: Final = 18
+NARROW_BYTES: Final = 12
+WIDE_BYTES: Final = 18
+#: format u8, layout u8, n_bodies u16, n_quantised u16, n_escaped u16, origin 3 x i32.
+_HEADER: Final = struct.Struct("<BBHHH3i")
 _ESCAPE: Final = np.dtype([("body", "<u2"), ("pose", "<f8", (7,))])
 _NO_ESCAPES: Final = np.empty(0, _ESCAPE)
-_MAX_POSITION_BYTES: Final = 7
+_POSITION_MASK: Final = np.uint32(2**POSITION_BITS - 1)
+_SHIFT: Final = np.uint32(POSITION_BITS)
 _MAX_INDEX: Final = 2**31 - 1
 #: Quaternions farther from unit length (squared) than this are no rotations: they escape.
 _MAX_NORM_DEFECT: Final = 1e-3
-#: Below this many bytes per position an outlier is not looked for.
-_USUAL_POSITION_BYTES: Final = 6
 _COS_ALLOWANCE: Final = math.cos(0.5 * DRIFT_ALLOWANCE_RAD)
 
 Mask = npt.NDArray[np.bool_]
@@ -90,10 +93,10 @@ class RigidEncoder:
         self.n_bodies = n_bodies
         self._next_seq = first_seq
         self._scene_epoch: int | None = None
-        self._anchor = np.full((n_bodies, 7), np.nan)
+        self._anchor = np.full((7, n_bodies), np.nan)
         self._anchored_seq = np.full(n_bodies, -1, np.int64)
-        self._index = np.zeros((n_bodies, 3), np.int64)  # lattice node of the anchor
-        self._rotation = np.zeros(n_bodies, np.uint64)
+        self._index = np.zeros((3, n_bodies), np.int64)  # lattice node of the anchor
+        self._levels = np.zeros((3, n_bodies), np.int64)
         self._escapes = np.zeros(n_bodies, np.bool_)  # anchor cannot be quantised
         self._refreshed = 0
 
@@ -108,54 +111,56 @@ class RigidEncoder:
             raise ValueError(f"poses have shape {poses.shape}, expected ({self.n_bodies}, 7): x y z qw qx qy qz")
         seq = self._next_seq
         self._next_seq += 1
-        changed = self._changed(poses)
-        if scene_epoch != self._scene_epoch:
-            self._scene_epoch = scene_epoch
-            changed[:] = True
-        self._anchor_anew(poses, np.flatnonzero(changed), seq)
+        rows = np.ascontiguousarray(poses.T)
+        with np.errstate(invalid="ignore", over="ignore"):
+            squares = np.einsum("ij,ij->j", rows[3:], rows[3:])
+            changed = self._changed(rows, squares)
+            if scene_epoch != self._scene_epoch:
+                self._scene_epoch = scene_epoch
+                changed[:] = True
+            self._anchor_anew(rows, squares, changed, seq)
         base_seq = max(seq - WINDOW, 0)
         sent = self._anchored_seq > base_seq
         self._add_refresh(sent)
         # A frame that holds every body (as all do until `WINDOW` frames after the first) needs no frame before it.
-        return EncodedFrame(seq, 0 if sent.all() else base_seq, self._pack(np.flatnonzero(sent)))
+        return EncodedFrame(seq, 0 if sent.all() else base_seq, self._pack(sent))
 
     def keyframe(self) -> tuple[int, Floats]:
         """`(state_seq, poses)` of the newest frame, for a snapshot: (n_bodies, 7), within the drift allowance."""
-        return self._next_seq - 1, self._anchor.copy()
+        return self._next_seq - 1, np.ascontiguousarray(self._anchor.T)
 
-    def _changed(self, poses: Floats) -> Mask:
-        """Bodies that left their anchor, and those that cannot be compared (not finite, no anchor yet)."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            offset = poses[:, :3] - self._anchor[:, :3]
-            near: Mask = np.einsum("ij,ij->i", offset, offset) <= DRIFT_ALLOWANCE_M**2
-            q, anchor_q = poses[:, 3:], self._anchor[:, 3:]
-            cosine = np.abs(np.einsum("ij,ij->i", q, anchor_q))
-            squares = np.einsum("ij,ij->i", q, q)
-            near &= (cosine >= _COS_ALLOWANCE * np.sqrt(squares)) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
+    def _changed(self, rows: Floats, squares: Floats) -> Mask:
+        """Bodies that left their anchor, and those that cannot be compared (not finite, no anchor yet).
+
+        `rows`: (7, n) poses. `squares`: of the length of their quaternions.
+        """
+        offset = rows[:3] - self._anchor[:3]
+        near: Mask = np.einsum("ij,ij->j", offset, offset) <= DRIFT_ALLOWANCE_M**2
+        cosine = np.abs(np.einsum("ij,ij->j", rows[3:], self._anchor[3:]))
+        near &= (cosine >= _COS_ALLOWANCE * np.sqrt(squares)) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
         return ~near
 
-    def _anchor_anew(self, poses: Floats, bodies: Ints, seq: int) -> None:
-        """Makes the present pose of `bodies` (ascending) their anchor and computes its code."""
-        if not len(bodies):
-            return
-        anchor = poses.take(bodies, axis=0)
-        q = anchor[:, 3:]
-        with np.errstate(invalid="ignore", over="ignore"):
-            squares = np.einsum("ij,ij->i", q, q)
-            nodes = np.rint(anchor[:, :3] * (1.0 / LATTICE_M))
-            fits = (np.abs(nodes) <= _MAX_INDEX).all(axis=1) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
-        at: Ints | slice = slice(None) if len(bodies) == self.n_bodies else bodies
+    def _anchor_anew(self, rows: Floats, squares: Floats, changed: Mask, seq: int) -> None:
+        """Makes the present pose of the `changed` bodies their anchor and computes its code."""
+        at: Ints | slice = slice(None)
+        if not changed.all():
+            at = np.flatnonzero(changed)
+            if not len(at):
+                return
+            rows, squares = rows[:, at], squares[at]
+        nodes = np.rint(rows[:3] * (1.0 / LATTICE_M))
+        fits = (np.abs(nodes) <= _MAX_INDEX).all(axis=0) & (np.abs(squares - 1.0) <= _MAX_NORM_DEFECT)
         self._anchored_seq[at] = seq
         self._escapes[at] = ~fits
         if not fits.all():
-            self._anchor[at] = anchor
-            at = bodies[fits]
-            anchor, squares, nodes = anchor[fits], squares[fits], nodes[fits]
-            q = anchor[:, 3:]
-        q /= np.sqrt(squares)[:, None]
-        self._anchor[at] = anchor
-        self._index[at] = nodes
-        self._rotation[at] = rotation_codes(q)
+            self._anchor[:, at] = rows
+            at = (np.arange(self.n_bodies) if isinstance(at, slice) else at)[fits]
+            rows, squares, nodes = rows[:, fits], squares[fits], nodes[:, fits]
+        q = rows[3:] / np.sqrt(squares)
+        self._anchor[:3, at] = rows[:3]
+        self._anchor[3:, at] = q
+        self._index[:, at] = nodes
+        self._levels[:, at] = rotation_levels(q)
 
     def _add_refresh(self, sent: Mask) -> None:
         """Marks the next bodies of the round robin in `sent`."""
@@ -164,36 +169,32 @@ class RigidEncoder:
             sent[self._refreshed] = True
             self._refreshed = (self._refreshed + 1) % self.n_bodies
 
-    def _pack(self, bodies: Ints) -> bytes:
-        """Payload with the anchors of `bodies` (ascending)."""
-        escapes = self._escapes[bodies]
-        quantised, escaped = (bodies[~escapes], bodies[escapes]) if escapes.any() else (bodies, bodies[:0])
-        index = self._index.take(quantised, axis=0)
-        origin, levels = _box(index)
-        position_bytes = _bytes_for(levels)
-        if position_bytes > _USUAL_POSITION_BYTES:
-            inside = _worth_quantising(index)
-            escaped = np.sort(np.concatenate((escaped, quantised[~inside])))
-            quantised, index = quantised[inside], index[inside]
-            origin, levels = _box(index)
-            position_bytes = _bytes_for(levels)
-        nx, ny = int(levels[0]), int(levels[1])
-        index -= origin
-        positions = index[:, 0] + nx * (index[:, 1] + ny * index[:, 2])
-        mask = np.zeros(self.n_bodies, np.bool_)
-        mask[quantised] = True
-        head = _HEADER.pack(
-            FORMAT, position_bytes, self.n_bodies, len(quantised), len(escaped), *origin.tolist(), nx, ny
-        )
-        return b"".join(
-            (
-                head,
-                np.packbits(mask, bitorder="little").tobytes(),
-                pack_words(positions, position_bytes),
-                pack_words(self._rotation.take(quantised), ROTATION_BYTES),
-                self._verbatim(escaped),
-            )
-        )
+    def _pack(self, sent: Mask) -> bytes:
+        """Payload with the anchors of the bodies `sent`."""
+        quantised = sent & ~self._escapes
+        index, levels = self._index, self._levels
+        if not quantised.all():
+            index, levels = index[:, quantised], levels[:, quantised]
+        origin, top = (index.min(axis=1), index.max(axis=1)) if index.size else (np.zeros(3, np.int64),) * 2
+        layout = NARROW
+        if (top - origin).max() >= 2**POSITION_BITS:
+            inside = _in_narrow_box(index)
+            if NARROW_BYTES * inside.sum() + _ESCAPE.itemsize * (~inside).sum() < WIDE_BYTES * len(inside):
+                quantised[np.flatnonzero(quantised)[~inside]] = False
+                index, levels = index[:, inside], levels[:, inside]
+                origin = index.min(axis=1)
+            else:
+                layout = WIDE
+        escaped = np.flatnonzero(sent & ~quantised)
+        n_quantised = index.shape[1]
+        index = index - origin[:, None]
+        if layout == NARROW:
+            codes = ((levels << POSITION_BITS) | index).astype("<u4").tobytes()
+        else:
+            codes = index.astype("<u4").tobytes() + levels.astype("<u2").tobytes()
+        head = _HEADER.pack(FORMAT, layout, self.n_bodies, n_quantised, len(escaped), *origin.tolist())
+        mask = b"" if n_quantised == self.n_bodies else np.packbits(quantised, bitorder="little").tobytes()
+        return b"".join((head, codes, mask, self._verbatim(escaped)))
 
     def _verbatim(self, bodies: Ints) -> bytes:
         """The anchors of `bodies` as escapes."""
@@ -201,40 +202,14 @@ class RigidEncoder:
             return b""
         escapes = np.empty(len(bodies), _ESCAPE)
         escapes["body"] = bodies
-        escapes["pose"] = self._anchor[bodies]
+        escapes["pose"] = self._anchor[:, bodies].T
         return escapes.tobytes()
 
 
-def _box(index: Ints) -> tuple[Ints, Ints]:
-    """Lowest node and number of nodes per axis of the box around lattice nodes `index` (m, 3)."""
-    if not len(index):
-        return np.zeros(3, np.int64), np.ones(3, np.int64)
-    axes = np.ascontiguousarray(index.T)  # three times as fast as along the short axis
-    origin = axes.min(axis=1)
-    return origin, axes.max(axis=1) - origin + 1
-
-
-def _bytes_for(levels: Ints) -> int:
-    """Bytes of one position code in a box of `levels` nodes per axis."""
-    nodes = int(levels[0]) * int(levels[1]) * int(levels[2])
-    return max(1, ((nodes - 1).bit_length() + 7) // 8)
-
-
-def _worth_quantising(index: Ints) -> Mask:
-    """Which of the nodes `index` (m, 3) go into the box, so that box and escapes together take the fewest bytes.
-
-    Considers the boxes around the k nodes nearest to the median, for every k.
-    """
-    order = np.argsort(np.abs(index - np.median(index, axis=0)).max(axis=1), kind="stable")
-    nodes = index[order]
-    extent = np.maximum.accumulate(nodes, axis=0) - np.minimum.accumulate(nodes, axis=0) + 1
-    bits = np.log2(extent.astype(np.float64)).sum(axis=1)
-    size = np.ceil(bits / 8.0 + 1e-9)  # the margin keeps rounding of log2 on the safe side
-    count = np.arange(1, len(index) + 1)
-    cost = count * size - count * (_ESCAPE.itemsize - ROTATION_BYTES)
-    cost[size > _MAX_POSITION_BYTES] = np.inf
-    inside = np.zeros(len(index), np.bool_)
-    inside[order[: int(cost.argmin()) + 1]] = True
+def _in_narrow_box(index: Ints) -> Mask:
+    """Which of the nodes `index` (3, m) lie in the narrow box around their median. At least half of them per axis."""
+    middle = np.median(index, axis=1)[:, None]
+    inside: Mask = (np.abs(index - middle) < 2 ** (POSITION_BITS - 1) - 1).all(axis=0)
     return inside
 
 
@@ -282,7 +257,7 @@ class RigidDecoder:
             return self.complete
         mask, poses, escapes = _unpack(payload, self.n_bodies)
         self.state_seq, self.base_seq = state_seq, base_seq
-        if len(poses) == self.n_bodies:  # everything moves: the common case, and the one that must be fast
+        if mask is None:  # everything moves: the common case, and the one that must be fast
             self.poses = poses
             self._held.fill(state_seq)
             return self.complete
@@ -318,49 +293,54 @@ class RigidDecoder:
         self._held[self._held >= max(self.base_seq, 1)] = self.state_seq
 
 
-def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask, Floats, npt.NDArray[np.void]]:
-    """Mask (n_bodies,) of the quantised bodies, their poses, and the escapes. Raises `StreamError`."""
+def _unpack(payload: bytes | memoryview, n_bodies: int) -> tuple[Mask | None, Floats, npt.NDArray[np.void]]:
+    """Mask (n_bodies,) of the quantised bodies (None: all of them), their poses (n, 7), and the escapes.
+
+    The poses are one coordinate after the other in memory: that is how they are decoded. Raises `StreamError`.
+    """
     if len(payload) < _HEADER.size:
         raise StreamError(f"payload of {len(payload)} bytes, shorter than its header of {_HEADER.size}")
-    form, position_bytes, bodies, n_quantised, n_escaped, ox, oy, oz, nx, ny = _HEADER.unpack_from(payload)
+    form, layout, bodies, n, n_escaped, ox, oy, oz = _HEADER.unpack_from(payload)
     if form != FORMAT or bodies != n_bodies:
         raise StreamError(
             f"payload of format {form} for {bodies} bodies, expected format {FORMAT} for {n_bodies}: "
             "take the bodies from a new snapshot"
         )
-    if not (1 <= position_bytes <= _MAX_POSITION_BYTES and min(nx, ny) >= 1 and nx * ny <= 2**56):
-        raise StreamError(
-            f"box of {nx} x {ny} nodes in {position_bytes} bytes: 1 to {_MAX_POSITION_BYTES} are possible"
-        )
-    at_positions = _HEADER.size + (n_bodies + 7) // 8
-    at_rotations = at_positions + n_quantised * position_bytes
-    at_escapes = at_rotations + n_quantised * ROTATION_BYTES
+    if layout not in (NARROW, WIDE) or n > n_bodies:
+        raise StreamError(f"layout {layout} of {n} bodies: layouts {NARROW} and {WIDE} of up to {n_bodies} are known")
+    at_mask = _HEADER.size + n * (NARROW_BYTES if layout == NARROW else WIDE_BYTES)
+    at_escapes = at_mask + (0 if n == n_bodies else (n_bodies + 7) // 8)
     end = at_escapes + n_escaped * _ESCAPE.itemsize
     if len(payload) != end:
         raise StreamError(f"payload of {len(payload)} bytes, its header asks for {end}")
-    padded = bytes(payload) + PADDING
-    bits = np.frombuffer(padded, np.uint8, at_positions - _HEADER.size, _HEADER.size)
-    mask = np.unpackbits(bits, bitorder="little").view(np.bool_)
-    if np.count_nonzero(mask[:n_bodies]) != n_quantised or np.count_nonzero(mask) != n_quantised:
+    mask = None if n == n_bodies else _mask(payload, at_mask, n, n_bodies)
+    escapes = _NO_ESCAPES if not n_escaped else _escaped(payload, at_escapes, n_escaped, n_bodies, mask)
+    words = np.ndarray((3, n), "<u4", payload, _HEADER.size)
+    if layout == NARROW:
+        levels = (words >> _SHIFT).view(np.int32)
+        words = words & _POSITION_MASK
+    else:
+        levels = np.ndarray((3, n), "<u2", payload, _HEADER.size + 12 * n).astype(np.int32)
+    rows = np.empty((7, n))
+    rotations(levels, rows[3], rows[4:])
+    positions = rows[:3]
+    np.multiply(words, LATTICE_M, out=positions)
+    positions += np.array(((ox,), (oy,), (oz,)), np.float64) * LATTICE_M  # exact: multiples of a power of two
+    return mask, rows.T, escapes
+
+
+def _mask(payload: bytes | memoryview, at: int, n_quantised: int, n_bodies: int) -> Mask:
+    mask = np.unpackbits(np.frombuffer(payload, np.uint8, (n_bodies + 7) // 8, at), bitorder="little").view(np.bool_)
+    if np.count_nonzero(mask[:n_bodies]) != n_quantised or mask[n_bodies:].any():
         raise StreamError(f"mask marks other than {n_quantised} of {n_bodies} bodies")
-    mask = mask[:n_bodies]
-    escapes = _NO_ESCAPES
-    if n_escaped:
-        escapes = np.frombuffer(padded, _ESCAPE, n_escaped, at_escapes)
-        body = escapes["body"].astype(np.int64)
-        if body[-1] >= n_bodies or (np.diff(body) <= 0).any() or mask[body].any():
-            raise StreamError("escaped bodies are not ascending, in range and apart from the mask")
-    codes = words_at(padded, at_positions, n_quantised, position_bytes)
-    poses = np.empty((n_quantised, 7))
-    ux, uy = np.uint64(nx), np.uint64(ny)
-    rest = codes // ux
-    z = rest // uy
-    xyz = np.empty((3, n_quantised))
-    xyz[0] = codes - rest * ux
-    xyz[1] = rest - z * uy
-    xyz[2] = z
-    xyz += np.array([[ox], [oy], [oz]], np.float64)
-    xyz *= LATTICE_M
-    poses[:, :3] = xyz.T
-    poses[:, 3:] = rotations(words_at(padded, at_rotations, n_quantised, ROTATION_BYTES))
-    return mask, poses, escapes
+    return mask[:n_bodies]
+
+
+def _escaped(
+    payload: bytes | memoryview, at: int, n_escaped: int, n_bodies: int, mask: Mask | None
+) -> npt.NDArray[np.void]:
+    escapes = np.frombuffer(payload, _ESCAPE, n_escaped, at)
+    body = escapes["body"].astype(np.int64)
+    if mask is None or body[-1] >= n_bodies or (np.diff(body) <= 0).any() or mask[body].any():
+        raise StreamError("escaped bodies are not ascending, in range and apart from the mask")
+    return escapes

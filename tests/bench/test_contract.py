@@ -22,6 +22,9 @@ STATE_KEYS = {
 INPUT_KEYS = {
     *("response_ms_p50", "response_ms_p99", "late_tick_share", "lateness_ms_p99", "samples_per_s", "rejected"),
 }
+SLOW_CLIENT_KEYS = {
+    f"{prefix}{key}" for prefix in ("", "link_") for key in ("resume_first_age_ms", "resume_fresh_after_ms")
+} | {"others_age_ms_p99", "others_age_ms_p99_link", "others_age_ms_p99_baseline", "late_tick_share"}
 
 
 def _bench(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -71,6 +74,39 @@ def test_input(tmp_path: Path) -> None:
     assert isinstance(got["rejected"], dict)
 
 
+@pytest.mark.e2e
+def test_slow_client(tmp_path: Path) -> None:
+    """One round. The client that was stopped, and the one whose link stalled, get fresh state again."""
+    result = _bench(tmp_path, "slow-client", "--clients", "3", "--bodies", "20", "--seconds", "1")
+    _check(result, "slow-client", SLOW_CLIENT_KEYS)
+    assert result["params"]["rounds"] == 1
+    assert result["reference"]["resume_first_age_ms"] > 2900.0
+    assert all(result["results"][f"{link}resume_first_age_ms"] < 1000.0 for link in ("", "link_"))
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("arguments", [("state", "--bodies", "20"), ("input", "--operators", "1", "--robots", "1")])
+def test_over_a_bad_link(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    """The figures include the link, so no bar applies."""
+    slow = tmp_path / "slow.toml"
+    slow.write_text("[[phases]]\ndelay_ms = 50\n")
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    people = ("--clients", "1") if arguments[0] == "state" else ("--observers", "0")
+    result = _bench(folder, *arguments, *people, "--seconds", "1", "--profile", str(slow))
+    assert result["bars"] == []
+    assert result["params"]["profile"] == str(slow)
+    assert "include the link" in result["params"]["bars"]
+    assert result["results"]["age_ms_p50" if arguments[0] == "state" else "response_ms_p50"] > 50.0
+
+
+def test_bench_of_an_unknown_profile_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "state", "--profile", "nice-wifi"]) == 2
+    assert "no profile 'nice-wifi': give one of none, lan, wan" in capsys.readouterr().err
+    assert main(["bench", "slow-client", "--clients", "2"]) == 2
+    assert "so 3" in capsys.readouterr().err
+
+
 def _report(value: float) -> BenchReport:
     results = {"age_ms_p99": value, "extra": 1}
     return BenchReport("state", {"clients": 2}, results, (bar(results, "age_ms_p99", "<=", 3.0),))
@@ -83,10 +119,17 @@ def test_a_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     assert ("MISSED" in report.lines()) is not ok
 
 
+def test_what_never_came_is_null() -> None:
+    report = _report(math.inf).as_dict()
+    assert report["results"]["age_ms_p99"] is report["bars"][0]["value"] is None
+    assert report["bars"][0]["ok"] is False
+    json.dumps(report, allow_nan=False)
+
+
 @pytest.mark.parametrize(("value", "options", "status"), [(9.0, ["--check"], 1), (9.0, [], 0), (1.0, ["--check"], 0)])
 def test_check_makes_a_missed_bar_the_exit_status(
     value: float, options: list[str], status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("iris_session.bench.state.run_state", lambda *_: _report(value))
+    monkeypatch.setattr("iris_session.bench.state.run_state", lambda *_, **__: _report(value))
     assert main(["bench", "state", *options]) == status
     assert "age_ms_p99" in capsys.readouterr().out

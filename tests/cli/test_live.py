@@ -31,7 +31,7 @@ STATUS = {
     ],
     "input_to_ctrl_ms": {"left": 21.0},
     "lateness": {"late_share": 0.001, "p99_ms": 0.8},
-    "handovers": [{}],
+    "handovers": 1,
     "drops": {"slow": 3},
 }  # fmt: skip
 
@@ -85,7 +85,7 @@ class _Session:
 
 
 def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refreshes that do not fit into the pipe are skipped and counted."""
+    """Refreshes that do not fit into the pipe are skipped and counted; none is cut, and no event is lost."""
     import os
 
     session = _Session()
@@ -96,8 +96,17 @@ def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyP
     session.events = [Event(1, 0, 0, MarkerAdded("p1", "hello"))]
     for _ in range(3):
         view.update(force=True)
-    assert view.skipped == 3
+    assert view.skipped == 2
+    got = b""
+    while not got.endswith(b"\n"):
+        got += os.read(read, 1 << 20)
+        view.update(force=True)
+    first = got.splitlines()[0]
+    assert [json.loads(first)["events"][0].split()[-1], json.loads(first)["status"]["text"][:2]] == ["text=hello", "xx"]
+    view._pending = b""
+    view.skipped = 3
     os.close(read)
+    view._pending = b"x"
     view.update(force=True)
     assert view.skipped == 4
     os.close(write)

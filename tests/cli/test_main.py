@@ -15,7 +15,7 @@ import pytest
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import session_config
 
-COMMANDS = ("demo", "serve", "verify", "emulate", "robots", "bench")
+COMMANDS = ("demo", "serve", "sessions", "verify", "emulate", "robots", "bench")
 
 
 def _help(command: str, capsys: pytest.CaptureFixture[str]) -> str:
@@ -56,9 +56,12 @@ def test_every_option_is_explained() -> None:
     assert silent == []
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["fly"], ["demo", "juggle"], ["serve"], ["bench", "state", "--clients", "x"]]
-)
+def test_serve_without_a_scene_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve"]) == 2
+    assert "--resume RECORDING" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["demo", "juggle"], ["bench", "state", "--clients", "x"]])
 def test_a_wrong_command_line_is_status_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)

@@ -2,7 +2,8 @@
 
 Stands in for network, headset and authority only: states reach the operators 30 to 60 ms old with 1 mm and 0.3 deg of
 noise and stalls, their samples reach the session 8 to 25 ms later with the same noise on the hand. `Referee` judges the
-handover from contacts alone. `python -m tests.emulator.handover_rig 50` counts successes over 50 seeds.
+handover from contacts alone. `python -m tests.emulator.handover_rig 50 iiwa` counts successes over 50 seeds of a demo
+(`handover`, `iiwa`, `aloha`; a third argument is the number of operators), or of `board`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import mujoco
 
 from anchors.pose import PoseTuple, distance, quat_from_rotvec, quat_from_yaw, quat_mul, quat_normalize
 from iris_session.control.controller import Controller
-from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver
+from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
 from iris_session.physics.objects import find_objects
 from iris_session.physics.robots import find_robots
 from iris_session.physics.scenes import scene_path
@@ -28,6 +29,7 @@ from iris_session.physics.world import World
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import CommandKind, HoldReason
 from iris_session.protocol.steps import Command, CommandSource, Decision
+from iris_session.runtime.plays import Play, make_play
 
 NOISE = (0.001, math.radians(0.3))  # per axis: m, rad
 STATE_S = 1.0 / 60.0
@@ -133,7 +135,8 @@ class Rig:
     behaviours: Mapping[str, Behaviour]
     seed: int = 0
     object: str = "hammer"
-    shift: bool = True  # start the object up to 30 mm and 20 deg from its place
+    also: tuple[str, ...] = ()  # other objects that change hands
+    shift: bool = True  # start the objects up to 30 mm and 20 deg from their places
     noise: tuple[float, float] = NOISE
     watch: Callable[[Rig, str], None] | None = None  # called at every change of an operator's phase
     views: dict[str, LateView] = field(default_factory=dict)
@@ -145,11 +148,12 @@ class Rig:
         model = self.model or mujoco.MjModel.from_xml_path(str(scene_path("handover")))
         self.robots, self.objects = find_robots(model), find_objects(model)
         self.world = World(model, self.robots, self.objects)
-        if self.shift:
-            self._shift_object()
+        for name in (self.object, *self.also) if self.shift else ():
+            self._shift_object(name)
         self.controller = Controller(model, self.robots, self.objects)
         self.controller.reset(self.world.data)
-        self.referee = Referee(self.object)
+        self.referees = {name: Referee(name) for name in (self.object, *self.also)}
+        self.referee = self.referees[self.object]
         self.views = {robot: LateView(random.Random(self.rng.random()), self.noise) for robot in self.behaviours}
         self._commands = {spec.name: Command(spec.name, CommandKind.HOLD, HoldReason.NO_SAMPLE) for spec in self.robots}
         self._on_the_way: deque[tuple[float, HandInput]] = deque()
@@ -179,12 +183,17 @@ class Rig:
             self._commands = {name: _seen(command) for name, command in self._commands.items()}
             self.controller.tick(self.world.data)
             self.world.tick()
-            self.referee.tick(self.world)
+            for referee in self.referees.values():
+                referee.tick(self.world)
 
     def end_engagement(self, robot: str) -> None:
         """What the session does after a gap in the samples: the robot holds until the clutch was opened once."""
         self._commands[robot] = Command(robot, CommandKind.HOLD, HoldReason.STALE)
         self._must_open.add(robot)
+
+    def moved_by_hand(self) -> None:
+        """After `qpos` was written: poses and contacts are those of the new state."""
+        self.world.set_state_bytes(self.world.state_bytes())
 
     def _publish(self) -> None:
         if self.now_s < self._next_state_s:
@@ -243,12 +252,13 @@ class Rig:
             )
             self._commands[hand.robot] = Command(hand.robot, CommandKind.POSE, "", (source,), hand.gripper)
 
-    def _shift_object(self) -> None:
+    def _shift_object(self, name: str) -> None:
         data = self.world.data
-        at = self.world.model.joint(self.object).qposadr[0]
+        at = int(self.world.model.jnt_qposadr[self.world.model.body(name).jntadr[0]])
         data.qpos[at : at + 2] += (self.rng.uniform(-0.03, 0.03), self.rng.uniform(-0.03, 0.03))
-        data.qpos[at + 3 : at + 7] = quat_from_yaw(self.rng.uniform(-0.35, 0.35))
-        self.world.refresh()
+        turn = quat_from_yaw(self.rng.uniform(-0.35, 0.35))
+        data.qpos[at + 3 : at + 7] = quat_mul(turn, tuple(data.qpos[at + 3 : at + 7].tolist()))
+        self.moved_by_hand()
 
 
 def _seen(command: Command) -> Command:
@@ -263,9 +273,18 @@ def _seen(command: Command) -> Command:
 
 
 def handover(seed: int, object: str = "hammer", giver: str = "left", receiver: str = "right", **options: Any) -> Rig:
-    """A rig with one giver and one receiver."""
+    """A rig with one giver and one receiver in the packaged handover scene."""
     behaviours = {giver: Giver(giver, object, receiver), receiver: Receiver(receiver, object, giver)}
     return Rig(behaviours, seed, object, **options)
+
+
+def demo(play: Play, seed: int, **options: Any) -> Rig:
+    """A rig with the cast of a demo, one behaviour per robot; who has no partner is left out."""
+    behaviours = {}
+    for task in (task for person in play.people for task in person.tasks if task.partner):
+        args = (task.behaviour, task.robot, task.object, task.partner, task.device, seed, task.arm, task.place)
+        behaviours[task.robot] = make_behaviour(*args)
+    return Rig(behaviours, seed, play.objects[0], play.objects[1:], model=play.model, **options)
 
 
 def verdict(rig: Rig, giver: str, receiver: str) -> str:
@@ -278,16 +297,36 @@ def verdict(rig: Rig, giver: str, receiver: str) -> str:
     return "" if rig.referee.resting else "the object does not rest on the table alone"
 
 
-def main(runs: int, object: str, giver: str, receiver: str) -> None:
+def demo_verdict(rig: Rig) -> str:
+    """Empty when every object changed hands cleanly and rests, else what is wrong."""
+    wrong = [
+        f"{robot} ({b.phase}): {b.failed or 'not done'}"
+        for robot, b in rig.behaviours.items()
+        if b.failed or not b.done
+    ]
+    for giver in (b for b in rig.behaviours.values() if isinstance(b, Giver)):
+        referee = rig.referees[giver.object]
+        if not referee.handed_over(giver.robot, giver.partner):
+            wrong.append(f"no clean handover of {giver.object}: {referee.flights}")
+        elif not referee.resting:
+            wrong.append(f"{giver.object} does not rest on the table alone")
+    return "; ".join(wrong)
+
+
+def over(rig: Rig) -> bool:
+    """Whether everybody is done, or somebody has given up."""
+    behaviours = rig.behaviours.values()
+    return all(b.done for b in behaviours) or any(b.failed for b in behaviours)
+
+
+def main(runs: int, name: str = "handover", operators: int = 2, first: int = 0) -> None:
     """Counts successes over `runs` seeds."""
     good, times = 0, []
-    for seed in range(runs):
-        rig = handover(seed, object, giver, receiver)
-        rig.run(
-            90.0,
-            until=lambda r: all(b.done for b in r.behaviours.values()) or any(b.failed for b in r.behaviours.values()),
-        )
-        wrong = verdict(rig, giver, receiver)
+    play = None if name == "board" else make_play(name, operators)
+    for seed in range(first, first + runs):
+        rig = handover(seed, "board", "right", "left") if play is None else demo(play, seed)
+        rig.run(90.0, until=over)
+        wrong = demo_verdict(rig)
         good += not wrong
         times.append(rig.now_s)
         tries = [b.attempts for b in rig.behaviours.values()]
@@ -295,8 +334,8 @@ def main(runs: int, object: str, giver: str, receiver: str) -> None:
         if wrong or max(tries) > 1 or max(again) > 0 or rig.fastest_hand > 0.5:
             notes = f"attempts {tries}, reclutched {again}, {rig.fastest_hand:.2f} m/s"
             print(f"seed {seed}: {wrong or 'ok'}, {rig.now_s:.1f} s, {notes}", flush=True)
-    print(f"{object} {giver}->{receiver}: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
+    print(f"{name}, {operators} operators: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), *(sys.argv[2:5] or ("hammer", "left", "right")))
+    main(int(sys.argv[1]), *sys.argv[2:3], *map(int, sys.argv[3:5]))

@@ -114,7 +114,7 @@ def test_thing_moved_away_before_the_grasp() -> None:
     rig.run(30.0, until=_until("left", "close"))
     at = rig.world.model.joint("hammer").qposadr[0]
     rig.world.data.qpos[at : at + 2] += (0.02, 0.09)
-    rig.world.refresh()
+    rig.moved_by_hand()
     rig.run(50.0)
     assert verdict(rig, "left", "right") == ""
     assert rig.behaviours["left"].attempts == 2  # type: ignore[attr-defined]
@@ -140,7 +140,7 @@ def test_thing_that_leans_on_something_is_left_alone() -> None:
     at = rig.world.model.joint("hammer").qposadr[0]
     rig.world.data.qpos[at + 2] = 0.17
     rig.world.data.qpos[at + 3 : at + 7] = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)  # on its head, handle upright
-    rig.world.refresh()
+    rig.moved_by_hand()
     rig.run(10.0, until=lambda r: r.behaviours["left"].done)
     assert rig.behaviours["left"].failed == "the hammer does not lie flat, it cannot be taken from above"
 

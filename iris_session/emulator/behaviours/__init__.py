@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
+from iris_session.emulator.behaviours.arms import arm_kind
 from iris_session.emulator.behaviours.base import Behaviour, HandInput, OperatorView
 from iris_session.emulator.behaviours.giver import Giver
+from iris_session.emulator.behaviours.hands import Hands
 from iris_session.emulator.behaviours.receiver import Receiver
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device
 
-__all__ = ["Behaviour", "Giver", "HandInput", "Idle", "OperatorView", "Receiver", "Wander", "make_behaviour"]
+__all__ = ["Behaviour", "Giver", "HandInput", "Hands", "Idle", "OperatorView", "Receiver", "Wander", "make_behaviour"]
 
 NAMES = ("giver", "receiver", "wander", "idle")
 
@@ -23,8 +25,11 @@ def make_behaviour(
     partner: str = "",
     device: str = Device.CONTROLLER_RIGHT,
     seed: int = 0,
+    arm: str = "arm",
+    place: tuple[float, float] | None = None,
 ) -> Behaviour:
     """The behaviour `name` for `robot`. `partner`: the other robot of a handover; default the other of left and right.
+    `arm`: kind of both arms. `place`: where a receiver lays the thing (x, y [m], world); default before its robot.
 
     Raises `ValueError` naming what is available.
     """
@@ -34,9 +39,9 @@ def make_behaviour(
         partner = "right" if robot == "left" else "left"
     match name:
         case "giver":
-            return Giver(robot, object, partner, device)
+            return Giver(robot, object, partner, device, arm_kind(arm))
         case "receiver":
-            return Receiver(robot, object, partner, device)
+            return Receiver(robot, object, partner, device, arm_kind(arm), place)
         case "wander":
             return Wander(robot, device, seed)
         case "idle":

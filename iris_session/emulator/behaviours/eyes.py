@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from anchors.pose import PoseTuple, Vec3, apply, distance, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.base import OperatorView
-from iris_session.emulator.behaviours.things import PAD_IN_FINGER
 
 #: Smoothing time of vision [s]: averages 1 mm of noise at 60-90 Hz to about 0.4 mm.
 SMOOTHING_S = 0.07
@@ -42,12 +42,15 @@ class Seen:
 class Eyes:
     """Watches bodies and robot tips by name. `missing`: which of them were never seen so far.
 
-    `perhaps`: bodies that need not be there.
+    `arm`: the kind of the robots. `perhaps`: bodies that need not be there.
     """
 
-    def __init__(self, bodies: tuple[str, ...], robots: tuple[str, ...], perhaps: tuple[str, ...] = ()) -> None:
-        fingers = tuple(f"{robot}/finger_{side}" for robot in robots for side in ("left", "right"))
-        self._bodies = bodies + fingers + tuple(f"{robot}/base" for robot in robots)
+    def __init__(
+        self, bodies: tuple[str, ...], robots: tuple[str, ...], perhaps: tuple[str, ...] = (), arm: ArmKind = ARM
+    ) -> None:
+        self._arm = arm
+        parts = tuple(f"{robot}/{part}" for robot in robots for part in (*arm.fingers, arm.base))
+        self._bodies = bodies + parts
         self._robots = robots
         self._perhaps = perhaps
         self._seen: dict[str, Seen] = {}
@@ -84,14 +87,17 @@ class Eyes:
     def tip(self, robot: str) -> PoseTuple:
         return self._seen[f"tip {robot}"].pose
 
+    def base(self, robot: str) -> PoseTuple:
+        return self._seen[f"{robot}/{self._arm.base}"].pose
+
     def still_s(self, name: str) -> float:
         """For how long [s] the body `name` has kept still."""
         return self._seen[name].still_s
 
     def pads(self, robot: str) -> tuple[Vec3, Vec3]:
         """Where the faces of the two finger pads are [m], world frame."""
-        left, right = (self._seen[f"{robot}/finger_{side}"].pose for side in ("left", "right"))
-        return apply(left, PAD_IN_FINGER), apply(right, PAD_IN_FINGER)
+        one, other = (self._seen[f"{robot}/{finger}"].pose for finger in self._arm.fingers)
+        return apply(one, self._arm.pads[0]), apply(other, self._arm.pads[1])
 
     def gap(self, robot: str) -> float:
         """Distance between the finger pads [m]."""

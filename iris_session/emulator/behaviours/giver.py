@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from anchors.pose import apply, distance
+from anchors.pose import PoseTuple, apply, compose, distance, inverse, quat_angle
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.operator import CLEAR_ABOVE, Operator
 from iris_session.emulator.behaviours.things import above, face_up, level, tilt
 from iris_session.protocol.names import Device
@@ -27,9 +28,10 @@ class Giver(Operator):
         object: str,
         partner: str,
         device: str = Device.CONTROLLER_RIGHT,
+        arm: ArmKind = ARM,
         patience_s: float = 60.0,
     ) -> None:
-        super().__init__(robot, object, partner, device)
+        super().__init__(robot, object, partner, device, arm)
         self._after_close = "lift"
         self._patience_s = patience_s
         self._taken_since_s = math.inf
@@ -46,20 +48,21 @@ class Giver(Operator):
         return "look"
 
     def _look(self) -> None:
-        """Waits until the thing lies still, and chooses the end to take: the free end must point at the partner."""
+        """Waits until the thing lies still, and chooses the end to take: the one that turns the wrist least."""
         if self.eyes.still_s(self.object) < 0.3:
             return
         if tilt(self.eyes.body(self.object)) > MOST_TILT:
             if self._waited(3.0):
                 self._give_up(f"the {self.object} does not lie flat, it cannot be taken from above")
             return
-        self._take_x = self.thing.giver_x
-        if self.thing.symmetric:
-            _, direction = self._exchange()
-            (ox, oy, _), (tx, ty, _) = (apply(self.eyes.body(self.object), (x, 0.0, 0.0)) for x in (0.0, self._take_x))
-            if (tx - ox) * direction[0] + (ty - oy) * direction[1] > 0.0:
-                self._take_x = -self._take_x
+        ends = (self.thing.giver_x, -self.thing.giver_x) if self.thing.symmetric else (self.thing.giver_x,)
+        self._take_x = min(ends, key=self._effort)
         self._enter("approach")
+
+    def _effort(self, take_x: float) -> float:
+        """How far [rad] the wrist must turn to take the thing at this end, and then to offer the other."""
+        self._take_x = take_x
+        return self._turn(self._grasp_pose(), self.eyes.body(self.object))
 
     def _lift(self) -> None:
         if self._entering_now:
@@ -71,13 +74,24 @@ class Giver(Operator):
 
     def _present(self) -> None:
         if self._entering_now:
-            place, (dx, dy, _) = self._exchange()
-            towards = math.atan2(dy, dx) if self._take_x < 0.0 else math.atan2(-dy, -dx)
-            self.hand.move_to(self._tip_for(level(place, towards, face_up(self.eyes.body(self.object)))))
+            self.hand.move_to(self._tip_for(self._offered()))
         if self._lost():
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
         elif self.hand.arrived(0.008, 0.05) or self._waited(8.0):
             self._enter("offer")
+
+    def _offered(self) -> PoseTuple:
+        """Pose of the thing when it is offered: its free end towards the partner."""
+        place, (dx, dy, _) = self._exchange()
+        towards = math.atan2(dy, dx) if self._take_x < 0.0 else math.atan2(-dy, -dx)
+        return level(place, towards, face_up(self.eyes.body(self.object)))
+
+    def _turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
+        """The same way has to do for offering it, and the turn between the two is work as well."""
+        offered = self._offered()
+        offering = compose(offered, compose(inverse(T_world_thing), T_world_tip))
+        farthest = max(super()._turn(T_world_tip, T_world_thing), super()._turn(offering, T_world_thing))
+        return farthest + 0.5 * quat_angle(offered[1], T_world_thing[1])
 
     def _offer(self) -> None:
         thing = self.eyes.body(self.object)

@@ -48,8 +48,9 @@ LONGEST_STEP_S = 0.05
 class ClutchedHand:
     """One hand on one robot. Call `update` once per sample, then `input`; goals are tip poses in the world."""
 
-    def __init__(self, device: str, robot: str) -> None:
+    def __init__(self, device: str, robot: str, speed: float = SPEED) -> None:
         self.device, self.robot = device, robot
+        self._free_speed = speed  # m/s
         self.now_s = 0.0  # the operator's own clock: runs only while he can act
         self.reclutches = 0
         self.trigger_goal = 0.0
@@ -63,7 +64,7 @@ class ClutchedHand:
         self._correction_p: Vec3 = (0.0, 0.0, 0.0)
         self._correction_r: Vec3 = (0.0, 0.0, 0.0)
         self._goal: PoseTuple | None = None
-        self._speed, self._turn = SPEED, TURN
+        self._speed, self._turn = speed, TURN
         self._reach: Reach | None = None
         self._correcting = True
         self._missing_m, self._missing_rad = math.inf, math.inf
@@ -89,8 +90,9 @@ class ClutchedHand:
             self._follow(tip, step_s)
         return True
 
-    def move_to(self, goal: PoseTuple, speed: float = SPEED, turn: float = TURN, correct: bool = True) -> None:
+    def move_to(self, goal: PoseTuple, speed: float | None = None, turn: float = TURN, correct: bool = True) -> None:
         """Starts a movement of the tip to `goal`. `correct`: add what is missing at the end, until told otherwise."""
+        speed = self._free_speed if speed is None else min(speed, self._free_speed)
         self._goal, self._speed, self._turn, self._correcting = goal, speed, turn, correct
         self._still = False
         self._close_since_s = math.inf

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_rotate
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.base import HandInput, OperatorView
 from iris_session.emulator.behaviours.eyes import Eyes
 from iris_session.emulator.behaviours.hand import ClutchedHand
-from iris_session.emulator.behaviours.things import COMMON_THINGS, Thing, above, grasp, thing_named
+from iris_session.emulator.behaviours.things import COMMON_THINGS, Thing, above, grasps, thing_named
 
-#: Height of the hands above the bases of the robots at the exchange [m].
-EXCHANGE_HEIGHT = 0.34
 #: How far above a grasp the hand first goes, and how far it backs off afterwards [m].
 CLEAR_ABOVE = 0.11
 #: Speed of the last centimetres before a grasp [m/s].
@@ -28,15 +27,16 @@ class Operator:
     A subclass fills `self._steps` (phase -> method called once per update) and says where to take the thing.
     """
 
-    def __init__(self, robot: str, object: str, partner: str, device: str) -> None:
+    def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
         self.phase = "wait"
         self.done = False
         self.failed = ""
         self.attempts = 1
         self.robot, self.object, self.partner = robot, object, partner
         self.thing: Thing = thing_named(object)
-        self.hand = ClutchedHand(device, robot)
-        self.eyes = Eyes((object,), (robot, partner), tuple(name for name in COMMON_THINGS if name != object))
+        self.arm = arm
+        self.hand = ClutchedHand(device, robot, arm.speed)
+        self.eyes = Eyes((object,), (robot, partner), tuple(name for name in COMMON_THINGS if name != object), arm)
         self._entering, self._entering_now = True, False
         self._entered_s = 0.0
         self._search_since_ns: int | None = None
@@ -97,7 +97,9 @@ class Operator:
     def _descend(self) -> None:
         if self._entering_now:
             self.hand.move_to(self._grasp_pose(), CAREFUL_SPEED)
-        if self.hand.arrived(0.0025, 0.025) or (self._waited(4.0) and self.hand.arrived(0.006, 0.06)):
+        if self.hand.arrived(self.arm.near_m, self.arm.near_rad) or (
+            self._waited(4.0) and self.hand.arrived(0.006, 0.06)
+        ):
             self._enter("close")
         elif self._waited(6.0):
             self._retry(f"{self.robot} cannot reach down to the {self.object}")
@@ -142,7 +144,7 @@ class Operator:
             self._clutched_again = 0
         self.hand.hold_still()
         self.hand.trigger_goal = 0.0
-        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.015:
+        if self.hand.trigger_done() and self.eyes.gap(self.robot) > 2.0 * self.thing.half_width + 0.010:
             self._enter(then)
         elif self._waited(8.0):
             self._give_up(f"the gripper of {self.robot} does not open")
@@ -176,9 +178,13 @@ class Operator:
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 
     def _grasp_pose(self) -> PoseTuple:
-        """Tip pose that takes the thing where it is seen now."""
-        like = self._home if self._home is not None else self.eyes.tip(self.robot)
-        return grasp(self.eyes.body(self.object), self._take_x, like[1])
+        """Tip pose that takes the thing where it is seen now, and turns the wrist least."""
+        T_world_thing = self.eyes.body(self.object)
+        return min(grasps(T_world_thing, self._take_x, self.arm.lean), key=lambda tip: self._turn(tip, T_world_thing))
+
+    def _turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
+        """How far [rad] the wrist is from home when the tip takes the thing like this."""
+        return quat_angle(T_world_tip[1], (self._home or self.eyes.tip(self.robot))[1])
 
     def _holding(self) -> bool:
         return self.eyes.holds(self.robot, self.object, self.thing.half_width)
@@ -195,7 +201,14 @@ class Operator:
 
     def _exchange(self) -> tuple[Vec3, Vec3]:
         """Where things change hands (world), and the horizontal direction from me to my partner."""
-        (ax, ay, az), (bx, by, bz) = self.eyes.body(f"{self.robot}/base")[0], self.eyes.body(f"{self.partner}/base")[0]
+        mine, other = self.eyes.base(self.robot), self.eyes.base(self.partner)
+        (ax, ay, az), (bx, by, bz) = mine[0], other[0]
+        (fx, fy, _), (gx, gy, _) = (quat_rotate(base[1], (1.0, 0.0, 0.0)) for base in (mine, other))
+        inward = self.arm.exchange_inward / 2.0
         apart = max(((bx - ax) ** 2 + (by - ay) ** 2) ** 0.5, 1e-6)
-        middle = ((ax + bx) / 2.0, (ay + by) / 2.0, (az + bz) / 2.0 + EXCHANGE_HEIGHT)
-        return middle, ((bx - ax) / apart, (by - ay) / apart, 0.0)
+        place = ((ax + bx) / 2.0 + inward * (fx + gx), (ay + by) / 2.0 + inward * (fy + gy))
+        return (*place, (az + bz) / 2.0 + self.arm.exchange_height), ((bx - ax) / apart, (by - ay) / apart, 0.0)
+
+    def _table(self) -> float:
+        """Height of the table [m], world frame."""
+        return self.eyes.base(self.robot)[0][2] - self.arm.above_table

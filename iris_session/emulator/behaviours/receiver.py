@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from anchors.pose import PoseTuple, Vec3, apply, distance
+from anchors.pose import PoseTuple, Vec3, apply, distance, quat_rotate
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.operator import CAREFUL_SPEED, CLEAR_ABOVE, Operator
 from iris_session.emulator.behaviours.things import above, face_up, level
 from iris_session.protocol.names import Device
@@ -28,16 +29,18 @@ class Receiver(Operator):
         object: str,
         partner: str,
         device: str = Device.CONTROLLER_RIGHT,
+        arm: ArmKind = ARM,
         place: tuple[float, float] | None = None,
         patience_s: float = 120.0,
     ) -> None:
-        super().__init__(robot, object, partner, device)
+        super().__init__(robot, object, partner, device, arm)
         self._after_close = "secure"
         self._place = place
         self._patience_s = patience_s
         self._laid: PoseTuple | None = None
         self._steps |= {
             "watch": self._watch,
+            "raise": self._raise,
             "secure": self._secure,
             "carry": self._carry,
             "lower": self._lower,
@@ -60,9 +63,18 @@ class Receiver(Operator):
         )
         if offered:
             self._take_x = self._free_end()
-            self._enter("approach")
+            self._enter("raise")
         elif self._waited(self._patience_s):
             self._give_up(f"nobody offered the {self.object} within {self._patience_s:.0f} s")
+
+    def _raise(self) -> None:
+        """Straight up to where the thing will be approached from: on a slant, the fingers could push it away."""
+        if self._entering_now:
+            (x, y, z), q = self.eyes.tip(self.robot)
+            height = self._grasp_pose()[0][2] + CLEAR_ABOVE
+            self.hand.move_to(((x, y, max(z, height)), q))
+        if self.hand.arrived(0.03, 0.1) or self._waited(4.0):
+            self._enter("approach")
 
     def _free_end(self) -> float:
         """Where to take the thing [m along its x]: for a symmetric thing the end away from the giver's fingers."""
@@ -77,7 +89,7 @@ class Receiver(Operator):
         if self._entering_now:
             self.hand.hold_still()
         given_at = apply(self.eyes.body(self.object), (-self._take_x, 0.0, 0.0))
-        opened = self.eyes.gap(self.partner) > 2.0 * self.thing.half_width + 0.015
+        opened = self.eyes.gap(self.partner) > 2.0 * self.thing.half_width + 0.010
         if opened and distance(self.eyes.tip(self.partner)[0], given_at) > LEFT_M:
             self._enter("carry")
         elif self._waited(1.0) and not self._holding():
@@ -88,10 +100,10 @@ class Receiver(Operator):
     def _carry(self) -> None:
         if self._entering_now:
             x, y = self._place if self._place is not None else self._free_place()
-            base, (dx, dy, _) = self.eyes.body(f"{self.robot}/base")[0], self._exchange()[1]
-            yaw = math.atan2(-dy, -dx) if self._take_x > 0.0 else math.atan2(dy, dx)
+            bx, by, _ = self.eyes.base(self.robot)[0]
+            yaw = math.atan2(by - y, bx - x) if self._take_x > 0.0 else math.atan2(y - by, x - bx)
             up = face_up(self.eyes.body(self.object))
-            self._laid = level((x, y, base[2] + self.thing.half_thickness), yaw, up)
+            self._laid = level((x, y, self._table() + self.thing.half_thickness), yaw, up)
             self.hand.move_to(self._tip_for(above(self._laid, CLEAR_ABOVE)))
         if self._lost():
             self._give_up(f"{self.robot} dropped the {self.object} on the way")
@@ -110,8 +122,7 @@ class Receiver(Operator):
     def _put(self) -> None:
         """The last centimetre, by the height that is seen below the lowest point."""
         if self._entering_now:
-            table = self.eyes.body(f"{self.robot}/base")[0][2]
-            below = self.thing.lowest(self.eyes.body(self.object)) - table
+            below = self.thing.lowest(self.eyes.body(self.object)) - self._table()
             self.hand.move_to(above(self.eyes.tip(self.robot), -max(below - 0.0005, 0.0)), 0.05, correct=False)
         if self.hand.moved() and self._waited(0.9):
             self._enter("open")
@@ -132,10 +143,10 @@ class Receiver(Operator):
 
     def _free_place(self) -> tuple[float, float]:
         """A place in front of the robot, on the side of the shared table that is farther from other things."""
-        base, (dx, dy, _) = self.eyes.body(f"{self.robot}/base")[0], self._exchange()[1]
-        sides = [
-            (base[0] + 0.43 * dx - side * 0.2 * dy, base[1] + 0.43 * dy + side * 0.2 * dx, base[2]) for side in (1, -1)
-        ]
+        base, q = self.eyes.base(self.robot)
+        dx, dy, _ = quat_rotate(q, (self.arm.reach, 0.0, 0.0))
+        aside = 0.2 / self.arm.reach
+        sides = [(base[0] + dx - s * aside * dy, base[1] + dy + s * aside * dx, base[2]) for s in (1.0, -1.0)]
         others = self.eyes.others()
 
         def room(place: Vec3) -> float:

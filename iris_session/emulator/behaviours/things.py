@@ -9,10 +9,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from anchors.pose import PoseTuple, Quat, Vec3, apply, compose, quat_angle, quat_from_yaw, quat_mul, quat_rotate
+from anchors.pose import (
+    PoseTuple,
+    Quat,
+    Vec3,
+    apply,
+    compose,
+    quat_from_rotvec,
+    quat_from_yaw,
+    quat_mul,
+    quat_rotate,
+)
 
-#: Middle of the face of a finger pad in the frame of its finger body [m].
-PAD_IN_FINGER: Vec3 = (0.0, 0.0, 0.045)
 #: How far above the middle of a thing's thickness the pads take it [m]: keeps the finger tips clear of the table.
 _GRASP_ABOVE = 0.003
 
@@ -57,20 +65,30 @@ BOARD = Thing(
     corners=_outline((-0.150, 0.150, 0.028, 0.012)),
     symmetric=True,
 )
-
+#: Of the ALOHA scene: light enough for the points of its finger tips.
+SLAT = Thing(
+    giver_x=-0.100,
+    receiver_x=0.100,
+    half_width=0.016,
+    half_thickness=0.0125,
+    corners=_outline((-0.145, 0.145, 0.016, 0.0125)),
+    symmetric=True,
+)
+KNOWN: dict[str, Thing] = {"hammer": HAMMER, "board": BOARD, "red_board": SLAT, "blue_board": SLAT}
 
 #: Things that may lie about, to be kept clear of.
-COMMON_THINGS = ("hammer", "board", *(f"object{i}" for i in range(1, 7)))
+COMMON_THINGS = (*KNOWN, *(f"object{i}" for i in range(1, 9)))
 
 
 def thing_named(name: str) -> Thing:
-    """The thing that body `name` is: `hammer`, `board`, or `objectN` of a generated scene (odd N: hammers)."""
+    """The thing that body `name` is: one of `KNOWN`, or `objectN` of a generated scene (odd N: hammers)."""
     if name.startswith("object") and name[6:].isdigit():
         return HAMMER if int(name[6:]) % 2 else BOARD
-    known = {"hammer": HAMMER, "board": BOARD}
-    if name not in known:
-        raise ValueError(f"no operator knows how to take '{name}'. Known things: hammer, board, object1, object2, ...")
-    return known[name]
+    if name not in KNOWN:
+        raise ValueError(
+            f"no operator knows how to take '{name}'. Known things: {', '.join(KNOWN)}, object1, object2, ..."
+        )
+    return KNOWN[name]
 
 
 def face_up(T_world_thing: PoseTuple) -> float:
@@ -89,17 +107,16 @@ def level(p_world: Vec3, yaw: float, up: float) -> PoseTuple:
     return (p_world, q if up > 0.0 else quat_mul(q, (0.0, 1.0, 0.0, 0.0)))
 
 
-def grasp(T_world_thing: PoseTuple, x: float, q_world_like: Quat) -> PoseTuple:
-    """Tip pose that takes the thing at `x` [m] from above.
-
-    A gripper fits two ways, turned by half a turn: the one nearer to the orientation `q_world_like` is taken.
-    """
+def grasps(T_world_thing: PoseTuple, x: float, lean: float = 0.0) -> list[PoseTuple]:
+    """The two tip poses that take the thing at `x` [m] from above, half a turn from each other. The fingers lean
+    towards its middle by `lean` [rad]."""
     up = face_up(T_world_thing)
     ways: tuple[Quat, Quat] = ((0.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 0.0))
     if up < 0.0:
         ways = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    poses = [compose(T_world_thing, ((x, 0.0, up * _GRASP_ABOVE), way)) for way in ways]
-    return min(poses, key=lambda pose: quat_angle(pose[1], q_world_like))
+    # About the thing's y axis: brings the fingers, along -up z, towards the middle, along -x.
+    leaning = quat_from_rotvec((0.0, math.copysign(lean, x) * up, 0.0))
+    return [compose(T_world_thing, ((x, 0.0, up * _GRASP_ABOVE), quat_mul(leaning, way))) for way in ways]
 
 
 def above(pose: PoseTuple, height: float) -> PoseTuple:

@@ -1,0 +1,97 @@
+"""`iris-session doctor`: what is wrong, why, and what to do. On a client's machine, or on the server's."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from iris_session.cli.common import add_json, print_json
+from iris_session.cli.live import printable
+from iris_session.protocol.names import Role
+
+if TYPE_CHECKING:
+    from iris_session.doctor.findings import Finding
+
+MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "skipped": "-      "}
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "doctor",
+        help="what is wrong, why, and what to do",
+        description="Looks at the way to a session, at keys and joining, and at what the session says of itself: one "
+        "check after the other. Exit status 1 when a check failed. It joins for two seconds, as an observer.",
+        epilog="examples:\n"
+        "  iris-session doctor                      the session on this machine\n"
+        "  iris-session doctor 192.168.1.20         from a client's machine\n"
+        "  iris-session doctor --session lab-1 --code 7KQ2-M4XD\n"
+        "  iris-session doctor --server             the machine that is to serve",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("address", nargs="?", default="", help="HOST:PORT or iris://... (default: 127.0.0.1:7721)")
+    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
+    parser.add_argument("--code", default="", help="a join code to try; it is used up")
+    parser.add_argument(
+        "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
+    )
+    parser.add_argument("--server", action="store_true", help="look at this machine as one that serves")
+    parser.add_argument("--identity", default="", metavar="DIR", help="home of keys (default: as for every command)")
+    parser.add_argument("--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: of recordings")
+    parser.add_argument("--all", action="store_true", help="also print the checks that were not possible")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Examines, prints one screen (or one JSON object); exit status 1 when a check failed."""
+    import os
+
+    from iris_session.doctor.examination import Examination, examine, examine_server
+
+    if arguments.identity:
+        os.environ["IRIS_HOME"] = arguments.identity
+    progress = sys.stderr.isatty() and not arguments.json
+
+    def told(what: str) -> None:
+        if progress:
+            print(f"... {what}", file=sys.stderr, flush=True)
+
+    result: Examination
+    if arguments.server:
+        result = examine_server(arguments.address, arguments.record, told=told)
+    else:
+        result = examine(
+            arguments.address, session=arguments.session, code=arguments.code, role=arguments.role, told=told
+        )
+    if arguments.json:
+        print_json(result.as_dict())
+    else:
+        print("\n".join(lines(result.findings, show_skipped=arguments.all)))
+        print(verdict(result.findings))
+    return 0 if result.ok else 1
+
+
+def lines(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[str]:
+    """One line per check; why and what to do below those that are not well. Printable: texts hold strangers' names."""
+    found = []
+    for one in findings:
+        if one.state == "skipped" and not show_skipped:
+            continue
+        found.append(printable(f"{MARKS[one.state]} {one.check:12s} {one.text}"))
+        if one.state in ("warning", "failed"):
+            found += [
+                printable(f"{'':20s} {label}: {text}") for label, text in (("why", one.why), ("do", one.advice)) if text
+            ]
+    return found
+
+
+def verdict(findings: Iterable[Finding]) -> str:
+    """The last line."""
+    states = [one.state for one in findings]
+    failed, warned, skipped = (states.count(state) for state in ("failed", "warning", "skipped"))
+    if failed:
+        return f"{failed} failed, {warned} to look at" + (f", {skipped} not possible" if skipped else "")
+    return "all well" if not warned else f"nothing failed, {warned} to look at"

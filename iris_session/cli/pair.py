@@ -1,0 +1,181 @@
+"""`iris-session pair`: makes a join code, shows it as a QR code, and waits until somebody has used it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from iris_session.cli.common import CommandError, add_json, print_json
+from iris_session.keys.allow_list import DEFAULT_ROLES
+from iris_session.protocol.names import Role
+
+if TYPE_CHECKING:
+    from iris_session.keys import JoinCode, KeyHome, KeyPair, SessionNote
+
+ANY_ROLE: Final = "any"
+POLL_S: Final = 0.2
+MAX_MINUTES: Final = 24 * 60.0
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "pair",
+        help="let a new device into the session on this machine",
+        description="Makes a join code for one new device and shows it, with address and key of the session, as a QR "
+        "code. It is good for ten minutes, one device, and five wrong attempts. Waits until it is used; Ctrl-C "
+        "makes it void.",
+        epilog="examples:\n"
+        "  iris-session pair                               scan it, or type the code\n"
+        "  iris-session pair --role director --name ann    a key that may direct\n"
+        "  iris-session pair --png code.png --no-wait      for a screen elsewhere\n"
+        "  iris-session pair --address 10.0.0.5:7721       as others reach this machine",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_role(parser)
+    parser.add_argument("--minutes", type=_minutes, default=10.0, metavar="M", help="how long it is good for (10)")
+    parser.add_argument("--name", default="", help="name of the device in the list (default: what it says itself)")
+    parser.add_argument("--session", default="", metavar="NAME", help="which session, when several run here")
+    parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="the session's secret key, if not the user's")
+    parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
+    parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def add_role(parser: argparse.ArgumentParser) -> None:
+    """`--role`, for `pair` and `keys allow`."""
+    parser.add_argument(
+        "--role",
+        action="append",
+        choices=[*sorted(Role.ALL), ANY_ROLE],
+        metavar="ROLE",
+        help=f"what the key may join as, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role",
+    )
+
+
+def roles_of(given: list[str] | None) -> tuple[str, ...]:
+    """Roles for the allow-list: empty for any."""
+    return DEFAULT_ROLES if given is None else () if ANY_ROLE in given else tuple(given)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Exit status 1 when the code was not used."""
+    from iris_session.client.address import pairing_uri
+    from iris_session.keys import KeyHome, load_secret
+
+    home = KeyHome()
+    key = load_secret(arguments.curve_key) if arguments.curve_key else home.server_key()
+    session, places = _places(arguments, home, key)
+    roles = roles_of(arguments.role)
+    code, made = home.codes.make(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
+    try:
+        uri = pairing_uri(*places[0], key.public, code, session)
+        told = {
+            "code": code,
+            "uri": uri,
+            "session": session,
+            "addresses": [_address(*place) for place in places],
+            "fingerprint": key.fingerprint,
+            "roles": list(roles),
+            "expires": made.expires,
+        }
+        _show(arguments, told)
+        return 0 if arguments.no_wait else _wait(home, made, arguments)
+    except BaseException:
+        home.codes.cancel(made.id)  # who asked for it does not see any more what becomes of it
+        raise
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = 0.0
+    if not 0.0 < minutes <= MAX_MINUTES:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time: more than 0 and at most {MAX_MINUTES:g} minutes")
+    return minutes
+
+
+def _places(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple[str, list[tuple[str, int]]]:
+    """Name of the session, and host and port where others reach it, best first."""
+    from iris_session.client.address import Address
+
+    if arguments.address:
+        address = Address.parse(arguments.address)
+        return arguments.session, [(address.host, address.port)]
+    here = [note for note in home.sessions.read() if note.server == key.fingerprint]
+    found = [note for note in here if arguments.session in ("", note.name)]
+    if len(found) != 1:
+        raise CommandError(_which(arguments.session, here, found))
+    return found[0].name, [(host, found[0].control) for host in found[0].hosts]
+
+
+def _which(wanted: str, here: list[SessionNote], found: list[SessionNote]) -> str:
+    if not here:
+        return (
+            "no encrypted session of yours runs on this machine: start one with `iris-session serve SCENE "
+            "--host 0.0.0.0`, or say where it is with --address HOST:PORT"
+        )
+    names = ", ".join(sorted(note.name for note in here))
+    if not found:
+        return f"no session {wanted!r} runs here, there are: {names}"
+    return f"{len(found)} sessions run here ({names}): choose with --session NAME or --address HOST:PORT"
+
+
+def _address(host: str, port: int) -> str:
+    from iris_session.client.address import host_port
+
+    return host_port(host, port)
+
+
+def _show(arguments: argparse.Namespace, told: dict[str, Any]) -> None:
+    import segno
+
+    qr = segno.make(told["uri"], micro=False, error="m")
+    if arguments.png is not None:
+        try:
+            qr.save(str(arguments.png), kind="png", scale=10, border=4)
+        except OSError as error:
+            raise CommandError(f"{arguments.png} cannot be written: {error.strerror}") from error
+    if arguments.json:
+        print_json(told)
+        return
+    qr.terminal(out=sys.stdout, compact=True)
+    print(f"join code    {told['code']}    for {arguments.minutes:g} minutes, one device")
+    print(f"address      {'  or  '.join(told['addresses'])}")
+    print(f"fingerprint  {told['fingerprint']}")
+    print(f"roles        {', '.join(told['roles']) or 'any'}")
+    print(f"from Python  Client({told['addresses'][0]!r}, join_code={told['code']!r})")
+    print(f"or           {told['uri']}", flush=True)
+
+
+def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
+    """Until the code is used, void or expired."""
+    seen: object = None
+    while True:
+        if home.codes.signature != seen:
+            seen = home.codes.signature
+            now = home.codes.find(made.id)
+            if now is None or now.paired or not now.open(time.time()):
+                break
+        if time.time() >= made.expires:
+            now = made
+            break
+        time.sleep(POLL_S)
+    entry = None if now is None else now.paired
+    if entry is not None:
+        told: dict[str, Any] = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": list(entry.roles)}
+        text = f"paired: {entry.name} ({entry.fingerprint})"
+    else:
+        void = now is not None and now.attempts_left == 0
+        told = {"paired": None, "reason": "void" if void else "expired"}
+        text = "void after five wrong attempts: make another code" if void else "expired: nobody used it"
+    if arguments.json:
+        print_json(told)
+    else:
+        print(text, flush=True)
+    return 0 if entry is not None else 1

@@ -1,0 +1,57 @@
+"""`iris-session sessions`: what can be joined on this network."""
+
+from __future__ import annotations
+
+import argparse
+
+from iris_session.cli.common import add_json, positive_seconds, print_json
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "sessions",
+        help="list the sessions on this network",
+        description="Lists the sessions that tell of themselves on the networks of this machine. Where an access point "
+        "blocks broadcasts nothing is heard: type the address of the session, or scan the code of `iris-session pair`.",
+        epilog="examples:\n  iris-session sessions\n  iris-session sessions --seconds 3 --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seconds", type=positive_seconds, default=1.0, help="listen this long (default: %(default)g)")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Exit status 0 when any was heard, 1 when none was."""
+    from iris_session.client import find_sessions
+    from iris_session.client.known_servers import known_fingerprints
+
+    known = known_fingerprints()
+    found = find_sessions(arguments.seconds)
+    rows = [
+        {
+            "name": one.name,
+            "address": one.address,
+            "addresses": list(one.addresses),
+            "session_id": one.session_id,
+            "kind": one.kind,
+            "encrypted": bool(one.key_fingerprint),
+            "key_fingerprint": one.key_fingerprint,
+            "known": one.key_fingerprint in known,
+        }
+        for one in found
+    ]
+    if arguments.json:
+        print_json({"ok": bool(rows), "sessions": rows})
+        return 0 if rows else 1
+    for row in rows:
+        print(f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_key(row)}")
+    if not rows:
+        print("no session was heard: type the address of one, or scan its code (docs/network.md)")
+    return 0 if rows else 1
+
+
+def _key(row: dict[str, object]) -> str:
+    if not row["encrypted"]:
+        return "not encrypted: this machine only"
+    return f"key {row['key_fingerprint']}{'' if row['known'] else ' (new: join with --code)'}"

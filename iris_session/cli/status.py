@@ -1,0 +1,239 @@
+"""`iris-session status`: how a session does, on one screen, as JSON, or as metrics for Prometheus."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Final
+
+from iris_session.cli.common import CommandError, add_json, positive_seconds, print_json
+from iris_session.cli.live import printable
+
+if TYPE_CHECKING:
+    from iris_session.client import Client
+    from iris_session.protocol.status import ParticipantReport, Quantiles, StatusReport
+
+#: Without having been let in by then, the session is asked all the same.
+JOIN_S: Final = 4.0
+#: Clients report once a second: a report before that says less.
+SETTLE_S: Final = 1.2
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "status",
+        help="how a session does: people, robots, ages, late ticks, recorder",
+        description="Joins as the observer `status`, asks, prints, and leaves.",
+        epilog="examples:\n"
+        "  iris-session status\n"
+        "  iris-session status 192.168.1.20 --watch\n"
+        "  iris-session status --json\n"
+        "  iris-session status --metrics-port 9463      http://127.0.0.1:9463/metrics for Prometheus",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("address", nargs="?", default="", help="HOST:PORT or iris://... (default: 127.0.0.1:7721)")
+    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
+    parser.add_argument("--code", default="", help="join code, for the first time at an encrypted session")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    form.add_argument("--prometheus", action="store_true", help="text exposition format of Prometheus, once")
+    form.add_argument(
+        "--metrics-port", type=int, default=None, metavar="PORT", help="serve that on 127.0.0.1 over HTTP"
+    )
+    parser.add_argument(
+        "--period", type=positive_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints the status; with --watch or --metrics-port until Ctrl-C."""
+    from iris_session.client import Client
+
+    client = Client(
+        arguments.address,
+        session=arguments.session,
+        join_code=arguments.code,
+        role="observer",
+        name="status",
+        alignment="not_needed",
+    )
+    try:
+        client.open()
+        if client.wait_for(lambda one: one.ready, JOIN_S):
+            client.sleep(SETTLE_S)
+        return _tell(client, arguments)
+    finally:
+        client.close()
+
+
+def _tell(client: Client, arguments: argparse.Namespace) -> int:
+    """In the form that is asked for. A session that stands still lets nobody in, but tells how it does."""
+    from iris_session.cli.metrics import exposition
+    from iris_session.client import NotConnectedError, RequestTimeoutError
+
+    try:
+        report = client.status()
+    except (NotConnectedError, RequestTimeoutError) as error:
+        why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
+        raise CommandError(why) from None
+    if arguments.metrics_port is not None:
+        return _serve_metrics(client, arguments.metrics_port)
+    if arguments.watch:
+        return _watch(client, arguments.period, as_json=arguments.json)
+    if arguments.prometheus:
+        sys.stdout.write(exposition(report))
+    else:
+        _show(report, as_json=arguments.json)
+    return 0
+
+
+def _show(report: StatusReport, *, as_json: bool) -> None:
+    import msgspec
+
+    if as_json:
+        print_json(msgspec.to_builtins(report))
+    else:
+        print("\n".join(screen(report)), flush=True)
+
+
+def _watch(client: Client, period_s: float, *, as_json: bool) -> int:
+    """Until Ctrl-C. A session that goes away is waited for."""
+    from iris_session.client import NotConnectedError, RequestTimeoutError
+
+    clear = "\x1b[2J\x1b[H" if sys.stdout.isatty() and not as_json else ""
+    while True:
+        began = time.monotonic()
+        try:
+            report = client.status()
+        except (NotConnectedError, RequestTimeoutError) as error:
+            print(f"{clear}{error}", flush=True)
+        else:
+            print(clear, end="")
+            _show(report, as_json=as_json)
+        client.sleep(max(0.1, period_s - (time.monotonic() - began)))
+
+
+def _serve_metrics(client: Client, port: int) -> int:
+    """Answers scrapes on loopback until Ctrl-C."""
+    from iris_session.cli.metrics import CONTENT_TYPE, exposition
+    from iris_session.client import ClientError
+
+    client.start()
+    asking = threading.Lock()  # one scrape at a time: answers are not told apart
+
+    class Scrape(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path not in ("/", "/metrics"):
+                self.send_error(404, "metrics are at /metrics")
+                return
+            try:
+                with asking:
+                    body = exposition(client.status()).encode()
+            except ClientError as error:
+                self.send_error(503, printable(str(error)))
+                return
+            self.send_response(200)
+            self.send_header("Content-Type", CONTENT_TYPE)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Scrapes are not worth a line."""
+
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", port), Scrape)
+    except (OSError, OverflowError) as error:
+        raise CommandError(f"cannot serve metrics on port {port}: {error}") from None
+    with server:
+        print(f"metrics on http://127.0.0.1:{server.server_address[1]}/metrics", flush=True)
+        server.serve_forever()
+    return 0
+
+
+def screen(report: StatusReport) -> list[str]:
+    """One screen of printable lines."""
+    return [printable(line) for line in _lines(report)]
+
+
+def _lines(report: StatusReport) -> Iterator[str]:
+    from iris_session.doctor.condition import stages
+
+    state = "E-STOP" if report.estop else "paused" if report.paused else "running"
+    if report.stalled:
+        state = f"STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s"
+    elif report.authority_silent_ns < 0:
+        state = "HAS NOT TAKEN A STEP YET"
+    yield (
+        f"session '{report.session_name}'  {state}  tick {report.tick}  {report.session_time * 1e-9:.1f} s  "
+        f"{report.connections} connections  {report.entries_per_s:.0f} entries/s"
+    )
+    yield ""
+    yield (
+        f"{'participant':20s} {'role':9s} {'alignment':22s} {'age p50/p99 ms':>15s} {'rtt ms':>7s} "
+        f"{'missed':>7s} {'samples/s':>9s} {'drops':>6s}  robots"
+    )
+    for p in report.participants:
+        yield _participant(p)
+    yield ""
+    yield f"{'robot':20s} {'holder':20s} {'state':9s} {'hold reason':14s} {'receive to step ms':>19s}  queue"
+    for r in report.robots:
+        waits = ", ".join(r.queue)
+        holder = r.holder_name or r.holder or "-"
+        yield (
+            f"{r.name:20.20s} {holder:20.20s} {r.state:9s} {r.hold_reason or '-':14s} "
+            f"{_quantiles(r.receive_to_step):>19s}  {waits}"
+        )
+    yield ""
+    took = stages(report.participants, report)
+    yield "data age, p99 of the worst: " + (
+        ", ".join(f"{stage} {ms:.1f} ms" + (f" ({who})" if who else "") for stage, (ms, who) in took.items()) or "-"
+    )
+    causes = ", ".join(f"{cause} {n}" for cause, n in report.late_causes.items()) or "none"
+    yield (
+        f"late ticks: {report.late_share:.2%} of the last ten seconds, {report.late_share_total:.2%} in all; "
+        f"lateness p50/p99 {_quantiles(report.lateness)} ms; causes: {causes}; scheduling {report.scheduling or '-'}"
+    )
+    yield (
+        f"machine: load {report.load:.1f} of {report.cpus}, the session's process {report.cpu_share:.0%} of one, "
+        f"{report.memory_bytes / 1e6:.0f} MB"
+    )
+    one = report.recorder
+    if one is not None:
+        yield f"recorder: {one.state}" + (
+            ""
+            if one.state == "off"
+            else f", {one.bytes_written / 1e6:.1f} MB, {one.disk_free_bytes / 1e9:.1f} GB free, "
+            f"{one.lost_rows} rows lost, {one.path}" + (f": {one.text}" if one.text else "")
+        )
+    most = sorted(report.drops.items(), key=lambda item: -item[1])[:8]
+    yield "drops: " + (", ".join(f"{reason} {n}" for reason, n in most) or "none")
+    restarts = ", ".join(f"{name} {n}" for name, n in report.restarts.items() if n)
+    if restarts:
+        yield f"started again: {restarts}"
+    yield from (f"warning: {text}" for text in report.warnings)
+
+
+def _participant(p: ParticipantReport) -> str:
+    aligned = p.alignment
+    if p.alignment_age_ns >= 0 and aligned in ("measured", "placed"):
+        aligned += f" {p.alignment_error_m * 1e3:.0f} mm, {p.alignment_age_ns * 1e-9:.0f} s"
+    elif p.alignment_void_ns >= 0:
+        aligned = f"void for {p.alignment_void_ns * 1e-9:.0f} s"
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
+    age = _quantiles(p.state_age) if p.reported else "-"
+    waits = f" waits: {', '.join(p.waits_for)}" if p.waits_for else ""
+    return (
+        f"{name:20.20s} {p.role:9.9s} {aligned:22.22s} {age:>15s} {p.rtt_ms:7.1f} {p.missed_share:7.1%} "
+        f"{p.samples_per_s:9.0f} {p.drops:6d}  {', '.join(p.holds)}{waits}"
+    )
+
+
+def _quantiles(values: Quantiles | None) -> str:
+    return "-" if values is None else f"{values.p50:.1f}/{values.p99:.1f}"

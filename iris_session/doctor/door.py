@@ -1,0 +1,173 @@
+"""Keys, codes, roles and joining: knocks as a client does, and says what stands in the way. Then looks at the state
+that comes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from iris_session.client import Client, ClientError, RefusedError, VersionError
+from iris_session.client.address import Address
+from iris_session.client.errors import NotConnectedError, RequestTimeoutError, SessionNameError, TrustError
+from iris_session.client.state_stream import SceneState
+from iris_session.doctor import reach
+from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.keys import KeyHome, KeysError, fingerprint, raw_key
+from iris_session.protocol.discovery import Introduction
+from iris_session.protocol.names import DenialReason, RefusalCode
+from iris_session.protocol.status import StatusReport, quantiles
+
+JOIN_S: Final = 4.0
+STATE_S: Final = 3.0
+#: A report of ours is a second old at most by then, and those of all others are there.
+LOOK_S: Final = 1.5
+ANSWER_S: Final = 2.0
+#: Ages of the state at the doctor's own place [ms]: above it, this machine or its link is slow.
+OLD_MS: Final = 100.0
+UNSURE_CLOCK_MS: Final = 20.0
+NAME: Final = "doctor"
+
+
+@dataclass
+class Visit:
+    """What knocking gave. `report`: of the session, if anybody answered."""
+
+    findings: list[Finding] = field(default_factory=list)
+    report: StatusReport | None = None
+    own_id: str = ""
+
+
+def server_key(address: Address, said: Introduction | None) -> Finding:
+    """Whether the key that the session introduces itself with is the one known for this address."""
+    try:
+        known = KeyHome().servers.by_address(str(address))
+    except KeysError as error:
+        return failed("server_key", str(error), "", "mend or remove that file")
+    stored = address.server_key or ("" if known is None else known.key)
+    if said is None:
+        return Finding("server_key", "skipped", "not known: there was no introduction")
+    if not said.server_key:
+        return ok("server_key", "not encrypted, which is for one machine only")
+    mark = fingerprint(raw_key(said.server_key))
+    if not stored:
+        text = f"its key {mark} is not known here yet"
+        return warning("server_key", text, "", "pair with a code of `iris-session pair`, which proves whose key it is")
+    if stored != said.server_key:
+        return failed(
+            "server_key",
+            f"its key is {mark}, but {fingerprint(raw_key(stored))} is known for {address}",
+            "somebody else answers there, or the session's keys were made anew",
+            f"ask who runs it; if they are new: iris-session keys forget {address}, then pair again",
+        )
+    return ok("server_key", f"its key {mark} is the known one")
+
+
+def knock(address: str, code: str, role: str) -> Visit:
+    """Joins as `doctor`, looks around, and leaves."""
+    visit = Visit()
+    states: list[SceneState] = []
+    try:
+        client = Client(address, role=role, name=NAME, alignment="not_needed", join_code=code, on_state=states.append)
+    except ClientError as error:
+        visit.findings.append(failed("join", str(error)))
+        return visit
+    try:
+        client.connect(JOIN_S)
+    except ClientError as error:
+        _not_let_in(client, error, visit)
+    else:
+        _let_in(client, states, role, bool(code), visit)
+    finally:
+        client.close()
+    return visit
+
+
+def _not_let_in(client: Client, error: ClientError, visit: Visit) -> None:
+    if isinstance(error, NotConnectedError):
+        try:
+            visit.report = client.status(ANSWER_S)
+        except ClientError:
+            pass
+        else:
+            text = "the session listens, but lets nobody in: it does not step"
+            visit.findings.append(failed("join", text, "see the check `session`", "look at the program that owns it"))
+            return
+    visit.findings.append(refusal(error))
+
+
+def refusal(error: ClientError) -> Finding:
+    """Why joining failed, under the check that it belongs to."""
+    text = str(error)
+    if isinstance(error, VersionError):
+        return reach.version(max(error.supported_versions, default=0))
+    if isinstance(error, TrustError):
+        return failed("server_key", text, "", "ask who runs the session; see docs/security.md")
+    if isinstance(error, SessionNameError):
+        return failed("beacon", text, "", "give the address of the one you mean")
+    if isinstance(error, RefusedError):
+        if error.code == RefusalCode.UNPAIRED:
+            advice = "on the server's machine: iris-session pair; then here: iris-session doctor ADDRESS --code CODE"
+            return failed("key", "this machine's key is not on the session's list", error.message, advice)
+        if error.code == RefusalCode.CODE:
+            advice = error.advice or "ask for a new one: iris-session pair (they live for minutes, and work once)"
+            return failed("code", f"the join code was not taken: {error.message}", "", advice)
+        if error.code == DenialReason.ROLE:
+            advice = error.advice or "join in another role, or let the key have this one: iris-session keys allow"
+            return failed("role", f"this key may not join in this role: {error.message}", "", advice)
+        return failed("join", f"refused ({error.code}): {error.message}", "", error.advice)
+    if isinstance(error, NotConnectedError):
+        return failed(
+            "join",
+            "somebody takes the connection there, but nobody answers as a session",
+            text,
+            "is it another program's port? a firewall that takes every connection? the wrong key of the server?",
+        )
+    return failed("join", text)
+
+
+def _let_in(client: Client, states: list[SceneState], role: str, coded: bool, visit: Visit) -> None:
+    visit.own_id = client.participant_id
+    visit.findings += [
+        ok("role", f"let in as {role}"),
+        ok("join", f"joined as {client.participant_id}, and leaves again"),
+    ]
+    if coded:
+        visit.findings.append(ok("code", "the join code was taken, or not needed"))
+    try:
+        client.wait_for(lambda _: bool(states), STATE_S)
+        states.clear()
+        client.sleep(LOOK_S)
+        visit.report = client.status(ANSWER_S)
+    except (RequestTimeoutError, NotConnectedError) as error:
+        visit.findings.append(failed("join", f"the connection did not last: {error}", "", "look at the network"))
+    visit.findings += [_clock(client), _state(client, states)]
+
+
+def _clock(client: Client) -> Finding:
+    bound_ms, rtt_ms = client.clock_error_ns() * 1e-6, client.connection.clock.rtt_ns * 1e-6
+    text = f"session time is known to {bound_ms:.1f} ms, round trip {rtt_ms:.1f} ms"
+    if bound_ms > UNSURE_CLOCK_MS:
+        return warning("clock", text, "round trips are long or differ much", "look at the network: Wi-Fi, power saving")
+    return ok("clock", text)
+
+
+def _state(client: Client, states: list[SceneState]) -> Finding:
+    """State at our own place."""
+    ages = quantiles(state.age_ns for state in states)
+    welcome = client.connection.welcome
+    if ages is None:
+        port = 0 if welcome is None else welcome.endpoints.state
+        address = Address.parse(client.address)
+        try:
+            finding = reach.tcp(address, reach.resolved(address)[1], port, "state", "state")
+        except OSError as error:
+            return failed("state", f"no state comes: {error}")
+        if finding.failed:
+            return finding
+        return failed("state", f"no state comes though port {port} takes connections", "the session does not step?")
+    missed = client.connection.stream.counters.queued_old
+    text = f"state comes at {len(states) / LOOK_S:.0f} Hz, age p50 {ages.p50:.1f} ms, p99 {ages.p99:.1f} ms"
+    if ages.p99 > OLD_MS:
+        why = f"{missed} frames waited too long in a queue" if missed else "see the check `age`"
+        return warning("state", text, why, "look at this machine's network and load")
+    return ok("state", text)

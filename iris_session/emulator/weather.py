@@ -1,0 +1,255 @@
+"""What a link is like from moment to moment: profiles as data, and delays as a function of seed and time alone.
+
+    weather = Weather(load_profile("busy-wifi"), seed=1)
+    weather.delay_ns("up", 3_000_000_000)      one-way delay of a byte that is sent 3 s after the start
+    weather.stalled("up", 3_000_000_000)       whether nothing passes then
+
+Two runs with one profile and one seed have the same weather at the same moments, whatever was sent. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from statistics import NormalDist
+from typing import Final
+
+import msgspec
+
+UP: Final = "up"  # from clients to the session
+DOWN: Final = "down"
+DIRECTIONS: Final = (UP, DOWN)
+#: Jitter is drawn anew this often: a wireless channel keeps its state for some milliseconds.
+SLOT_NS: Final = 4_000_000
+SECOND: Final = 1_000_000_000
+_MASK: Final = 2**64 - 1
+_NORMAL: Final = NormalDist()
+
+
+class ProfileError(ValueError):
+    """The profile cannot be used; the text is one line that says what would be right."""
+
+
+class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One direction of a link. `delay_ms` +- `jitter_ms` (normal, never below 0), one way; `rate_mbit`: megabits a
+    second that all connections share, 0 unlimited; `stalled`: nothing passes.
+
+    Datagrams only: probability that one is lost, comes twice, or is held back by `reorder_ms` so that later ones
+    overtake it. Bytes of a TCP connection are never lost and keep their order.
+    """
+
+    delay_ms: float = 0.0
+    jitter_ms: float = 0.0
+    rate_mbit: float = 0.0
+    stalled: bool = False
+    loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    reorder_ms: float = 20.0
+
+
+class Phase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A stretch of time of a profile. Its own fields are for both directions; `up`, `down` replace all of them.
+
+    `seconds`: 0 for ever. `at_start`: `cut` closes every connection, `reset` breaks them off (RST). `burst_*`: mean
+    time between bursts in which up to `burst_ms` is added to each delay, and how long one lasts. `stall_*`: the same
+    of stalls in which nothing passes; then everything comes at once. Both hit both directions.
+    """
+
+    seconds: float = 0.0
+    at_start: str = ""
+    burst_every_s: float = 0.0
+    burst_s: float = 0.3
+    burst_ms: float = 0.0
+    stall_every_s: float = 0.0
+    stall_s: float = 0.05
+    up: Direction | None = None
+    down: Direction | None = None
+
+    def direction(self, name: str) -> Direction:
+        """What holds for `up` or `down`."""
+        return (self.up if name == UP else self.down) or self
+
+
+class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Phases one after the other; the last one stays, or with `repeat` it begins again.
+
+    `window_kib`: bytes that may be under way per connection and direction, as the receiver's TCP window bounds them;
+    the sender is held back beyond. It is how much stale data a stall can leave on the way.
+    """
+
+    phases: tuple[Phase, ...]
+    repeat: bool = False
+    window_kib: int = 256
+
+    def __post_init__(self) -> None:
+        if not self.phases:
+            raise ProfileError("a profile needs a phase, for example {delay_ms = 8, jitter_ms = 3, rate_mbit = 40}")
+        for phase in self.phases:
+            _check(phase)
+        if any(not p.seconds for p in self.phases if self.repeat or p is not self.phases[-1]):
+            raise ProfileError("seconds = 0 (for ever) is for the last phase of a profile that does not repeat")
+        if not 4 <= self.window_kib <= 16_384:
+            raise ProfileError(f"window_kib {self.window_kib} is out of range: 4 to 16384")
+
+
+def _check(phase: Phase) -> None:
+    if phase.at_start not in ("", "cut", "reset"):
+        raise ProfileError(f"at_start {phase.at_start!r} is not known: '', 'cut' or 'reset'")
+    for part in (phase, *(d for d in (phase.up, phase.down) if d is not None)):
+        for field in part.__struct_fields__:
+            value = getattr(part, field)
+            if not isinstance(value, float | int):
+                continue
+            top = 1.0 if field in ("loss", "duplicate", "reorder") else math.inf
+            if not (math.isfinite(value) and 0.0 <= value <= top):
+                raise ProfileError(f"{field} {value} is out of range: 0 to {'1' if top == 1.0 else 'any number'}")
+
+
+_GOOD: Final = Phase(delay_ms=2.0, jitter_ms=1.0, rate_mbit=300.0, loss=0.001)
+_BUSY: Final = Phase(
+    delay_ms=8.0,
+    jitter_ms=12.0,
+    rate_mbit=40.0,
+    loss=0.02,
+    duplicate=0.002,
+    reorder=0.01,
+    burst_every_s=4.0,
+    burst_s=0.3,
+    burst_ms=60.0,
+    stall_every_s=10.0,
+    stall_s=0.12,
+)
+#: Profiles by name. `none` forwards as fast as it can: what the proxy itself costs.
+PROFILES: Final[dict[str, Profile]] = {
+    "none": Profile(phases=(Phase(),)),
+    "lan": Profile(phases=(Phase(delay_ms=0.2, jitter_ms=0.05, rate_mbit=1000.0),)),
+    "wan": Profile(phases=(Phase(delay_ms=40.0, jitter_ms=2.0, rate_mbit=100.0, loss=0.001),), window_kib=1024),
+    "good-wifi": Profile(phases=(_GOOD,)),
+    "busy-wifi": Profile(phases=(_BUSY,), window_kib=128),
+    "blackout": Profile(
+        phases=(
+            msgspec.structs.replace(_GOOD, seconds=10.0),
+            msgspec.structs.replace(_GOOD, seconds=5.0, stalled=True),
+            _GOOD,
+        )
+    ),
+}
+
+
+def latency_profile(latency_ms: float) -> Profile:
+    """A link that delays by `latency_ms` each way and does nothing else."""
+    return Profile(phases=(Phase(delay_ms=latency_ms),), window_kib=1024)
+
+
+def load_profile(name: str) -> Profile:
+    """A profile by name, `40ms` for a delay alone, or a TOML or JSON file with the fields of `Profile`.
+
+    Raises `ProfileError`.
+    """
+    if name in PROFILES:
+        return PROFILES[name]
+    if delay := re.fullmatch(r"(\d+(?:\.\d+)?)ms", name):
+        return latency_profile(float(delay[1]))
+    path = Path(name)
+    if path.suffix not in (".toml", ".json"):
+        raise ProfileError(f"no profile {name!r}: give one of {', '.join(PROFILES)}, 40ms, or a .toml or .json file")
+    try:
+        text = path.read_text(encoding="utf-8")
+        return msgspec.convert(tomllib.loads(text) if path.suffix == ".toml" else msgspec.json.decode(text), Profile)
+    except OSError as error:
+        raise ProfileError(f"profile {name} cannot be read: {error.strerror}") from error
+    except (ValueError, msgspec.MsgspecError) as error:
+        raise ProfileError(f"profile {name}: {error}") from error
+
+
+class Spells:
+    """Stretches of time that come at random: mean time between them, length. Asked for times that never go back."""
+
+    def __init__(self, rng: random.Random, every_s: float, length_s: float, start_ns: int) -> None:
+        self._rng, self._every_s, self._length_ns = rng, every_s, round(length_s * SECOND)
+        self.begin_ns = self.end_ns = start_ns
+        self._next()
+
+    def covers(self, t_ns: int) -> bool:
+        """Whether one is on at `t_ns`."""
+        while t_ns >= self.end_ns and self._every_s > 0.0:
+            self._next()
+        return self.begin_ns <= t_ns < self.end_ns
+
+    def change_ns(self, t_ns: int) -> int:
+        """When `covers` changes next after `t_ns`."""
+        return self.end_ns if self.covers(t_ns) else self.begin_ns
+
+    def _next(self) -> None:
+        if self._every_s <= 0.0:
+            self.begin_ns = self.end_ns = 2**63 - 1
+            return
+        self.begin_ns = self.end_ns + round(self._rng.expovariate(1.0 / self._every_s) * SECOND)
+        self.end_ns = self.begin_ns + self._length_ns
+
+
+class Weather:
+    """The weather of one link. All times are nanoseconds since its start and never go back by more than a phase."""
+
+    def __init__(self, profile: Profile, seed: int = 0) -> None:
+        self.profile = profile
+        self._seed = seed
+        self._number = -1
+        self._phase_end_ns = 0
+        self.phase = profile.phases[0]
+        self._bursts = self._stalls = Spells(random.Random(0), 0.0, 0.0, 0)
+        self._move_on(0)
+
+    def move_on(self, t_ns: int, at_start: Callable[[str], None] = lambda _: None) -> None:
+        """Enters the phase of `t_ns`; `at_start` is called with `cut` or `reset` for each phase that begins so."""
+        while t_ns >= self._phase_end_ns:
+            self._move_on(self._phase_end_ns)
+            if self.phase.at_start:
+                at_start(self.phase.at_start)
+
+    def delay_ns(self, direction: str, t_ns: int) -> int:
+        """One-way delay of what is sent at `t_ns`, without rate and stalls."""
+        part = self.phase.direction(direction)
+        slot = t_ns // SLOT_NS
+        delay_ms = part.delay_ms
+        if part.jitter_ms:
+            delay_ms += part.jitter_ms * _NORMAL.inv_cdf(self._uniform(direction, slot, 0))
+        if self.phase.burst_ms and self._bursts.covers(t_ns):
+            delay_ms += self.phase.burst_ms * self._uniform(direction, slot, 1)
+        return round(max(0.0, delay_ms) * 1e6)
+
+    def stalled(self, direction: str, t_ns: int) -> bool:
+        """Whether nothing passes at `t_ns`."""
+        return self.phase.direction(direction).stalled or self._stalls.covers(t_ns)
+
+    def next_change_ns(self, t_ns: int) -> int:
+        """When `stalled` or the phase changes next after `t_ns`."""
+        return min(self._phase_end_ns, self._stalls.change_ns(t_ns))
+
+    def chance(self, direction: str, number: int, what: int) -> float:
+        """A number in (0, 1) for datagram `number`: the same in every run with this seed. `what`: of its fates."""
+        return self._uniform(direction, number, 16 + what)
+
+    def _move_on(self, begin_ns: int) -> None:
+        phases = self.profile.phases
+        self._number += 1
+        self.phase = phases[self._number % len(phases) if self.profile.repeat else self._number]
+        self._phase_end_ns = begin_ns + round(self.phase.seconds * SECOND) if self.phase.seconds else 2**63 - 1
+        phase, key = self.phase, f"{self._seed}/{self._number}"
+        self._bursts = Spells(random.Random(f"{key}/bursts"), phase.burst_every_s, phase.burst_s, begin_ns)
+        self._stalls = Spells(random.Random(f"{key}/stalls"), phase.stall_every_s, phase.stall_s, begin_ns)
+
+    def _uniform(self, direction: str, number: int, what: int) -> float:
+        """Uniform in (0, 1), by hashing (splitmix64): any moment can be asked for without those before it."""
+        x = (self._seed * 0x9E3779B97F4A7C15 + number * 64 + what * 2 + (direction == UP)) & _MASK
+        for _ in range(2):
+            x = (x + 0x9E3779B97F4A7C15) & _MASK
+            x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+            x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & _MASK
+            x ^= x >> 31
+        return (x + 0.5) / 2**64

@@ -1,0 +1,25 @@
+"""`iris-session bench`: numbers that cannot be are one line, before anything starts."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.cli.main import main
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["input", "--robots", "20"], "--robots 20: bench input takes 1 to 12"),
+        (["input", "--operators", "9", "--robots", "8"], "--operators 9: bench input takes 1 to 8, one robot each"),
+        (["input", "--observers", "-1"], "takes 0 to"),
+        (["state", "--clients", "0"], "--clients 0"),
+        (["state", "--bodies", "0"], "--bodies 0"),
+        (["slow-client", "--clients", "2"], "slow-client needs"),
+    ],
+)
+def test_numbers_that_cannot_be(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *options]) == 2
+    error = capsys.readouterr().err
+    assert text in error
+    assert error.count("\n") == 1

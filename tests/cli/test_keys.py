@@ -1,0 +1,160 @@
+"""`iris-session keys` and `pair`: what they print, their exit status, what they leave behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import pytest
+from zmq.auth import create_certificates
+
+from iris_session.cli.main import main
+from iris_session.client.address import Address
+from iris_session.keys import KeyHome, KeyPair, SessionNote
+from iris_session.protocol import pairing
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
+
+
+@pytest.fixture
+def lab(home: KeyHome) -> KeyHome:
+    """A home with one session that runs."""
+    mark = home.server_key().fingerprint
+    home.sessions.add(SessionNote("id", "lab-1", os.getpid(), ("10.0.0.5", "fd00::5"), 7731, mark))
+    return home
+
+
+def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> None:
+    assert main(["keys", "list"]) == 0
+    assert "nobody may join yet" in capsys.readouterr().out
+    certificate, _ = create_certificates(tmp_path, "ann")
+    bob = KeyPair.new()
+    assert main(["keys", "allow", "ann", str(certificate), "--role", "director", "--role", "operator"]) == 0
+    assert main(["keys", "allow", "bob", bob.public]) == 0
+    capsys.readouterr()
+    assert main(["keys", "list", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["keys"]}
+    assert rows["ann"]["roles"] == ["director", "operator"]
+    assert rows["bob"]["roles"] == ["operator", "observer", "agent", "leader"], "directing is given by name only"
+    assert rows["bob"]["fingerprint"] == bob.fingerprint
+    assert main(["keys", "allow", "bob", bob.public, "--role", "any"]) == 0
+    assert home.clients.read()[bob.fingerprint].roles == ()
+    assert main(["keys", "list"]) == 0
+    assert "any role" in capsys.readouterr().out
+    assert main(["keys", "revoke", "ann"]) == 0
+    assert main(["keys", "revoke", "ann"]) == 2
+    assert "no key 'ann' on the list, there are: bob" in capsys.readouterr().err
+    assert list(home.clients.read()) == [bob.fingerprint]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["keys", "allow", "eve", "short"], "'short' is not a CURVE key"),
+        (["keys", "allow", "eve", "missing.key"], "missing.key cannot be used"),
+        (["keys", "forget", "10.0.0.9:7721"], "no key is stored for '10.0.0.9:7721', stored are: none"),
+        (["pair"], "no encrypted session of yours runs on this machine"),
+        (["pair", "--address", "lab:99999", "--no-wait"], "not HOST:PORT"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(home: KeyHome, arguments: list[str], text: str, capsys: Capture) -> None:
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    assert text in err
+    assert err.count("\n") == 1
+    assert home.codes.read() == []
+
+
+def test_show_names_both_keys_and_never_a_secret(home: KeyHome, capsys: Capture) -> None:
+    assert main(["keys", "show", "--json"]) == 0
+    text = capsys.readouterr().out
+    shown = json.loads(text)
+    assert shown["server"]["fingerprint"] == home.server_key().fingerprint
+    assert shown["identity"]["key"] == home.identity().public
+    assert main(["keys", "show"]) == 0
+    text += capsys.readouterr().out
+    assert home.server_key().secret not in text
+    assert home.identity().secret not in text
+
+
+def test_forget_lets_an_address_be_trusted_anew(home: KeyHome) -> None:
+    home.servers.pin("10.0.0.9:7721", "lab", KeyPair.new().public)
+    assert main(["keys", "forget", "10.0.0.9:7721"]) == 0
+    assert home.servers.read() == []
+
+
+def test_pair_shows_a_uri_that_holds_everything(lab: KeyHome, tmp_path: Path, capsys: Capture) -> None:
+    png = tmp_path / "code.png"
+    assert main(["pair", "--no-wait", "--json", "--png", str(png), "--name", "tablet", "--minutes", "2"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    address = Address.parse(told["uri"])
+    assert (address.host, address.port, address.session) == ("10.0.0.5", 7731, "lab-1")
+    assert address.server_key == lab.server_key().public
+    assert pairing.normal_code(told["code"]) == address.join_code
+    assert told["addresses"] == ["10.0.0.5:7731", "[fd00::5]:7731"]
+    assert 60 < told["expires"] - time.time() <= 120
+    read, *_ = cv2.QRCodeDetector().detectAndDecode(cv2.imread(str(png)))
+    assert read == told["uri"], "a camera reads it"
+    (made,) = lab.codes.read()
+    assert (made.name, made.roles) == ("tablet", ("operator", "observer", "agent", "leader"))
+
+
+def test_pair_for_people_shows_qr_code_and_fingerprint(lab: KeyHome, capsys: Capture) -> None:
+    assert main(["pair", "--no-wait", "--address", "192.0.2.7"]) == 0
+    out = capsys.readouterr().out
+    assert "\u2588" in out
+    assert "192.0.2.7:7721" in out
+    assert lab.server_key().fingerprint in out
+
+
+def test_of_several_sessions_one_is_chosen(lab: KeyHome, capsys: Capture) -> None:
+    mark = lab.server_key().fingerprint
+    lab.sessions.add(SessionNote("id2", "lab-2", os.getpid(), ("10.0.0.5",), 7741, mark))
+    assert main(["pair", "--no-wait"]) == 2
+    assert "2 sessions run here (lab-1, lab-2): choose with --session NAME" in capsys.readouterr().err
+    assert main(["pair", "--no-wait", "--session", "lab-3"]) == 2
+    assert "there are: lab-1, lab-2" in capsys.readouterr().err
+    assert main(["pair", "--no-wait", "--session", "lab-2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["addresses"] == ["10.0.0.5:7741"]
+
+
+def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
+    lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["pair", "--minutes", "0.002"]) == 1
+    assert "expired: nobody used it" in capsys.readouterr().out
+
+    def interrupt(_seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("iris_session.cli.pair.time.sleep", interrupt)
+    assert main(["pair"]) == 130
+    assert lab.codes.expiries(lab.server_key().fingerprint) == ()
+
+
+def test_pair_waits_and_says_who_came(lab: KeyHome, capsys: Capture) -> None:
+    ann = KeyPair.new()
+
+    def use() -> None:
+        server = lab.server_key()
+        while not lab.codes.expiries(server.fingerprint):
+            time.sleep(0.01)
+        (made,) = [one for one in lab.codes.read() if one.secret]
+        proof = pairing.client_proof(made.secret, server.raw_public, ann.raw_public)
+        lab.codes.attempt(server.raw_public, ann.public, proof, "ann", lab.clients)
+
+    user = threading.Thread(target=use)
+    user.start()
+    assert main(["pair", "--role", "observer"]) == 0
+    user.join()
+    assert f"paired: ann ({ann.fingerprint})" in capsys.readouterr().out

@@ -1,0 +1,92 @@
+"""`iris-session sessions`, and the options that say where a session listens and what it is called."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli.common import CommandError
+from iris_session.cli.main import build_parser, main
+from iris_session.cli.serve import session_config
+from iris_session.client import FoundSession
+from iris_session.keys import KeyHome, KeyPair, fingerprint, raw_key
+
+KEY = KeyPair.new().public
+PLAIN = FoundSession("handover", "127.0.0.1:7721", "s1", "live", "", ("127.0.0.1:7721",))
+NEW = FoundSession("lab-1", "10.0.0.5:7721", "s2", "live", "mark", ("10.0.0.5:7721", "10.1.0.5:7721"))
+KNOWN = FoundSession("lab-2", "10.0.0.6:7721", "s3", "replay", fingerprint(raw_key(KEY)), ("10.0.0.6:7721",))
+
+
+@pytest.fixture
+def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[FoundSession]:
+    """What is heard instead of what there is on the network of whoever runs this."""
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "keys"))
+    found: list[FoundSession] = []
+    monkeypatch.setattr("iris_session.client.find_sessions", lambda seconds: found)
+    return found
+
+
+def test_what_is_heard_is_listed_with_what_is_known_of_it(
+    heard: list[FoundSession], capsys: pytest.CaptureFixture[str]
+) -> None:
+    KeyHome().servers.pin("10.0.0.6:7721", "lab-2", KEY)
+    heard += [PLAIN, NEW, KNOWN]
+    assert main(["sessions"]) == 0
+    plain, new, known = capsys.readouterr().out.splitlines()
+    assert plain.split()[:3] == ["handover", "127.0.0.1:7721", "live"]
+    assert "not encrypted" in plain
+    assert "key mark (new: join with --code)" in new
+    assert known.split()[:3] == ["lab-2", "10.0.0.6:7721", "replay"]
+    assert "new" not in known
+    assert main(["sessions", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["sessions"]
+    assert [(row["encrypted"], row["known"]) for row in rows] == [(False, False), (True, False), (True, True)]
+    assert rows[1]["addresses"] == ["10.0.0.5:7721", "10.1.0.5:7721"]
+
+
+def test_nothing_heard_is_status_1_with_advice(heard: list[FoundSession], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sessions"]) == 1
+    assert "type the address" in capsys.readouterr().out
+    assert main(["sessions", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out) == {"ok": False, "sessions": []}
+
+
+def options(*words: str) -> argparse.Namespace:
+    return build_parser().parse_args(["serve", "handover", *words])
+
+
+def test_a_block_of_ports_is_chosen_as_one() -> None:
+    config = session_config(options("--port-base", "7730"), "x")
+    assert (config.control_port, config.state_port, config.beacon_port) == (7731, 7732, 7720)
+    config = session_config(options(), "x")
+    assert (config.control_port, config.state_port) == (7721, 7722)
+    demo = build_parser().parse_args(["demo", "handover"])
+    assert session_config(demo, "x").control_port == 0
+    demo = build_parser().parse_args(["demo", "handover", "--port-base", "7730"])
+    assert session_config(demo, "x").control_port == 7731
+    with pytest.raises(CommandError, match="names all ports"):
+        session_config(options("--port-base", "7730", "--state-port", "9"), "x")
+    for text in ("0", "65535", "x", "-1"):
+        with pytest.raises(SystemExit):
+            options("--port-base", text)
+
+
+def test_where_to_listen_is_said_once() -> None:
+    given = options("--interface", "eth0", "--interface", "10.0.0.5", "--advertise", "lab.example", "--no-beacon")
+    config = session_config(given, "x")
+    assert (config.interfaces, config.advertise, config.beacon_port) == (("eth0", "10.0.0.5"), "lab.example", 0)
+    with pytest.raises(CommandError, match="give one of them"):
+        session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
+
+
+def test_emulated_people_say_what_is_wrong_with_where_they_go(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, text in (
+        (["10.0.0.5", "--session", "lab"], "not both"),
+        (["10.0.0.5", "--code", "12"], "not a join code"),
+        (["iris://x/?k=1"], "iris://HOST:PORT"),
+    ):
+        assert main(["emulate", *words]) == 2
+        assert text in capsys.readouterr().err

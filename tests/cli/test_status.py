@@ -1,0 +1,146 @@
+"""`iris-session status` and `doctor` on paper: screens, metrics, lines. End to end: tests/e2e."""
+
+from __future__ import annotations
+
+import re
+
+import msgspec
+import pytest
+
+from iris_session.cli.doctor import lines, verdict
+from iris_session.cli.main import main
+from iris_session.cli.metrics import exposition
+from iris_session.cli.status import screen
+from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.protocol.status import ParticipantReport, Quantiles, RecorderReport, RobotReport, StatusReport
+
+ANN = ParticipantReport(
+    "p1",
+    'ann "\x1b[2J\n',
+    "operator",
+    True,
+    alignment="measured",
+    alignment_age_ns=3_000_000_000,
+    alignment_error_m=0.0042,
+    holds=("left",),
+    samples_per_s=72.0,
+    state_age=Quantiles(1.5, 4.0),
+    capture_to_receive=Quantiles(8.0, 20.0),
+    missed_share=0.1,
+    rtt_ms=2.0,
+    heard_ns=10_000_000,
+    rejected={"stale": 2},
+    reported=True,
+)
+BOB = ParticipantReport("p2", "bob", "operator", False, alignment_void_ns=4_000_000_000, lost="silent")
+REPORT = StatusReport(
+    1,
+    "s1",
+    "lab",
+    60_000_000_000,
+    tick=30_000,
+    late_share=0.02,
+    late_causes={"physics": 9},
+    lateness=Quantiles(0.3, 2.5),
+    step_to_publish=Quantiles(0.5, 1.0),
+    participants=(ANN, BOB),
+    robots=(
+        RobotReport("left", "exclusive", "p1", "ann", "pose", "", Quantiles(1.0, 3.0), ("p2",)),
+        RobotReport("right", "exclusive", state="hold", hold_reason="no_lease"),
+    ),
+    recorder=RecorderReport("running", "/data/s.rrd", 1_000_000, 5_000_000_000),
+    drops={"rate": 3},
+    restarts={"front": 1, "recorder": 0},
+    warnings=("mind the gap",),
+    authority_silent_ns=2_000_000,
+)
+#: One line of the exposition format: a name, labels with escaped values, a number.
+SAMPLE = re.compile(r'iris_session_[a-z_]+(\{[a-z_]+="(\\.|[^"\\])*"(,[a-z_]+="(\\.|[^"\\])*")*\})? -?[0-9.e+-]+')
+
+
+def test_one_screen_says_it_all() -> None:
+    shown = screen(REPORT)
+    text = "\n".join(shown)
+    assert len(shown) < 25
+    for words in ("lab", "measured 4 mm, 3 s", "1.5/4.0", "LOST silent", "void for 4 s", "no_lease", "physics 9"):
+        assert words in text
+    assert "device -> front 20.0 ms" in text
+    assert "front 1" in text
+    assert "mind the gap" in text
+
+
+def test_names_of_strangers_move_no_cursor() -> None:
+    assert all(line.isprintable() for line in screen(REPORT))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"stalled": True, "authority_silent_ns": 2_500_000_000}, "STANDS STILL since 2.5 s"),
+        ({"authority_silent_ns": -1}, "HAS NOT TAKEN A STEP YET"),
+        ({"estop": True}, "E-STOP"),
+        ({"paused": True}, "paused"),
+    ],
+)
+def test_what_matters_most_is_on_top(fields: dict[str, object], words: str) -> None:
+    assert words in screen(msgspec.structs.replace(REPORT, **fields))[0]
+
+
+def test_a_report_of_nothing_can_be_shown() -> None:
+    empty = StatusReport(0, "", "", 0)
+    assert screen(empty)
+    assert "iris_session_late_tick_share 0" in exposition(empty)
+
+
+def test_metrics_are_well_formed() -> None:
+    text = exposition(REPORT)
+    assert text.endswith("\n")
+    names: list[str] = []
+    for line in text.splitlines():
+        if line.startswith("# TYPE "):
+            names.append(line.split()[2])
+            assert line.split()[3] in ("gauge", "counter")
+        elif not line.startswith("# HELP "):
+            assert SAMPLE.fullmatch(line), line
+            assert line.startswith(names[-1])
+    assert len(names) == len(set(names))
+
+
+def test_metrics_of_everything() -> None:
+    text = exposition(REPORT)
+    assert 'iris_session_late_ticks{cause="physics"} 9' in text
+    assert 'iris_session_robot_held{robot="left",holder="ann"} 1' in text
+    assert 'iris_session_robot_state{robot="right",state="hold",reason="no_lease"} 1' in text
+    assert 'iris_session_participant_connected{participant="p2",name="bob",role="operator"} 0' in text
+    assert 'iris_session_tick_lateness_seconds{quantile="0.99"} 0.0025' in text
+    assert 'name="ann \\"\x1b[2J\\n"' in text
+    assert 'reason="stale"} 2' in text
+    assert "iris_session_recorder_disk_free_bytes 5e+09" in text
+
+
+def test_what_was_not_measured_is_left_out() -> None:
+    lines_of_bob = [line for line in exposition(REPORT).splitlines() if 'name="bob"' in line]
+    assert not any("state_age" in line or "missed" in line for line in lines_of_bob)
+
+
+def test_lines_of_the_doctor() -> None:
+    found = [
+        ok("tcp", "open"),
+        warning("age", "old \x1b[31m", "Wi-Fi", "nearer"),
+        failed("key", "unknown", "", "pair"),
+        Finding("join", "skipped", "not looked at"),
+    ]
+    shown = lines(found)
+    assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
+    assert all(line.isprintable() for line in shown)
+    assert verdict(found) == "1 failed, 1 to look at, 1 not possible"
+    assert len(lines(found, show_skipped=True)) == len(shown) + 1
+    assert verdict(found[:2]) == "nothing failed, 1 to look at"
+    assert verdict(found[:1]) == "all well"
+
+
+def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "nowhere:port"]) == 1
+    assert "is not HOST:PORT" in capsys.readouterr().out
+    assert main(["status", "nowhere:port"]) == 2
+    assert "is not HOST:PORT" in capsys.readouterr().err

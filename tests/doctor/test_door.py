@@ -1,0 +1,79 @@
+"""Why joining failed: each refusal under the check that it belongs to; and keys that are or are not the known ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from iris_session.client.address import Address
+from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
+from iris_session.doctor.door import refusal, server_key
+from iris_session.keys import KeyHome, KeyPair
+from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.server_messages import Refused
+
+ADDRESS = Address("192.0.2.7", 7721)
+
+
+def said(key: str) -> Introduction:
+    return Introduction(Beacon(1, "s1", "lab", "live", "192.0.2.7", 7721, 7722, 0, 0, 0), key)
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
+
+
+@pytest.mark.parametrize(
+    ("error", "check"),
+    [
+        (VersionError(Refused("version", "no", supported_versions=(2,))), "version"),
+        (RefusedError(Refused(RefusalCode.UNPAIRED, "who are you", "pair")), "key"),
+        (RefusedError(Refused(RefusalCode.CODE, "used")), "code"),
+        (RefusedError(Refused("role", "not as director")), "role"),
+        (RefusedError(Refused(RefusalCode.FULL, "all in use")), "join"),
+        (TrustError("another key"), "server_key"),
+        (SessionNameError("two of them"), "beacon"),
+        (NotConnectedError("nobody"), "join"),
+    ],
+)
+def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
+    found = refusal(error)  # type: ignore[arg-type]
+    assert (found.check, found.state) == (check, "failed")
+    assert found.text
+
+
+def test_key_that_is_the_known_one(home: KeyHome) -> None:
+    key = KeyPair.new().public
+    assert server_key(ADDRESS, said(key)).state == "warning"  # not known yet
+    home.servers.pin(str(ADDRESS), "lab", key)
+    assert server_key(ADDRESS, said(key)).state == "ok"
+
+
+def test_key_that_is_another_one(home: KeyHome) -> None:
+    home.servers.pin(str(ADDRESS), "lab", KeyPair.new().public)
+    found = server_key(ADDRESS, said(KeyPair.new().public))
+    assert found.failed
+    assert "iris-session keys forget 192.0.2.7:7721" in found.advice
+
+
+def test_key_of_a_scanned_code_counts(home: KeyHome) -> None:
+    scanned = Address("192.0.2.7", 7721, server_key=KeyPair.new().public)
+    assert server_key(scanned, said(KeyPair.new().public)).failed
+    assert server_key(scanned, said(scanned.server_key)).state == "ok"
+
+
+def test_damaged_list_of_servers(home: KeyHome) -> None:
+    home.folder.make()
+    path = home.path / "known_servers.json"
+    path.write_text("{")
+    path.chmod(0o600)
+    assert server_key(ADDRESS, said(KeyPair.new().public)).failed
+
+
+def test_nothing_to_compare() -> None:
+    assert server_key(ADDRESS, None).state == "skipped"
+    assert server_key(ADDRESS, said("")).state == "ok"

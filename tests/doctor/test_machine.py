@@ -1,0 +1,83 @@
+"""The server's machine: what is looked at, on this one."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from iris_session.doctor import machine
+from iris_session.doctor.findings import Findings, failed, ok, warning
+from iris_session.keys import KeyHome
+
+
+def test_every_check_says_something(tmp_path: Path) -> None:
+    found = machine.machine(tmp_path / "sessions")
+    names = [one.check for one in found]
+    assert names == [
+        "scheduling",
+        "processors",
+        "memory",
+        "disk",
+        "key_home",
+        "ports",
+        "interfaces",
+        "clock_source",
+    ]
+    assert all(one.text and one.state in ("ok", "warning", "failed") for one in found)
+
+
+def test_ports_name_who_has_them() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(1)
+        port = listener.getsockname()[1]
+        found = machine.ports(port)
+    assert found.state == "warning"
+    assert f"{port} (control)" in found.text
+    assert "python" in found.text or "pytest" in found.text
+
+
+def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    assert machine.key_home().state == "ok"  # not there yet
+    KeyHome().server_key()
+    assert machine.key_home().state == "ok"
+    (tmp_path / "home" / "server.key_secret").chmod(0o644)
+    found = machine.key_home()
+    assert found.failed
+    assert "server.key_secret" in found.text
+    assert "chmod" in found.advice
+
+
+def test_key_home_that_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    KeyHome().server_key()
+    path = tmp_path / "home" / "clients.json"
+    path.write_text("[{}]")
+    path.chmod(0o600)
+    assert machine.key_home().failed
+
+
+def test_folder_for_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert str(tmp_path) in machine.room(tmp_path / "deep" / "below").text
+    monkeypatch.setattr(machine, "FULL_DISK", 1 << 60)
+    assert machine.room(tmp_path).failed
+
+
+def test_findings_keep_their_order_and_one_per_check() -> None:
+    findings = Findings()
+    findings.add(ok("b", "fine"), warning("a", "hm"), failed("c", "no"))
+    findings.add(ok("c", "fine after all"))
+    findings.skip("c", "d")
+    findings.sort(("a", "b", "c"))
+    assert [(one.check, one.state) for one in findings] == [
+        ("a", "warning"),
+        ("b", "ok"),
+        ("c", "ok"),
+        ("d", "skipped"),
+    ]
+    assert findings.ok
+    findings.add(failed("d", "no"))
+    assert not findings.ok

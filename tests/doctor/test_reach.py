@@ -1,0 +1,175 @@
+"""The way to a session, on this machine: names, networks, closed ports, what introduces itself."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from typing import ClassVar
+
+import pytest
+
+from iris_session.client.address import Address
+from iris_session.client.discovery import FoundSession
+from iris_session.doctor import reach
+from iris_session.protocol.codec import encode_introduction
+from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import PROTOCOL_VERSION
+
+
+@contextlib.contextmanager
+def says(data: bytes) -> Iterator[Address]:
+    """Something that says `data` to whoever connects to the port below the address."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(4)
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                visitor, _ = listener.accept()
+                with visitor:
+                    visitor.sendall(data)
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield Address("127.0.0.1", listener.getsockname()[1] + 1)
+        thread.join(5.0)
+
+
+def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
+    beacon = Beacon(protocol, "s1", "lab", "live", "127.0.0.1", 7721, 7722, 0, 0, 0)
+    return encode_introduction(Introduction(beacon, pairing=True, participants=3))
+
+
+def test_a_session_introduces_itself() -> None:
+    with says(introduction()) as address:
+        introduced, version, said = reach.introduction(address)
+    assert (introduced.state, version.state) == ("ok", "ok")
+    assert "'lab' (live), 3 participants, a join code is open" in introduced.text
+    assert said is not None
+
+
+@pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
+def test_another_version(theirs: int, older: str) -> None:
+    with says(introduction(theirs)) as address:
+        _, version, said = reach.introduction(address)
+    assert version.failed
+    assert f"version {theirs}" in version.text
+    assert version.advice.startswith(f"update {older}")
+    assert said is None
+
+
+def test_something_else_introduces_itself() -> None:
+    with says(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n") as address:
+        introduced, version, _ = reach.introduction(address)
+    assert introduced.state in ("failed", "warning")
+    assert version.state == "skipped"
+
+
+def test_closed_port() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    found = reach.tcp(Address("127.0.0.1", port), "127.0.0.1")
+    assert found.failed
+    assert "nothing listens" in found.text
+    introduced, _, _ = reach.introduction(Address("127.0.0.1", port + 1))
+    assert introduced.state == "warning"
+
+
+def test_open_port() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(1)
+        assert reach.tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
+
+
+def test_a_firewall_is_told_from_a_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reach, "CONNECT_S", 0.2)
+    with socket.socket() as listener, contextlib.ExitStack() as stack:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)  # full after one: the system throws the rest away
+        for _ in range(3):
+            filling = stack.enter_context(socket.socket())
+            filling.setblocking(False)
+            filling.connect_ex(listener.getsockname())
+        found = reach.tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1")
+    assert found.failed
+    assert "firewall" in found.why
+
+
+def test_own_machine_and_own_networks() -> None:
+    assert reach.subnet("127.0.0.1").state == "ok"
+    assert reach.subnet("::1").state == "ok"
+    for name, network in reach.own_networks():
+        inside = str(next(network.hosts()))
+        found = reach.subnet(inside)
+        assert found.state == "ok"
+        assert name in found.text or str(network) in found.text or "in the network of" in found.text
+
+
+def test_foreign_network() -> None:
+    """Addresses of TEST-NET-3 are in nobody's network."""
+    found = reach.subnet("203.0.113.77")
+    assert found.state in ("warning", "failed")
+    assert "none of this machine's networks" in found.text
+    assert found.advice
+
+
+def test_names() -> None:
+    found, ip = reach.resolved(Address("localhost", 7721))
+    assert found.state == "ok"
+    assert ip in ("127.0.0.1", "::1")
+    found, ip = reach.resolved(Address("no-such-machine.invalid", 7721))
+    assert found.failed
+    assert ip == ""
+
+
+class Listener:
+    """Hears what it is given."""
+
+    sessions_heard: tuple[FoundSession, ...] = ()
+    ignored: ClassVar[dict[str, int]] = {}
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def wait(self, timeout_s: float) -> None: ...
+
+    def sessions(self) -> list[FoundSession]:
+        return list(self.sessions_heard)
+
+
+def heard(name: str, address: str) -> FoundSession:
+    return FoundSession(name, address, f"id-{address}", "live", "", (address,))
+
+
+@pytest.mark.parametrize(
+    ("sessions", "ignored", "name", "state", "text"),
+    [
+        ((heard("lab", "10.0.0.1:7721"),), {}, "lab", "ok", "10.0.0.1:7721"),
+        ((heard("lab", "10.0.0.1:7721"), heard("lab", "10.0.0.2:7721")), {}, "lab", "failed", "2 sessions"),
+        ((heard("other", "10.0.0.1:7721"),), {}, "lab", "failed", "other (10.0.0.1:7721)"),
+        ((), {}, "", "warning", "no session is heard"),
+        ((), {"other_version": 3}, "", "warning", "another protocol version"),
+        ((heard("lab", "10.0.0.1:7721"),), {}, "", "ok", "lab"),
+    ],
+)
+def test_beacon(
+    monkeypatch: pytest.MonkeyPatch,
+    sessions: tuple[FoundSession, ...],
+    ignored: dict[str, int],
+    name: str,
+    state: str,
+    text: str,
+) -> None:
+    monkeypatch.setattr(reach, "LISTEN_S", 0.01)
+    monkeypatch.setattr(reach, "BeaconListener", Listener)
+    monkeypatch.setattr(Listener, "sessions_heard", sessions)
+    monkeypatch.setattr(Listener, "ignored", ignored)
+    found, _ = reach.beacon(name, None)
+    assert found.state == state
+    assert text in found.text

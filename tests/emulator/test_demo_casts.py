@@ -1,0 +1,65 @@
+"""The casts of the demos on the real physics and control, late and noisy; and people with two hands."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from iris_session.emulator.behaviours import HandInput, Hands, OperatorView
+from iris_session.runtime.plays import make_play
+from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
+from tests.models import robot_models
+
+__all__ = ["robot_models"]
+
+
+@pytest.mark.usefixtures("robot_models")
+@pytest.mark.parametrize(("name", "operators"), [("iiwa", 2), ("iiwa", 4), ("aloha", 2)])
+def test_everything_changes_hands(name: str, operators: int) -> None:
+    """By friction, in mid-air, and ends on a table. ALOHA: all four arms at the same time."""
+    rig = demo(make_play(name, operators), seed=0)
+    rig.run(60.0, until=over)
+    assert demo_verdict(rig) == ""
+    assert rig.fastest_hand < 0.5
+
+
+def test_eight_arms_around_a_table() -> None:
+    rig = demo(make_play("handover", 8), seed=3)
+    rig.run(40.0, until=over)
+    assert demo_verdict(rig) == ""
+
+
+class Scripted:
+    """One hand that is done after some updates."""
+
+    def __init__(self, robot: str, updates: int, failed: str = "") -> None:
+        self.phase, self.done, self.failed = "busy", False, ""
+        self._robot, self._left, self._end = robot, updates, failed
+
+    def update(self, view: OperatorView) -> tuple[HandInput, ...]:
+        self._left -= 1
+        if self._left <= 0:
+            self.phase, self.done, self.failed = "done", True, self._end
+        return (HandInput(f"controller/{self._robot}", self._robot, view.device_pose(""), False, 0.0),)
+
+
+def view() -> LateView:
+    return LateView(random.Random(1))
+
+
+def test_both_hands_work_side_by_side_until_both_are_done() -> None:
+    hands = Hands([Scripted("left", 2), Scripted("right", 3)])
+    assert [i.robot for i in hands.update(view())] == ["left", "right"]
+    assert (hands.phase, hands.done) == ("busy", False)
+    hands.update(view())
+    assert not hands.done
+    assert [i.robot for i in hands.update(view())] == ["left", "right"]  # the idle hand is still sent
+    assert (hands.phase, hands.done, hands.failed) == ("done", True, "")
+
+
+def test_a_failure_of_one_hand_is_one_of_the_person() -> None:
+    hands = Hands([Scripted("left", 9), Scripted("right", 1, "dropped it")])
+    hands.update(view())
+    assert hands.failed == "dropped it"
+    assert not hands.done
