@@ -1,0 +1,171 @@
+"""What `tools/fuzz.py` has found, each by an input that showed it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+
+from iris_session.client.address import Address
+from iris_session.client.connection import Connection
+from iris_session.client.errors import ClientError
+from iris_session.client.identity import Identity
+from iris_session.keys import KeysError
+from iris_session.keys.allow_list import AllowList
+from iris_session.keys.curve import load_public
+from iris_session.keys.files import PrivateFolder
+from iris_session.keys.session_notes import SessionNotes
+from iris_session.protocol.client_messages import Heartbeat, Hello
+from iris_session.protocol.codec import decode_client, encode_server
+from iris_session.protocol.entries import decode_entries, decode_entry
+from iris_session.protocol.server_messages import (
+    Endpoints,
+    Lease,
+    Message,
+    ProtocolFault,
+    Reply,
+    ServerEnvelope,
+    Welcome,
+)
+from iris_session.recording import journal
+from iris_session.recording.messages import decode_header
+from iris_session.streams.rigid import RigidDecoder
+from iris_session.transport import SceneInfo
+from iris_session.transport.link_messages import decode_decided
+from iris_session.transport.state_publisher import StatePublisher
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize("port", ["²", "٣", "9" * 5000, "-1", "65536"])
+def test_ports_that_are_no_numbers(port: str) -> None:
+    for text in (f"lab:{port}", f"iris://lab:{port}/"):
+        with pytest.raises(ClientError):
+            Address.parse(text)
+
+
+@pytest.mark.parametrize("decode", [decode_entry, decode_entries, decode_decided, decode_header])
+@pytest.mark.parametrize("data", [b"\x91" * 5000, b"\x94\x01\x01\x01\x81\xa1\xff\x01", b"\x81\xa2\xc3\x28\x01", b""])
+def test_decoders_of_our_own_processes_promise_one_error(decode: object, data: bytes) -> None:
+    with pytest.raises(msgspec.DecodeError):
+        decode(data)  # type: ignore[operator]
+
+
+def test_counts_of_a_row_that_do_not_fit_are_damage() -> None:
+    row = journal.make_row(b"\0" * 16, 0, 0, 1, [], b"d" * 16)
+    for changed in (
+        {"entry_lengths": (1, 2)},
+        {"entry_crcs": (2**63,)},
+        {"entry_lengths": (2**64 - 1,), "entry_crcs": (1, 2, 3)},
+        {"field_crcs": (2**64 - 1,) * 6},
+    ):
+        damaged = msgspec.structs.replace(row, **changed)
+        assert journal.check_row(b"\0" * 16, damaged) is not None
+        journal.check_fields(damaged)
+    assert journal.check_row(b"\0" * 16, row) is None
+    keyframe = journal.seal(journal.Keyframe(3, b"p", b"a", b"c"), b"chain")
+    assert journal.check_keyframe(keyframe) == ""
+    assert journal.check_keyframe(msgspec.structs.replace(keyframe, step=2**64 - 1)) == "step"
+
+
+@pytest.mark.parametrize("content", [b'[{"name": "\xff"}]', b"[" * 100_000, b'[{"pid": 1'])
+def test_damaged_files_of_keys_are_one_kind_of_error(tmp_path: Path, content: bytes) -> None:
+    tmp_path.chmod(0o700)
+    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionNotes)):
+        (tmp_path / name).touch(0o600)
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(KeysError):
+            kind(PrivateFolder(tmp_path)).read()
+
+
+def test_a_note_of_a_process_that_cannot_be(tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    file = tmp_path / "sessions.json"
+    file.touch(0o600)
+    note = {"session_id": "s", "name": "lab", "pid": 2**40, "hosts": [], "control": 1, "server": ""}
+    file.write_bytes(msgspec.json.encode([note]))
+    assert SessionNotes(PrivateFolder(tmp_path)).read() == []
+
+
+@pytest.mark.parametrize("line", [b"public-key", b"public-key = abc", b'public-key = "\xff\xff"', b"public-key ="])
+def test_damaged_certificates_are_one_kind_of_error(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / "x.key"
+    path.write_bytes(b"metadata\ncurve\n    " + line + b"\n")
+    with pytest.raises(KeysError):
+        load_public(path)
+
+
+def joined(heartbeat_ns: int) -> Connection:
+    connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+    connection.open(10**12)
+    tell(
+        connection,
+        Welcome("s", "lab", "live", "p1", 7, "operator", b"t", False, 0, heartbeat_ns, 1, 1, Endpoints(1, 2)),
+    )
+    return connection
+
+
+def tell(connection: Connection, message: Message) -> None:
+    connection.receive([encode_server(ServerEnvelope(1, 7, message))], 10**12)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("heartbeat_ns", [-(2**63), 0, 1])
+def test_a_session_cannot_make_a_client_send_without_rest(heartbeat_ns: int) -> None:
+    connection = joined(heartbeat_ns)
+    heartbeats = 0
+    for i in range(100):
+        connection.tick(10**12 + i * MS)
+        assert connection.next_deadline_ns(10**12 + i * MS) > 10**12
+        while (waiting := connection.peek_outgoing()) is not None:
+            heartbeats += isinstance(decode_client(waiting[1]).message, Heartbeat)
+            connection.pop_outgoing(sent=True)
+    assert heartbeats <= 10
+
+
+def test_a_silent_session_is_noticed_whatever_heartbeat_it_asked_for() -> None:
+    connection = joined(2**63 - 1)
+    now_ns = 10**12
+    for _ in range(100):
+        now_ns += 500 * MS
+        connection.tick(now_ns)
+    assert connection.counters.reconnects == 1
+
+
+def test_what_a_session_says_does_not_pile_up_in_a_client() -> None:
+    connection = joined(500 * MS)
+    for i in range(6000):
+        tell(connection, ProtocolFault(f"code{i}", "x"))
+        tell(connection, Reply(0, True, leases=(Lease(f"robot{i}", "robot", "exclusive", "p1", 1),)))
+    assert len(connection.counters.faults) <= 65
+    assert sum(connection.counters.faults.values()) == 6000
+    assert len(connection.answers._granted) <= 4096
+
+
+def test_frames_of_bodies_that_are_not_are_refused_unchanged() -> None:
+    decoder = RigidDecoder(3)
+    for payload in (b"", b"\0" * 200, b"\xff" * 200):
+        with pytest.raises(ValueError):
+            decoder.apply(1, 0, payload)
+    assert decoder.state_seq == 0
+
+
+def test_an_idle_state_socket_does_what_waits() -> None:
+    """libzmq acts on what happened to connections when it is asked for something: also while no state is sent."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    state = context.socket(zmq.XPUB)
+    publisher = StatePublisher(state, SceneInfo("hash"), lambda: 0)
+    asked: list[int] = []
+    publisher.use_socket(None)
+    publisher.tend()
+
+    class Watched:
+        def get(self, option: int) -> int:
+            asked.append(option)
+            return 0
+
+    publisher._state = Watched()  # type: ignore[assignment]
+    publisher.tend()
+    assert asked == [int(zmq.EVENTS)]
+    context.destroy(linger=0)

@@ -1,0 +1,145 @@
+"""Fuzzing: bytes and conversations of nobody honest, for every decoder and every state machine that has a socket.
+
+    python tools/fuzz.py --target all --inputs 1000000 --seed 1
+    python tools/fuzz.py --target client,front --inputs 20000 --json
+
+Inputs are made from the schemas of the messages, right and wrong, and damaged as bytes. A finding is an exception
+that is not the one that a target promises, a broken invariant, or memory that grows; its input is saved, and it
+comes again with the same seed. Exit status 1 when there is one. `--list` names the targets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import traceback
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+import psutil
+from fuzz_decoders import DECODERS
+from fuzz_machines import ALL_TYPES, MACHINES
+
+TARGETS: Final = {**DECODERS, **MACHINES}
+#: What a target may hold more than after its first inputs.
+MAX_GROWTH_MIB: Final = 64
+WARM_UP: Final = 5000
+LOOK_EVERY: Final = 1000
+MAX_FINDINGS: Final = 5
+
+
+@dataclass
+class Result:
+    """What became of one target. `growth_mib`: peak of resident memory above that after the first inputs."""
+
+    target: str
+    inputs: int = 0
+    accepted: int = 0
+    seconds: float = 0.0
+    peak_rss_mib: float = 0.0
+    growth_mib: float = 0.0
+    findings: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        return self.inputs / self.seconds if self.seconds else 0.0
+
+
+def fuzz(name: str, inputs: int, seed: int, save: Path | None = None, limit_s: float = float("inf")) -> Result:
+    """Gives `inputs` inputs to a target, or what fits into `limit_s`."""
+    result = Result(name)
+    target = TARGETS[name](Random(f"{seed}:{name}"))
+    process = getattr(target, "process", None) or psutil.Process()
+    seen: set[str] = set()
+    base = 0
+    began = time.monotonic()
+    try:
+        for i in range(inputs):
+            data = target.make()
+            try:
+                result.accepted += bool(target.take(data))
+            except Exception as error:  # whatever it is: that is what we look for
+                where = traceback.extract_tb(error.__traceback__)[-1]
+                place = f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}"
+                if place not in seen:
+                    seen.add(place)
+                    result.findings.append(finding(name, seed, i, data, f"{place}: {error}"[:500], save))
+            result.inputs = i + 1
+            if i % LOOK_EVERY == 0:
+                rss = process.memory_info().rss
+                result.peak_rss_mib = max(result.peak_rss_mib, rss / 2**20)
+                base = max(base, rss) if i <= WARM_UP else base
+                if time.monotonic() - began > limit_s or len(seen) >= MAX_FINDINGS:
+                    break
+    finally:
+        result.seconds = time.monotonic() - began
+        target.close()
+    result.growth_mib = max(0.0, result.peak_rss_mib - base / 2**20)
+    if result.growth_mib > MAX_GROWTH_MIB:
+        result.findings.append(
+            finding(name, seed, result.inputs, b"", f"memory grew by {result.growth_mib:.0f} MiB", None)
+        )
+    if name in ("client", "front") and inputs > WARM_UP:
+        missing = sorted(ALL_TYPES - getattr(target, "types", ALL_TYPES))
+        if missing:
+            result.findings.append(finding(name, seed, result.inputs, b"", f"never sent: {', '.join(missing)}", None))
+    return result
+
+
+def finding(name: str, seed: int, number: int, data: bytes, text: str, save: Path | None) -> dict[str, Any]:
+    path = ""
+    if save is not None:
+        save.mkdir(parents=True, exist_ok=True)
+        file = save / f"{name}-{seed}-{number}.bin"
+        file.write_bytes(data)
+        path = str(file)
+    return {"target": name, "seed": seed, "input": number, "text": text, "saved": path}
+
+
+def line(result: Result) -> str:
+    return (
+        f"| {result.target} | {result.inputs:,} | {result.accepted / max(1, result.inputs):.0%} | {result.rate:,.0f} | "
+        f"{result.peak_rss_mib:.0f} | {result.growth_mib:.1f} | {len(result.findings)} |"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--target", default="all", help="names with commas between them, or all")
+    parser.add_argument("--inputs", type=int, default=10_000, help="for each target")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--limit", type=float, default=float("inf"), help="seconds for each target at most")
+    parser.add_argument("--save", type=Path, default=Path("fuzz-findings"), help="folder for inputs of findings")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--list", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.list:
+        print("\n".join(TARGETS))
+        return 0
+    names = list(TARGETS) if arguments.target == "all" else arguments.target.split(",")
+    unknown = [name for name in names if name not in TARGETS]
+    if unknown:
+        parser.error(f"unknown target {', '.join(unknown)}: {', '.join(TARGETS)}")
+    results = []
+    if not arguments.json:
+        print("| target | inputs | accepted | per second | peak RSS [MiB] | growth [MiB] | findings |")
+        print("|---|---|---|---|---|---|---|", flush=True)
+    for name in names:
+        results.append(fuzz(name, arguments.inputs, arguments.seed, arguments.save, arguments.limit))
+        if not arguments.json:
+            print(line(results[-1]), flush=True)
+    findings = [one for result in results for one in result.findings]
+    if arguments.json:
+        print(json.dumps({"ok": not findings, "results": [{**asdict(r), "per_second": r.rate} for r in results]}))
+    else:
+        for one in findings:
+            print(f"{one['target']}, seed {one['seed']}, input {one['input']}: {one['text']} {one['saved']}")
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,326 @@
+"""What `fuzz.py` gives conversations to: a client's connection and state stream, the front over real sockets, the core.
+
+Each keeps its state over many inputs, so a finding is repeated by its seed and number, not by its bytes alone.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import psutil
+import zmq
+from fuzz_decoders import client_messages, rigid_frames, server_messages
+from fuzz_inputs import Corpus, encoded
+
+from iris_session.client.connection import Connection
+from iris_session.client.identity import Identity
+from iris_session.client.limits import MAX_INBOX
+from iris_session.client.state_stream import StateStream
+from iris_session.client.status import Phase
+from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, envelope
+from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server
+from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.server_messages import (
+    TOPIC_PRESENCE,
+    TOPIC_RIGID,
+    ClockPong,
+    Endpoints,
+    Presence,
+    ServerEnvelope,
+    StateHeader,
+    Welcome,
+)
+from iris_session.transport import FrontLimits
+
+ROOT: Final = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))  # the harness and the random entries are those of the tests
+MS: Final = 1_000_000
+
+
+class ClientConnection:
+    """A client that a hostile session talks to: after an honest welcome now and then, anything."""
+
+    def __init__(self, rng: Random) -> None:
+        self._rng = rng
+        self._corpus = Corpus(rng, server_messages())
+        self._now_ns = 10**12
+        self._left = 0
+
+    def make(self) -> bytes:
+        if not self._left:
+            self._left = self._rng.choice((20, 300))
+            self.connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+            self.connection.open(self._now_ns)
+        self._left -= 1
+        rng, connection = self._rng, self.connection
+        if connection.phase is Phase.JOINING and rng.random() < 0.3:
+            welcome = Welcome(
+                "s", "lab", "live", "p1", 7, "operator", b"t" * 16, False, 0, 500 * MS, 2 * MS, 16 * MS, Endpoints(1, 2)
+            )
+            return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, welcome))
+        if connection.joined and rng.random() < 0.05:
+            return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, ClockPong(self._now_ns - MS, 0, 0)))
+        return self._corpus.damaged()
+
+    def take(self, data: bytes) -> bool:
+        rng, connection = self._rng, self.connection
+        malformed = connection.counters.malformed
+        bulk = [rng.randbytes(rng.choice((0, 56, 57, 112)))] if rng.random() < 0.3 else []
+        connection.receive([data, *bulk], self._now_ns)
+        self._now_ns += rng.choice((0, 1, 20, 3000)) * MS
+        connection.tick(self._now_ns)
+        assert connection.next_deadline_ns(self._now_ns) > 0
+        if rng.random() < 0.1 and connection.joined:
+            connection.send(Sample("head", "pose", 1, 0, 0, 0, 0, pose=IDENTITY))
+            connection.request(Marker(0, "x"))
+        while (waiting := connection.peek_outgoing()) is not None:
+            decode_client(waiting[1])
+            connection.pop_outgoing(sent=rng.random() < 0.9)
+        assert len(connection.inbox) <= MAX_INBOX
+        if rng.random() < 0.01:
+            connection.inbox.clear()
+            connection.describe()
+        return connection.counters.malformed == malformed
+
+    def close(self) -> None:
+        """Nothing was opened."""
+
+
+class ClientState:
+    """State frames and presence from a hostile session."""
+
+    def __init__(self, rng: Random) -> None:
+        self._rng = rng
+        frames = rigid_frames(7)
+        self._rigid = Corpus(rng, [lambda rng: frames(rng)[16:]])
+        self._headers = Corpus(rng, [lambda rng: encoded(rng, StateHeader)])
+        self._presence = Corpus(rng, [lambda rng: encoded(rng, Presence)])
+        self._now_ns = 10**12
+        self.stream = StateStream()
+
+    def make(self) -> bytes:
+        rng = self._rng
+        if rng.random() < 0.3:
+            frames = [TOPIC_PRESENCE, self._presence.damaged()]
+        else:
+            header = self._headers.damaged()
+            if rng.random() < 0.5:
+                seq = rng.randrange(1, 1000)
+                header = msgspec.msgpack.encode(
+                    StateHeader(0, 0, 0, 0.0, self._now_ns, self._now_ns, seq, rng.randrange(seq))
+                )
+            frames = [TOPIC_RIGID, header, self._rigid.damaged()]
+        if not rng.randrange(50):
+            frames = rng.choice(([b""], [TOPIC_RIGID], [b"x", b"y"], [*frames, b"more"]))
+        return msgspec.msgpack.encode(frames)
+
+    def take(self, data: bytes) -> bool:
+        rng, stream = self._rng, self.stream
+        if not rng.randrange(100):
+            stream.reset()
+            stream.load_keyframe(0, np.zeros((7, 7)))
+        malformed = stream.counters.malformed
+        self._now_ns += 16 * MS
+        stream.drain([msgspec.msgpack.decode(data)], self._now_ns, self._now_ns)
+        if rng.random() < 0.1:
+            len(stream.presence)
+        return stream.counters.malformed == malformed
+
+    def close(self) -> None:
+        """Nothing was opened."""
+
+
+class FrontControl:
+    """The control port of a real front process. Peers say hello and anything after it, whole or damaged.
+
+    Every `BARRIER` inputs an honest client asks for the time: the front must answer, and hold no more than it may.
+    """
+
+    BARRIER: Final = 2000
+    PEERS: Final = 8
+    #: Inputs of one peer before a new one takes its place.
+    LIFE: Final = 400
+
+    def __init__(self, rng: Random) -> None:
+        from tests.transport.harness import FrontSession
+
+        self._rng = rng
+        limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6)
+        self.session = FrontSession(limits=limits, silence_ns=10**12)
+        self.process = psutil.Process(self.session.process.pid)
+        self._corpus = Corpus(rng, client_messages())
+        self._peers: list[zmq.Socket[bytes]] = []
+        self._lives: list[int] = []
+        self._honest = self.session.client()
+        self._honest.join()
+        self._sent = 0
+        self._newest = 1
+        self.base = self.process.memory_info().rss
+        self.peak = self.base
+        self.types: set[str] = set()
+
+    def make(self) -> bytes:
+        return self._corpus.damaged()
+
+    def take(self, data: bytes) -> bool:
+        """True when the protocol lets it through to the front's state machine."""
+        rng = self._rng
+        self._sent += 1
+        peer = self._peer(rng.randrange(self.PEERS))
+        try:
+            accepted = decode_client(data)
+        except ProtocolError:
+            accepted = None
+        else:
+            self.types.add(str(accepted.message.__struct_config__.tag))
+            if rng.random() < 0.7:  # as one who knows what the session said
+                data = encode_client(msgspec.structs.replace(accepted, connection_epoch=self._newest))
+        extra = [b"extra"] if not rng.randrange(200) else []
+        deadline = time.monotonic() + 10.0
+        while True:
+            try:
+                peer.send_multipart([data, *extra], zmq.DONTWAIT)
+                break
+            except zmq.Again:
+                assert time.monotonic() < deadline, "the front takes nothing"
+                self.session.once()
+        if self._sent % 50 == 0:
+            self.session.once()
+            self._newest = max((self._newest, *(entry.connection for entry in self.session.entries)))
+            self.session.entries.clear()
+        if self._sent % self.BARRIER == 0:
+            self._check()
+        return accepted is not None
+
+    def _peer(self, i: int) -> zmq.Socket[bytes]:
+        if i < len(self._peers) and self._lives[i] > 0:
+            self._lives[i] -= 1
+            return self._peers[i]
+        new = self.session.context.socket(zmq.DEALER)
+        new.linger = 0
+        new.sndhwm = 100
+        new.connect(f"tcp://127.0.0.1:{self.session.ports.control}")
+        if self._rng.random() < 0.9:
+            new.send(encode_client(envelope(Hello("operator", "Ann", secret=self._rng.randbytes(16)))))
+        if i < len(self._peers):
+            self._peers[i].close(linger=0)
+            self._peers[i], self._lives[i] = new, self.LIFE
+        else:
+            i = len(self._peers)
+            self._peers.append(new)
+            self._lives.append(self.LIFE)
+        return self._peers[i]
+
+    def _check(self) -> None:
+        for peer in self._peers:
+            while peer.poll(0):
+                decode_server(peer.recv_multipart()[0])
+        honest = self._honest
+        honest.inbox.clear()
+        honest.send(ClockPing(self._sent))
+        honest.wait_for(ClockPong)
+        assert self.session.process.alive
+        rss = self.process.memory_info().rss
+        self.peak = max(self.peak, rss)
+        assert rss - self.base < self.session.config.limits.memory_bytes, f"the front holds {rss >> 20} MiB"
+
+    def close(self) -> None:
+        for peer in self._peers:
+            peer.close(linger=0)
+        self.session.close()
+
+
+def _zmtp(rng: Random) -> bytes:
+    """What a ZeroMQ peer sends: greeting, READY, a message. Mechanism NULL or CURVE."""
+    mechanism = rng.choice((b"NULL", b"CURVE", b"PLAIN"))
+    greeting = (
+        b"\xff" + bytes(8) + b"\x7f\x03" + rng.choice((b"\x00", b"\x01")) + mechanism.ljust(20, b"\0") + bytes(32)
+    )
+    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
+    if mechanism == b"CURVE":
+        ready = b"\x05HELLO\x01\x00" + bytes(72) + rng.randbytes(120)
+    body = encode_client(ClientEnvelope(PROTOCOL_VERSION, 0, "", EStop()))
+    return greeting + b"\x04" + bytes((len(ready),)) + ready + b"\x00" + bytes((len(body),)) + body
+
+
+class FrontTcp(FrontControl):
+    """Bytes of strangers on the ports of control, state and introduction: half and damaged handshakes."""
+
+    BARRIER: Final = 1000
+
+    def __init__(self, rng: Random) -> None:
+        super().__init__(rng)
+        self._corpus = Corpus(rng, [_zmtp])
+        self._open: list[socket.socket] = []
+
+    def take(self, data: bytes) -> bool:
+        rng, ports = self._rng, self.session.ports
+        self._sent += 1
+        port = rng.choice((ports.control, ports.control, ports.state, ports.control - 1))
+        one = socket.socket()
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # leaves no port in TIME_WAIT
+        one.settimeout(5.0)
+        one.connect(("127.0.0.1", port))
+        try:
+            one.sendall(data)
+        except OSError:
+            one.close()  # it was refused before it had said all
+            return False
+        self._open.append(one)
+        if len(self._open) > 64:
+            self._open.pop(rng.randrange(64)).close()
+        if self._sent % self.BARRIER == 0:
+            self._check()
+        return True
+
+    def close(self) -> None:
+        for one in self._open:
+            one.close()
+        super().close()
+
+
+class Core:
+    """Authority, control and physics under random entries that the schema takes: `tests/runtime/fuzz_core.py`."""
+
+    def __init__(self, rng: Random) -> None:
+        from tests.runtime.fuzz_core import Fuzz
+
+        self._fuzz = Fuzz(rng.getrandbits(32))
+        self._given = 0
+
+    def make(self) -> bytes:
+        return b""
+
+    def take(self, data: bytes) -> bool:
+        """One entry is one input: steps get several, now and then many."""
+        if self._given > 0:
+            self._given -= 1
+            return True
+        rng = self._fuzz.rng
+        n = rng.choice([1, 3, 20, 400]) if rng.random() < 0.1 else rng.randrange(4)
+        self._fuzz.step(n)
+        self._given = n - 1
+        return True
+
+    def close(self) -> None:
+        """Nothing was opened."""
+
+
+MACHINES: Final[dict[str, Callable[[Random], Any]]] = {
+    "connection": ClientConnection,
+    "state-stream": ClientState,
+    "front": FrontControl,
+    "front-tcp": FrontTcp,
+    "core": Core,
+}
+ALL_TYPES: Final = frozenset(CLIENT_TYPES)
