@@ -27,10 +27,12 @@ FORBIDDEN = {
     "control": SOCKETS | CLOCKS | THREADS | RANDOM | {"rerun"},
     "physics": {"zmq", "rerun"} | RANDOM,
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
+    "keys": (SOCKETS - {"zmq"}) | THREADS | RANDOM | HEAVY,
     "transport": {"mujoco", "rerun"},
     "recording": set(),
     "client": {"mujoco", "rerun"},
     "emulator": {"mujoco", "rerun"},
+    "doctor": {"zmq", "mujoco", "rerun"},
 }
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")

@@ -22,6 +22,7 @@ from iris_session import Session, SessionConfig
 from iris_session.cli.main import build_parser
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol import names
+from tests.models import BESIDE
 
 ROOT = Path(__file__).parents[1]
 #: `docs/protocol.md` has tests of its own (tests/protocol); its links are checked here too.
@@ -144,25 +145,57 @@ def test_python_block_runs(block: Block, run_python: Callable[..., str], request
     run_python(text)
 
 
+def _network_page(part: str) -> str:
+    """The one Python block of the network page that has `part` in it."""
+    (text,) = (b.text for b in BLOCKS if b.page.name == "network.md" and b.language == "python" and part in b.text)
+    return text
+
+
+def _network_command(part: str) -> list[str]:
+    (words,) = (words for where, words in commands() if where.startswith("network.md:") and part in words)
+    return words
+
+
+def _emulate(words: list[str], folder: Path) -> None:
+    """Runs an `emulate` that the network page shows; its people must see something."""
+    done = subprocess.run(
+        [sys.executable, "-m", "iris_session.cli.main", *words, "--behaviour", "observer", "--seconds", "2", "--json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["frames"] > 0
+
+
 @pytest.mark.e2e
-def test_keys_of_the_network_page_work(tmp_path: Path, run_python: Callable[..., str]) -> None:
-    make, use = (block.text for block in BLOCKS if block.page.name == "network.md" and block.language == "python")
-    run_python(make)
+def test_key_files_of_the_network_page_work(tmp_path: Path, run_python: Callable[..., str]) -> None:
+    run_python(_network_page("create_certificates"))
     with served(tmp_path, "--curve-key", "keys/server.key_secret", "--curve-clients", "keys/clients") as address:
-        assert re.search(r"\(\d+, 7\)", run_python(use.replace(f"{LAB_ADDRESS}:7721", address)))
-        (shown,) = (words for where, words in commands() if where.startswith("network.md:") and "emulate" in words)
-        words = [address if LAB_ADDRESS in word else word for word in shown]
-        words += ["--behaviour", "observer", "--seconds", "2", "--json"]
+        use = _network_page("CurveKeys").replace(f"{LAB_ADDRESS}:7721", address)
+        assert re.search(r"\(\d+, 7\)", run_python(use))
+        _emulate([address if LAB_ADDRESS in word else word for word in _network_command("--curve-server")], tmp_path)
+
+
+@pytest.mark.e2e
+def test_joining_by_code_as_on_the_network_page_works(tmp_path: Path, run_python: Callable[..., str]) -> None:
+    join = _network_page("join_code=")
+    (shown,) = re.findall(r'join_code="(.+?)"', join)
+    with served(tmp_path, "--curve") as address:
         done = subprocess.run(
-            [sys.executable, "-m", "iris_session.cli.main", *words],
-            cwd=tmp_path,
+            [sys.executable, "-m", "iris_session.cli.main", "pair", "--address", address, "--no-wait", "--json"],
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout.splitlines()[-1])["frames"] > 0
+        code = json.loads(done.stdout)["code"]
+        text = join.replace(f"{LAB_ADDRESS}:7721", address).replace(shown, code)
+        assert re.search(r"\(\d+, 7\)", run_python(text))
+        _emulate(["emulate", address], tmp_path)  # the same user's key is on the list now
 
 
 @pytest.mark.e2e
@@ -229,7 +262,7 @@ def test_command_parses(where: str, arguments: tuple[str, ...]) -> None:
 
 def test_commands_are_found() -> None:
     found = {arguments[0] for _, arguments in commands()}
-    assert found == {"demo", "serve", "verify", "emulate", "robots", "bench"}
+    assert found == set(_commands())
 
 
 def test_make_targets_exist() -> None:
@@ -244,17 +277,32 @@ def test_make_targets_exist() -> None:
 
 def test_command_line_reference_has_every_option() -> None:
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
-    actions = build_parser()._subparsers
-    assert actions is not None
-    subparsers = next(a for a in actions._group_actions if isinstance(a, argparse._SubParsersAction))
     common = _section(page, "Session options")
-    for name, parser in subparsers.choices.items():
+    for name, parser in _commands().items():
         text = _section(page, name)
         if "#session-options" in text:
             text += common
-        known = {option for action in parser._actions for option in action.option_strings} - {"-h", "--help", "--json"}
+        known = _options(parser) - {"-h", "--help", "--json"}
         shown = set(re.findall(r"`(--[a-z-]+)", text)) - {"--json"}
         assert shown == known, f"{name}: {sorted(shown ^ known)}"
+
+
+def _commands() -> dict[str, argparse.ArgumentParser]:
+    """Every command of `iris-session` and its parser."""
+    actions = build_parser()._subparsers
+    assert actions is not None
+    subparsers = next(a for a in actions._group_actions if isinstance(a, argparse._SubParsersAction))
+    return dict(subparsers.choices)
+
+
+def _options(parser: argparse.ArgumentParser) -> set[str]:
+    """Options of a command and of the actions below it (`keys allow`)."""
+    found: set[str] = set()
+    for action in parser._actions:
+        found.update(action.option_strings)
+        if isinstance(action, argparse._SubParsersAction):
+            found.update(*(_options(inner) for inner in action.choices.values()))
+    return found
 
 
 def _section(page: str, title: str) -> str:
@@ -296,7 +344,8 @@ FILE = re.compile(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|md|xml|toml|json|png))`")
 def test_named_files_exist(page: Path) -> None:
     for name in FILE.findall(prose(page)):
         # Modules are named from the root or, in short, from the package.
-        assert (ROOT / name).is_file() or (ROOT / "iris_session" / name).is_file(), f"{page.name}: {name}"
+        folders = (ROOT, ROOT / "iris_session", Path(os.environ.get("IRIS_DATA") or BESIDE))
+        assert any((folder / name).is_file() for folder in folders), f"{page.name}: {name}"
 
 
 def test_files_are_named() -> None:
@@ -324,7 +373,14 @@ def test_every_reason_is_explained(enumeration: str, table: str) -> None:
 
 
 def test_all_tables_of_reasons_are_there() -> None:
-    assert {name for name, _ in TABLES} == {"HoldReason", "RejectReason", "DenialReason", "RefusalCode", "FaultCode"}
+    assert {name for name, _ in TABLES} == {
+        "HoldReason",
+        "RejectReason",
+        "DenialReason",
+        "RefusalCode",
+        "FaultCode",
+        "LateCause",
+    }
 
 
 def test_roles_modes_and_policies_are_in_the_guide() -> None:

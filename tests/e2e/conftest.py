@@ -189,11 +189,18 @@ class Stage:
         return hand
 
     def engage(self, hand: Hand) -> None:
-        """Opens, then closes the clutch, and waits until the robot follows."""
-        hand.clutch = False
-        self.seconds(0.1)
-        hand.clutch = True
-        self.run(lambda: self.following(hand), f"{hand.robot} follows {hand.client.name}")
+        """Opens, then closes the clutch, and waits until the robot follows; again, as people do, when it does not."""
+        closed_at = 0.0
+
+        def clutched() -> bool:
+            nonlocal closed_at
+            if time.monotonic() > closed_at + 2.0:  # on a busy machine no sample may have counted while it was open
+                hand.clutch = False
+                self.seconds(0.1)
+                hand.clutch, closed_at = True, time.monotonic()
+            return self.following(hand)
+
+        self.run(clutched, f"{hand.robot} follows {hand.client.name}")
 
     def following(self, hand: Hand) -> bool:
         state = hand.client.state

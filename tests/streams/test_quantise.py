@@ -12,72 +12,77 @@ from iris_session.streams.errors import StreamError
 from iris_session.streams.quantise import (
     LATTICE_M,
     POSITION_QUANTUM_ERROR_M,
-    ROTATION_LEVELS,
+    ROTATION_BITS,
+    ROTATION_CENTRE,
     ROTATION_QUANTUM_ERROR_RAD,
-    pack_words,
-    rotation_codes,
+    Floats,
+    Ints,
+    rotation_levels,
     rotations,
-    unpack_words,
 )
 from tests.streams.poses import random_poses, rotation_errors
 
 
-def test_six_bytes_hold_the_room() -> None:
-    assert np.prod(np.floor(np.array([10.0, 10.0, 3.0]) / LATTICE_M) + 2) <= 2**48
-    assert pytest.approx(9.25e-5, rel=1e-3) == POSITION_QUANTUM_ERROR_M
+def there_and_back(q: Floats) -> Floats:
+    """Unit quaternions (m, 4) as they are decoded."""
+    return decoded(rotation_levels(np.ascontiguousarray(q.T))).T
 
 
-def test_levels_fit_five_bytes() -> None:
-    assert 4 * ROTATION_LEVELS**3 <= 2**40 < 4 * (ROTATION_LEVELS + 2) ** 3
+def decoded(levels: Ints) -> Floats:
+    """Unit quaternions (4, m) of `levels` (3, m)."""
+    rows = np.empty((4, levels.shape[1]))
+    rotations(levels.astype(np.int32), rows[0], rows[1:])
+    return rows
+
+
+def test_lattice_is_exact_and_half_a_cell_is_the_bound() -> None:
+    assert pytest.approx(5.29e-5, rel=1e-3) == POSITION_QUANTUM_ERROR_M
+    index = np.array([2**31 - 1, -(2**31), 12_345_678])
+    np.testing.assert_array_equal(index * LATTICE_M / LATTICE_M, index)
+
+
+def test_levels_fit_their_bits() -> None:
+    assert 2 * ROTATION_CENTRE < 2**ROTATION_BITS
 
 
 def test_rotation_error_is_bounded_everywhere() -> None:
     q = random_poses(np.random.default_rng(1), 200_000)[:, 3:]
-    assert rotation_errors(q, rotations(rotation_codes(q))).max() <= ROTATION_QUANTUM_ERROR_RAD
+    assert rotation_errors(q, there_and_back(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
 
 
-def test_rotation_error_is_bounded_and_reached_at_the_worst_place() -> None:
-    """Around (1, 1, 1, 1) / 2 with half a step of rounding on all three components, of the same sign."""
+def test_rotation_error_is_bounded_and_reached_next_to_the_identity() -> None:
+    """Half a step of rounding on all three parameters, where they are small."""
     rng = np.random.default_rng(2)
-    half = 0.5 * math.sqrt(2.0) / (ROTATION_LEVELS - 1)
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    grid = np.rint(0.5 / (2 * half)) * 2 * half
-    rest = signs[rng.integers(8, size=20_000)] * (grid + half * rng.uniform(-9.0, 9.0, (20_000, 1)))
-    rest = rest[np.einsum("ij,ij->i", rest, rest) < 0.7499]
-    q = np.hstack((np.sqrt(1.0 - np.einsum("ij,ij->i", rest, rest))[:, None], rest))
-    errors = rotation_errors(q, rotations(rotation_codes(q)))
+    m = (rng.integers(-30, 30, (20_000, 3)) + rng.uniform(0.49, 0.51, (20_000, 3))) / ROTATION_CENTRE
+    squares = np.einsum("ij,ij->i", m, m)[:, None]
+    q = np.hstack(((1.0 - squares) / (1.0 + squares), 2.0 * m / (1.0 + squares)))
+    errors = rotation_errors(q, there_and_back(q))
     assert errors.max() <= ROTATION_QUANTUM_ERROR_RAD
     assert errors.max() >= 0.98 * ROTATION_QUANTUM_ERROR_RAD
 
 
-def test_axes_and_ties_are_exact_or_bounded() -> None:
-    q = np.array([v for v in itertools.product((-1.0, 0.0, 1.0), repeat=4) if any(v)])
+def test_axes_and_half_turns_are_exact_or_bounded() -> None:
+    q = np.array([v for v in itertools.product((-1.0, -0.0, 0.0, 1.0), repeat=4) if any(v)])
     q /= np.linalg.norm(q, axis=1)[:, None]
-    assert rotation_errors(q, rotations(rotation_codes(q))).max() <= ROTATION_QUANTUM_ERROR_RAD
+    assert rotation_errors(q, there_and_back(q)).max() <= ROTATION_QUANTUM_ERROR_RAD
     one = np.eye(4)
-    np.testing.assert_array_equal(rotations(rotation_codes(one)), one)
-    np.testing.assert_array_equal(rotations(rotation_codes(-one)), one)
+    np.testing.assert_array_equal(np.abs(there_and_back(one)), one)
+    np.testing.assert_array_equal(there_and_back(-one[:1]), one[:1])
 
 
-@pytest.mark.parametrize("code", [4 * ROTATION_LEVELS**3, 2**40 - 1, 0])
-def test_codes_of_no_rotation_are_refused(code: int) -> None:
-    with pytest.raises(StreamError, match="no unit quaternion"):
-        rotations(np.array([code], np.uint64))
+def test_decoded_quaternions_have_unit_length() -> None:
+    q = there_and_back(random_poses(np.random.default_rng(4), 10_000)[:, 3:])
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("levels", [(2 * ROTATION_CENTRE + 1, 8191, 8191), (0, 0, 0), (2**16 - 1,) * 3])
+def test_levels_of_no_rotation_are_refused(levels: tuple[int, ...]) -> None:
+    with pytest.raises(StreamError, match="stand for none"):
+        decoded(np.array([levels]).T)
 
 
 def test_every_second_code_is_reproduced() -> None:
-    """code -> rotation -> code is the identity away from ties of the largest component."""
+    """levels -> rotation -> levels is the identity away from half turns, where m and -m are the same rotation."""
     q = random_poses(np.random.default_rng(3), 50_000)[:, 3:]
-    ordered = np.sort(np.abs(q), axis=1)
-    codes = rotation_codes(q[ordered[:, 3] - ordered[:, 2] > 1e-3])
-    np.testing.assert_array_equal(rotation_codes(rotations(codes)), codes)
-
-
-@pytest.mark.parametrize("n_bytes", range(1, 9))
-def test_words_round_trip(n_bytes: int) -> None:
-    top = 256**n_bytes - 1
-    words = np.array([0, 1, top // 3, top], np.uint64)
-    data = pack_words(words, n_bytes)
-    assert len(data) == 4 * n_bytes
-    assert data[n_bytes : 2 * n_bytes] == (1).to_bytes(n_bytes, "little")
-    np.testing.assert_array_equal(unpack_words(data, n_bytes), words)
+    levels = rotation_levels(np.ascontiguousarray(q[np.abs(q[:, 0]) > math.sin(1e-3)].T))
+    np.testing.assert_array_equal(rotation_levels(decoded(levels)), levels)

@@ -25,7 +25,7 @@ from iris_session.streams.rigid import (
 )
 from tests.streams.poses import moved, position_errors, random_poses, rotation_errors
 
-HEADER, BODY, ESCAPE = 28, 11, 58
+HEADER, BODY, WIDE_BODY, ESCAPE = 20, 12, 18, 58
 
 
 def assert_within_bound(decoded: Floats, truth: Floats) -> None:
@@ -34,8 +34,8 @@ def assert_within_bound(decoded: Floats, truth: Floats) -> None:
 
 
 def test_allowance_leaves_room_for_drift() -> None:
-    assert DRIFT_ALLOWANCE_M > 5e-6
-    assert math.degrees(DRIFT_ALLOWANCE_RAD) > 0.005
+    assert DRIFT_ALLOWANCE_M > 4e-5
+    assert math.degrees(DRIFT_ALLOWANCE_RAD) > 0.02
 
 
 def test_three_hundred_moving_bodies_are_small_and_exact() -> None:
@@ -46,7 +46,7 @@ def test_three_hundred_moving_bodies_are_small_and_exact() -> None:
         poses = moved(rng, poses, 0.3 / 60, 0.5 / 60)
         poses[:, :3] = np.clip(poses[:, :3], 0.0, (10.0, 10.0, 3.0))
         frame = encoder.encode(poses, 1)
-        assert len(frame.payload) <= HEADER + 38 + 300 * BODY + ESCAPE
+        assert len(frame.payload) == HEADER + 300 * BODY
         assert frame.base_seq == 0  # complete in itself: nobody needs a snapshot
         assert decoder.apply(*frame)
         assert_within_bound(decoder.poses, poses)
@@ -56,7 +56,7 @@ def test_resting_bodies_cost_their_bit_and_the_round_robin() -> None:
     poses = random_poses(np.random.default_rng(0), 300)
     encoder = RigidEncoder(300)
     frames = [encoder.encode(poses, 1) for _ in range(WINDOW + 2)]
-    assert len(frames[0].payload) == HEADER + 38 + 300 * BODY
+    assert len(frames[0].payload) == HEADER + 300 * BODY
     assert len(frames[-1].payload) <= HEADER + 38 + BODY
     assert frames[-1].base_seq == frames[-1].state_seq - WINDOW
 
@@ -74,7 +74,7 @@ def test_only_what_moves_is_sent() -> None:
 
 
 def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
-    """0.6 um and 0.6 mdeg a frame: below the drift allowance in one frame, far above it in a second."""
+    """0.6 um and 0.6 mdeg a frame: far below the drift allowance in one frame, far above it in a second."""
     rng = np.random.default_rng(5)
     poses = random_poses(rng, 40)
     heading = random_poses(rng, 40)[:, :3] - 5.0
@@ -82,24 +82,26 @@ def test_creeping_bodies_stay_within_the_bound_for_a_lossy_client() -> None:
     encoder, decoder = RigidEncoder(40), RigidDecoder(40)
     frame = encoder.encode(poses, 1)
     assert decoder.apply(*frame)
+    delivered = 0
     for k in range(600):
         poses[:, :3] += heading
         poses = moved(rng, poses, 0.0, math.radians(6e-4))
         frame = encoder.encode(poses, 1)
-        if rng.random() < 0.15 or k == 599:
+        if rng.random() < 0.15 or k - delivered == WINDOW - 1:
             assert decoder.apply(*frame)
             assert_within_bound(decoder.poses, poses)
+            delivered = k
 
 
 def test_creeping_rotations_stay_within_the_bound_at_the_worst_place() -> None:
     """Rotations half a step beside their codes, turning on away from them by a tenth of the allowance per frame."""
-    half = 0.25 * math.sqrt(2.0) / 3250
-    rest = np.rint(0.5 / (2 * half)) * 2 * half - 0.999 * half - 2 * half * np.arange(1, 20)[:, None] * np.ones(3)
-    q = np.hstack((np.sqrt(1.0 - np.einsum("ij,ij->i", rest, rest))[:, None], rest))
+    m = (np.arange(1, 20)[:, None] + 0.499) / 8191 * np.ones(3)
+    squares = np.einsum("ij,ij->i", m, m)[:, None]
+    q = np.hstack(((1.0 - squares) / (1.0 + squares), 2.0 * m / (1.0 + squares)))
     poses = np.hstack((np.zeros((19, 3)), q))
     encoder, decoder = RigidEncoder(19), RigidDecoder(19)
     assert decoder.apply(*encoder.encode(poses, 1))
-    assert rotation_errors(decoder.poses, poses).max() > math.radians(0.042)
+    assert rotation_errors(decoder.poses, poses).max() > math.radians(0.024)
     away = poses[:, 3:] - decoder.poses[:, 3:]
     axis = away / np.linalg.norm(away, axis=1)[:, None]
     for _ in range(40):
@@ -169,10 +171,13 @@ def test_far_bodies_escape_and_the_rest_stays_small() -> None:
     assert_within_bound(decoder.poses, poses)
 
 
-def test_a_hall_takes_one_byte_more_rather_than_escapes() -> None:
+def test_a_hall_takes_the_wide_layout_rather_than_escapes() -> None:
     poses = random_poses(np.random.default_rng(7), 300, (90.0, 90.0, 10.0))
     frame = RigidEncoder(300).encode(poses, 1)
-    assert len(frame.payload) == HEADER + 38 + 300 * (BODY + 1)
+    assert len(frame.payload) == HEADER + 300 * WIDE_BODY
+    decoder = RigidDecoder(300)
+    assert decoder.apply(*frame)
+    assert_within_bound(decoder.poses, poses)
 
 
 def resting_stream(n: int = 50, frames: int = 100) -> tuple[Floats, RigidEncoder, list[EncodedFrame]]:
@@ -334,14 +339,14 @@ def test_random_bytes_raise_stream_errors_only(payload: bytes) -> None:
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.integers(1, 7), st.integers(0, 10), st.integers(0, 2), st.binary(min_size=400, max_size=400))
+@given(st.integers(0, 2), st.integers(0, 10), st.integers(0, 2), st.binary(min_size=400, max_size=400))
 def test_random_bodies_behind_a_fitting_header_raise_stream_errors_only(
-    position_bytes: int, quantised: int, escaped: int, noise: bytes
+    layout: int, quantised: int, escaped: int, noise: bytes
 ) -> None:
-    size = quantised * (position_bytes + 5) + escaped * ESCAPE
-    bits = ((1 << quantised) - 1).to_bytes(2, "little")
-    head = struct.pack("<BBHHH", 1, position_bytes, 10, quantised, escaped)
-    offer(head + noise[:20] + bits + noise[20 : 20 + size])
+    size = quantised * (WIDE_BODY if layout else BODY)
+    bits = ((1 << quantised) - 1).to_bytes(2, "little") if quantised < 10 else b""
+    head = struct.pack("<BBHHH", 2, layout, 10, quantised, escaped)
+    offer(head + noise[: 12 + size] + bits + noise[200 : 200 + escaped * ESCAPE])
 
 
 @settings(max_examples=300, deadline=None)
@@ -362,15 +367,19 @@ def test_each_check_refuses() -> None:
             RigidDecoder(n).apply(1, 0, payload)
 
     assert RigidDecoder(n).apply(1, 0, memoryview(good))
-    refused(good[:27], "shorter than its header")
-    refused(b"\x02" + good[1:], "format 2")
+    refused(good[:19], "shorter than its header")
+    refused(b"\x01" + good[1:], "format 1")
     refused(good[:2] + b"\x0b\0" + good[4:], "for 11 bodies")
-    refused(good[:1] + b"\x08" + good[2:], "8 bytes")
-    refused(good[:20] + b"\0\0\0\0" + good[24:], "box of 0")
+    refused(good[:1] + b"\x02" + good[2:], "layout 2")
+    refused(good[:4] + b"\x0b\0" + good[6:], "of 11 bodies")
     refused(good + b"\0", "header asks for")
-    refused(good[:28] + b"\xff\xff" + good[30:], "mask")
-    refused(good[:29] + bytes([good[29] | 0x80]) + good[30:], "mask")
     last = len(good) - ESCAPE
+    mask = last - ESCAPE - 2
+    refused(good[:mask] + b"\xff\xff" + good[mask + 2 :], "mask")
+    refused(good[: mask + 1] + bytes([good[mask + 1] | 0x80]) + good[mask + 2 :], "mask")
     refused(good[:last] + b"\x03\0" + good[last + 2 :], "ascending")
     refused(good[:last] + b"\x0a\0" + good[last + 2 :], "ascending")
     refused(good[:last] + b"\x09\0" + good[last + 2 :], "ascending")
+    refused(good[:20] + b"\xff\xff\xff\xff" + good[24:], "stand for none")
+    full = RigidEncoder(n).encode(random_poses(np.random.default_rng(11), n), 1).payload
+    refused(full[:6] + b"\x01\0" + full[8:] + good[last:], "ascending")

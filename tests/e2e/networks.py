@@ -1,0 +1,186 @@
+"""Two machines on one network, as network namespaces with addresses of their own. Needs root and `ip` (iproute2)."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+import pytest
+
+from tests.e2e.conftest import COMMAND, DEADLINE_S, none_left, relatives, wait
+
+#: Frames of state after which somebody has seen enough.
+SEEN: Final = 20
+
+
+def ip(*words: str) -> None:
+    done = subprocess.run(["ip", *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"ip {' '.join(words)}: {done.stderr}"
+
+
+@dataclass
+class Machine:
+    """One of them: `address` on `interface`, and a home of keys of its own. Without a `name`: this machine itself."""
+
+    name: str
+    interface: str
+    address: str
+    folder: Path
+    running: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def command(self, *arguments: str) -> list[str]:
+        inside = ["ip", "netns", "exec", self.name] if self.name else []
+        return [*inside, *COMMAND, *arguments]
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {**os.environ, "IRIS_HOME": str(self.folder / "keys")}
+
+    def iris(self, *arguments: str, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
+        """Runs one command to its end."""
+        return subprocess.run(
+            self.command(*arguments),
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=self.folder,
+            env=self.environment,
+            timeout=timeout_s,
+        )
+
+    def look(self, *where: str) -> dict[str, Any]:
+        """An observer joins and looks until they have seen something, or failed; what became of them."""
+        command = self.command("emulate", *where, "--behaviour", "observer", "--seconds", f"{DEADLINE_S}", "--json")
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self.environment
+        )
+        assert process.stdout is not None
+        report: dict[str, Any] = {}
+        seen = False
+        for line in process.stdout:
+            report = json.loads(line)
+            if report["frames"] > SEEN and not seen:
+                seen = True
+                process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=DEADLINE_S)
+        assert report, errors
+        assert process.returncode == (1 if report["failed"] else 0), errors
+        return report
+
+    def serve(self, *arguments: str) -> Served:
+        out = self.folder / f"serve{len(self.running)}.out"
+        with out.open("wb") as file:
+            process = subprocess.Popen(
+                self.command("serve", "handover", "--no-record", *arguments),
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                cwd=self.folder,
+                env=self.environment,
+            )
+        self.running.append(process)
+        served = Served(process, out)
+        wait(lambda: served.listens or process.poll() is not None, "the session listens")
+        assert process.poll() is None, served.output
+        return served
+
+    def close(self) -> None:
+        """Ends what a failed test left running."""
+        for process in self.running:
+            if process.poll() is None:
+                children = relatives(process.pid)
+                process.kill()
+                process.wait()
+                psutil.wait_procs(children, timeout=5.0)
+
+
+@dataclass
+class Served:
+    """A session in a process of its own."""
+
+    process: subprocess.Popen[bytes]
+    out: Path
+
+    @property
+    def output(self) -> str:
+        return self.out.read_text(errors="replace")
+
+    @property
+    def listens(self) -> bool:
+        return re.search(r"on (\S+:\d+),", self.output) is not None
+
+    @property
+    def name(self) -> str:
+        found = re.search(r"session '(\S+)' on", self.output)
+        assert found
+        return found[1]
+
+    @property
+    def address(self) -> str:
+        found = re.search(r"on (\S+:\d+),", self.output)
+        assert found
+        return found[1]
+
+    def stop(self) -> None:
+        """Ctrl-C; nothing may stay behind."""
+        children = relatives(self.process.pid)
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(DEADLINE_S) == 0, self.output
+        none_left(children)
+
+
+class Network:
+    """`server` and `headset`, with one cable between them."""
+
+    def __init__(self, folder: Path) -> None:
+        mark = f"{os.getpid() % 100_000}"
+        self.server = Machine(f"iris-s{mark}", f"irs{mark}", "10.77.1.1", folder / "server")
+        self.headset = Machine(f"iris-h{mark}", f"irh{mark}", "10.77.1.2", folder / "headset")
+        self.machines = (self.server, self.headset)
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        for machine in self.machines:
+            machine.folder.mkdir()
+            ip("netns", "add", machine.name)
+            ip("-n", machine.name, "link", "set", "lo", "up")
+        one, other = self.machines
+        ends = ("link", "add", one.interface, "netns", one.name, "type", "veth")
+        ip(*ends, "peer", "name", other.interface, "netns", other.name)
+        for machine in self.machines:
+            ip("-n", machine.name, "addr", "add", f"{machine.address}/24", "brd", "+", "dev", machine.interface)
+            ip("-n", machine.name, "link", "set", machine.interface, "up")
+
+    def block_broadcasts(self) -> None:
+        """To the headset, as some access points do: a broadcast of the network is no address of its own any more."""
+        name, interface = self.headset.name, self.headset.interface
+        ip("-n", name, "addr", "flush", "dev", interface)
+        ip("-n", name, "addr", "add", f"{self.headset.address}/32", "dev", interface)
+        ip("-n", name, "route", "add", "10.77.1.0/24", "dev", interface)
+
+    def allow_broadcasts(self) -> None:
+        name, interface = self.headset.name, self.headset.interface
+        ip("-n", name, "addr", "flush", "dev", interface)
+        ip("-n", name, "addr", "add", f"{self.headset.address}/24", "brd", "+", "dev", interface)
+
+    def close(self) -> None:
+        for machine in self.machines:
+            machine.close()
+            subprocess.run(["ip", "netns", "del", machine.name], capture_output=True, check=False)
+
+
+def require_namespaces() -> None:
+    """Only root can make another machine; as root it must work."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        pytest.skip("network namespaces need Linux and root")

@@ -1,0 +1,53 @@
+"""The short form of `tools/soak.py`, and that its checks can fail. An hour of it is run by hand: docs/links.md."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOOLS = Path(__file__).parents[2] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+from soak_checks import check_log, check_memory  # noqa: E402
+
+RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
+
+
+@pytest.mark.e2e
+@pytest.mark.timeout(150)
+def test_a_minute_of_disturbances(tmp_path: Path) -> None:
+    """Three people over busy Wi-Fi: everybody is back at the end, no event is lost, the recording verifies."""
+    command = [sys.executable, str(TOOLS / "soak.py"), "--seconds", "22", "--operators", "2", "--observers", "1"]
+    command += ["--per-process", "1", "--seed", "1", "--keep", str(tmp_path), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=140.0)
+    assert done.stdout, done.stderr[-3000:]
+    result = json.loads(done.stdout)
+    assert result["problems"] == [], done.stderr[-3000:]
+    assert done.returncode == 0
+    assert result["verified"]
+    assert sum(result["disturbances"].values()) >= 5
+    assert set(result["memory"]) == {"authority", "front", "recorder"}
+    events = result["events"]
+    assert events["recorded"] > 30
+    assert events["handed_out"] > events["recorded"], "three people were handed most events each"
+
+
+def test_check_of_events_finds_gaps_repeats_and_changes() -> None:
+    assert check_log("a", [(1, 1, 11), (1, 2, 22), (2, 4, 44), (2, 5, 55)], RECORDED) == []
+    assert "event 4 came after 2 on one connection" in check_log("a", [(1, 2, 22), (1, 4, 44)], RECORDED)[0]
+    assert "event 2 came after 2" in check_log("a", [(1, 2, 22), (2, 2, 22)], RECORDED)[0]
+    assert "event 3 is not that of the recording" in check_log("a", [(1, 2, 22), (1, 3, 22)], RECORDED)[0]
+    assert "event 6 is not that of the recording" in check_log("a", [(1, 5, 55), (1, 6, 66)], RECORDED)[0]
+
+
+def test_check_of_memory_finds_a_leak_and_nothing_else() -> None:
+    flat = [(float(t), 100.0 + t % 3) for t in range(60)]
+    warming = [(float(t), 100.0 + min(t, 20)) for t in range(60)]
+    leaking = [(float(t), 100.0 + 0.3 * t) for t in range(60)]
+    figures, problems = check_memory({"front": flat, "recorder": warming, "authority": leaking})
+    assert [p.split()[2] for p in problems] == ["authority"]
+    assert figures["authority"]["mib_per_hour"] == pytest.approx(1080.0)
