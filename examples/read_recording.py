@@ -30,4 +30,6 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/read_recording.py FILE    (a session.rrd that serve or demo wrote)")
     main(sys.argv[1])
