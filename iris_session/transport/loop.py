@@ -9,25 +9,23 @@ from __future__ import annotations
 import gc
 import time
 
-import msgspec
 import zmq
 
-from iris_session.protocol.entries import Entry, encode_entries
+from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
-from iris_session.transport.announce import Facts, announce, host_for_address, hosts_to_tell
+from iris_session.transport.announce import Facts, announce
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Outbox, Peer
 from iris_session.transport.coalescer import Coalescer
-from iris_session.transport.config import MILLISECOND, FrontConfig, FrontError, FrontStart, Ports
+from iris_session.transport.config import MILLISECOND, FrontStart
 from iris_session.transport.departures import Departures
 from iris_session.transport.doors import Doors
 from iris_session.transport.downlink import Downlink
+from iris_session.transport.front_sockets import FrontSockets
 from iris_session.transport.intake import Intake, RawFeed
-from iris_session.transport.introduction import open_with_introduction
-from iris_session.transport.keyring import open_keyring
 from iris_session.transport.limiter import Drops
 from iris_session.transport.memory import MemoryWatch
 from iris_session.transport.pairing_desk import PairingDesk
@@ -36,23 +34,16 @@ from iris_session.transport.resume_tokens import ResumeTokens
 from iris_session.transport.revocation import Revocation
 from iris_session.transport.service import Service
 from iris_session.transport.session_note import NoteKeeper
-from iris_session.transport.sockets import (
-    bound_port,
-    open_control,
-    open_state,
-    readable,
-    watch_tcp,
-)
+from iris_session.transport.sockets import readable
 from iris_session.transport.state_publisher import StatePublisher
 from iris_session.transport.status_desk import StatusDesk, Telling
-from iris_session.transport.zap import Authenticator
+from iris_session.transport.uplink import Uplink
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
 ROUND = 8
 ROUNDS = 16
 IDLE_MS = 10
 HOUSEKEEPING_NS = 10 * MILLISECOND
-STATUS_NS = 500 * MILLISECOND
 #: Cyclic garbage is rare here; it is collected when nothing waits.
 COLLECT_NS = 10_000 * MILLISECOND
 #: A restarted front numbers its state frames above those of its predecessor: state is sent at less than 1 kHz.
@@ -74,29 +65,20 @@ class Front:
         self._start = start
         config = self._config = start.config
         self._services: list[Service] = []  # in the order of their turns
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._link = self._context.socket(zmq.PAIR)
-        self._link.setsockopt(zmq.LINGER, 1000)
-        self._link_monitor = watch_tcp(self._link, "link", zmq.EVENT_DISCONNECTED)
-        self._link.connect(start.link_endpoint)
         self._drops = Drops()
         self._clients = ClientTable()
-        self._state_sockets = 0
-        try:
-            self._open_sockets()
-        except FrontError as error:
-            self._link.send_multipart((link.FAILED, str(error).encode()))
-            self.close()
-            raise
+        sockets = self._sockets = FrontSockets(start, self._drops, self._key_refused)
+        self._link, self._control = sockets.link, sockets.control.socket
+        self._keyring = sockets.keyring
         self._outbox = Outbox(self._control, config.limits, self._drops)
         self._tokens = ResumeTokens(config.limits.resume_tokens, start.handback)
         self._coalescer = Coalescer(config.limits, self._drops)
         self._audit = AuditTrail(self._coalescer.offer)
         doors = self._doors = Doors(self._clients, self._drops, self._audit, config.limits)
-        doors.watch_state(self._state_monitor)
+        doors.watch_state(sockets.state.monitor)
         admission = self._admission = Admission(
             config,
-            self._ports,
+            sockets.ports,
             self._clients,
             self._outbox,
             self._drops,
@@ -106,7 +88,7 @@ class Front:
             doors,
         )
         self._pairing = PairingDesk(self._keyring, self._outbox, self._audit, self._drops)
-        raw = RawFeed(self._context, config.recorder_endpoint, self._drops)
+        raw = RawFeed(sockets.context, config.recorder_endpoint, self._drops)
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
         memory = MemoryWatch(config.limits.memory_bytes, doors.shed, self._shed)
         self._services += [self._status, doors, memory]
@@ -125,7 +107,7 @@ class Front:
             doors,
         )
         departures = self._departures = Departures(
-            self._monitor,
+            sockets.control.monitor,
             self._clients,
             self._outbox,
             admission,
@@ -137,7 +119,7 @@ class Front:
             doors,
         )
         first_seq = 1 + (self._session_ns() // SEQ_NS if start.handback else 0)
-        self._publisher = StatePublisher(self._state, start.scene, self._session_ns, first_seq)
+        self._publisher = StatePublisher(sockets.state.socket, start.scene, self._session_ns, first_seq)
         revocation = Revocation(
             self._keyring,
             self._clients,
@@ -164,49 +146,35 @@ class Front:
         self.ended = ""
         #: The link closed without a word: its process ends, or has ended already.
         self.cut_off = False
+        self._authenticator = sockets.authenticator
         if self._authenticator is not None:
             self._authenticator.banned = self._tokens.revoked
-        self._batches = 0
-        self._entries = 0
-        self._stalls = 0
-        self._stalled = False
-        self._reported = (-1, -1, -1)
-        self._next_beat_ns = self._next_status_ns = self._next_housekeeping_ns = self._next_collect_ns = 0
+        self._uplink = Uplink(
+            self._link,
+            config.limits.unacknowledged,
+            self._coalescer,
+            self._downlink,
+            self._tokens,
+            self._clients,
+            self._drops,
+            self._publisher,
+        )
+        self._services += self._announced()
+        self._next_housekeeping_ns = self._next_collect_ns = 0
 
-    def _open_sockets(self) -> None:
-        config = self._config
-        self._keyring = open_keyring(config, self._drops)
-        key = self._keyring.key
-        self._authenticator = (
-            Authenticator(self._context, self._keyring, self._drops, self._key_refused) if key is not None else None
-        )
-        self._control, listeners = open_with_introduction(
-            config.hosts, config.control_port, lambda port: open_control(self._context, config, key, port)
-        )
-        self._state, self._state_monitor = self._open_state(config)
-        self._monitor = watch_tcp(self._control, "control")
-        self._ports = Ports(
-            host_for_address(config),
-            bound_port(self._control),
-            bound_port(self._state),
-            key.fingerprint if key else "",
-            hosts_to_tell(config),
-        )
+    def _announced(self) -> list[Service]:
+        """What makes the session known, on the network and in the home of keys."""
+        sockets, config, key = self._sockets, self._config, self._keyring.key
         facts = Facts(key.public if key else "", lambda: self._pairing.open, lambda: len(self._clients))
+        services: list[Service] = []
         if self._keyring.home is not None:
-            self._services.append(NoteKeeper(self._keyring.home, config, self._ports))
-        self._services += announce(config, self._ports, listeners, self._drops, facts)
-
-    def _open_state(self, config: FrontConfig) -> tuple[zmq.Socket[bytes], zmq.Socket[bytes]]:
-        """The state socket, and what tells of its TCP connections."""
-        state = open_state(self._context, config, self._keyring.key)
-        self._state_sockets += 1
-        return state, watch_tcp(state, f"state-{self._state_sockets}")
+            services.append(NoteKeeper(self._keyring.home, config, sockets.ports))
+        return services + announce(config, sockets.ports, sockets.listeners, self._drops, facts)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
-        state, monitor = self._open_state(msgspec.structs.replace(self._config, state_port=self._ports.state))
-        self._doors.watch_state(monitor)
-        return state
+        state = self._sockets.open_state(self._sockets.ports.state)
+        self._doors.watch_state(state.monitor)
+        return state.socket
 
     def _shed(self, whom: str, now_ns: int) -> None:
         self._doors.flood("", f"memory: closed {whom}", now_ns)
@@ -223,9 +191,9 @@ class Front:
 
     def run(self) -> None:
         """Serves until the authority or a signal ends it, or the parent is gone."""
-        self._link.send_multipart((link.READY, link.encoder.encode(self._ports)))
+        self._link.send_multipart((link.READY, link.encoder.encode(self._sockets.ports)))
         poller = zmq.Poller()
-        watched = [self._link, self._link_monitor, self._control, self._monitor]
+        watched = [self._link, self._sockets.link_monitor, self._control, self._sockets.control.monitor]
         if self._authenticator is not None:
             watched.append(self._authenticator.socket)
         for one in watched:
@@ -247,21 +215,21 @@ class Front:
         for _ in range(ROUNDS):
             self._departures.drain_monitor()
             more = self._drain_control()
-            self._flush()
+            self._uplink.flush()
             self._downlink.drain()
             if not more:
                 break
         replaced, self._intake.replaced = self._intake.replaced, []
         self._departures.take_leave(replaced, drained=not more)
         self._housekeeping(idle=not more)
-        self._flush()
+        self._uplink.flush()
         return more
 
     def close(self) -> None:
         """Closes every socket; what was sent leaves within its linger time."""
         for service in self._services:
             service.close()
-        self._context.destroy()
+        self._sockets.close()
 
     # --- from clients ------------------------------------------------------------------------------------------------
 
@@ -287,29 +255,6 @@ class Front:
             self._intake.take(routing_id, peer, frame.buffer, extra)
         return True
 
-    # --- to the authority --------------------------------------------------------------------------------------------
-
-    def _flush(self) -> None:
-        """Sends what waits, as far as credit goes; urgent entries have credits of their own."""
-        limit = self._config.limits.unacknowledged
-        used = self._batches - self._downlink.acknowledged
-        batch: list[Entry] = []
-        if used < limit:
-            batch = self._coalescer.take() if self._coalescer else []
-        elif self._coalescer.urgent and used < 2 * limit:
-            batch = self._coalescer.take(urgent_only=True)
-        if self._tokens.changed and (batch or self._listens):
-            self._link.send_multipart((link.HANDBACK, self._tokens.blob()), zmq.DONTWAIT)
-        if batch:
-            self._link.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
-            self._batches += 1
-            self._entries += len(batch)
-
-    @property
-    def _listens(self) -> bool:
-        """Whether the authority takes what is sent, as far as we know."""
-        return self._downlink.heard_ns > 0 and not self._stalled
-
     # --- now and then ------------------------------------------------------------------------------------------------
 
     def _housekeeping(self, idle: bool) -> None:
@@ -324,12 +269,7 @@ class Front:
         self._publisher.tend()
         self._propose(now_ns)
         self._watch_stall(now_ns)
-        if now_ns >= self._next_beat_ns and self._listens:
-            self._next_beat_ns = now_ns + link.BEAT_NS
-            self._link.send_multipart((link.BEAT, b""), zmq.DONTWAIT)
-        if now_ns >= self._next_status_ns:
-            self._next_status_ns = now_ns + STATUS_NS
-            self._report()
+        self._uplink.turn(now_ns)
         if idle and now_ns >= self._next_collect_ns:
             self._next_collect_ns = now_ns + COLLECT_NS
             gc.collect()
@@ -349,7 +289,7 @@ class Front:
         """The link closes with the session's process, however that ended, or with the session."""
         if self._downlink.ended:
             self.end(ENDED)
-        elif readable(self._link_monitor):
+        elif readable(self._sockets.link_monitor):
             self.cut_off = True
             self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
 
@@ -357,12 +297,12 @@ class Front:
         """Called after the link was drained, so a front that was kept from running does not blame the authority."""
         heard_ns = self._downlink.heard_ns
         stalled = heard_ns > 0 and now_ns - heard_ns > self._config.stall_ns
-        if stalled and not self._stalled:
-            self._stalls += 1
+        if stalled and not self._uplink.stalled:
+            self._uplink.stalls += 1
             self._downlink.broadcast(ProtocolFault(FaultCode.STALLED, "the session does not step: robots hold"))
-        elif self._stalled and not stalled:
+        elif self._uplink.stalled and not stalled:
             self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
-        self._stalled = stalled
+        self._uplink.stalled = stalled
         if not parent_is(self._start.parent_pid):
             self.end(ORPHANED)
 
@@ -371,24 +311,7 @@ class Front:
             self._publisher.delays_ns,
             self._downlink.heard_ns,
             self._downlink.report,
-            self._stalled,
-            self._entries,
+            self._uplink.stalled,
+            self._uplink.entries,
             self._doors.warnings(self._session_ns()),
         )
-
-    def _report(self) -> None:
-        """Counters to the authority, while it listens."""
-        drops = self._drops
-        now = (drops.version, len(self._clients), self._entries)
-        if now == self._reported or self._stalled:
-            return
-        self._reported = now
-        status = link.FrontStatus(
-            len(self._clients),
-            drops.by_reason,
-            drops.by_connection,
-            self._stalls,
-            self._publisher.frames,
-            self._entries,
-        )
-        self._link.send_multipart((link.STATUS, link.encoder.encode(status)), zmq.DONTWAIT)

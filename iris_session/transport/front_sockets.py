@@ -1,0 +1,83 @@
+"""The sockets of the front: opened together, or not at all. What comes by them is for `loop`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+import zmq
+
+from iris_session.transport import link_messages as link
+from iris_session.transport.announce import host_for_address, hosts_to_tell
+from iris_session.transport.config import FrontError, FrontStart, Ports
+from iris_session.transport.introduction import Listeners, open_with_introduction
+from iris_session.transport.keyring import open_keyring
+from iris_session.transport.limiter import Drops
+from iris_session.transport.sockets import bound_port, open_control, open_state, watch_tcp
+from iris_session.transport.zap import Authenticator
+
+
+class Watched(NamedTuple):
+    """A socket, and what tells of its TCP connections."""
+
+    socket: zmq.Socket[bytes]
+    monitor: zmq.Socket[bytes]
+
+
+class FrontSockets:
+    """`link`: to the authority. `control`, `state`: for clients. `listeners`: of the introduction.
+
+    Raises `FrontError` when one cannot be opened; the authority has been told why then, and all are closed. `refused`:
+    told the fingerprint and the address of every key that was not let in.
+    """
+
+    def __init__(self, start: FrontStart, drops: Drops, refused: Callable[[str, str], None]) -> None:
+        self._config = start.config
+        self._drops = drops
+        self._state_sockets = 0
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.link = self.context.socket(zmq.PAIR)
+        self.link.setsockopt(zmq.LINGER, 1000)
+        self.link_monitor = watch_tcp(self.link, "link", zmq.EVENT_DISCONNECTED)
+        self.link.connect(start.link_endpoint)
+        try:
+            self._open(refused)
+        except FrontError as error:
+            self.link.send_multipart((link.FAILED, str(error).encode()))
+            self.close()
+            raise
+
+    def _open(self, refused: Callable[[str, str], None]) -> None:
+        config = self._config
+        self.keyring = open_keyring(config, self._drops)
+        key = self.keyring.key
+        self.authenticator = Authenticator(self.context, self.keyring, self._drops, refused) if key else None
+        self.listeners: Listeners
+        control, self.listeners = open_with_introduction(
+            config.hosts, config.control_port, lambda port: open_control(self.context, config, key, port)
+        )
+        try:
+            self.state = self.open_state(config.state_port)
+        except FrontError:
+            for listener in self.listeners:
+                listener.close()
+            raise
+        self.control = Watched(control, watch_tcp(control, "control"))
+        self.ports = Ports(
+            host_for_address(config),
+            bound_port(control),
+            bound_port(self.state.socket),
+            key.fingerprint if key else "",
+            hosts_to_tell(config),
+        )
+
+    def open_state(self, port: int) -> Watched:
+        """A state socket; the one before must be closed. Raises `FrontError` while its port is not free yet."""
+        state = open_state(self.context, msgspec.structs.replace(self._config, state_port=port), self.keyring.key)
+        self._state_sockets += 1
+        return Watched(state, watch_tcp(state, f"state-{self._state_sockets}"))
+
+    def close(self) -> None:
+        """Closes every socket; what was sent leaves within its linger time."""
+        self.context.destroy()
