@@ -11,31 +11,26 @@ at the latest at `next_deadline_ns`, and sends what `peek_outgoing` shows. All `
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
 from iris_session.client.answers import Answers
 from iris_session.client.clock import ClockSync
-from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, VersionError
+from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.identity import Identity
 from iris_session.client.limits import (
     BACKOFF_MAX_NS,
     BACKOFF_MIN_NS,
     HELLO_TIMEOUT_NS,
-    MAX_INBOX,
-    NOT_TAKEN,
     SILENT_HEARTBEATS,
     SNAPSHOT_RETRY_NS,
     STEADY_NS,
-    TRANSIENT,
-    end_for_good,
-    heartbeat_period,
 )
 from iris_session.client.outgoing import Outgoing, PendingStop
+from iris_session.client.receiving import Receiving
 from iris_session.client.session_state import SessionMirror
-from iris_session.client.state_stream import StateStream, poses_from_bytes
+from iris_session.client.state_stream import StateStream
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.client.values import checked_bytes
 from iris_session.protocol.client_messages import (
@@ -49,29 +44,21 @@ from iris_session.protocol.client_messages import (
     Hello,
     Sample,
     Samples,
-    TrackingEpoch,
     envelope,
 )
-from iris_session.protocol.codec import decode_server, encode_client
-from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.codec import encode_client
 from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
-    ClockPong,
-    EStopChanged,
     Event,
     Feedback,
-    ParticipantLeft,
     ProtocolFault,
-    Refused,
     Reply,
-    Snapshot,
     Welcome,
 )
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
-class Connection:
+class Connection(Receiving):
     """One participant's connection, over any number of sockets."""
 
     def __init__(self, hello: Hello, identity: Identity) -> None:
@@ -224,129 +211,6 @@ class Connection:
             return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
         texts = {Phase.IDLE: "not connected: call connect() first", Phase.CLOSED: "this client was closed"}
         return texts.get(self.phase, str(self.failure) if self.failure else "connected")
-
-    # --- receiving ----------------------------------------------------------------------------------------------------
-
-    def receive(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """One message of the control channel: `[envelope, *bulk]`. Anything that does not fit is counted."""
-        try:
-            wrapped = decode_server(frames[0])
-        except (ProtocolError, IndexError):
-            self.counters.malformed += 1
-            return
-        message = wrapped.message
-        self.counters.received += 1
-        self._heard_at = now_ns
-        if isinstance(message, Welcome):
-            self._welcomed(message, now_ns)
-        elif isinstance(message, Refused):
-            self._refused(message, now_ns)
-        elif isinstance(message, ProtocolFault):
-            self._fault(message, now_ns)
-        elif isinstance(message, StatusReport):
-            self.latest[StatusReport] = message  # also while a session that stands still lets nobody in
-        elif not self.joined or wrapped.connection_epoch != self.connection_epoch:
-            self.counters.other_connection += 1
-        elif isinstance(message, ClockPong):
-            self.clock.pong(message.t0_ns, message.t1_ns, message.t2_ns, now_ns)
-            self.stop.answered(message.t0_ns, stopped=self.mirror.synced and self.mirror.estop)
-            self._maybe_ready()
-        elif isinstance(message, Reply):
-            if not self.answers.came(message):
-                self.counters.unasked_denials += 1
-                self._deliver(message)
-        elif isinstance(message, Event):
-            if self.mirror.apply_event(message):
-                self.stream.scene_epoch = self.mirror.scene_epoch
-                if isinstance(message.body, EStopChanged) and message.body.active:
-                    self.stop.withdraw()
-                self._deliver(message)
-        elif isinstance(message, Snapshot):
-            self._snapshot(message, frames[1:])
-        elif isinstance(message, Feedback):
-            self._deliver(message)
-        else:
-            self.latest[type(message)] = message
-
-    def _welcomed(self, welcome: Welcome, now_ns: int) -> None:
-        if self.phase is not Phase.JOINING:
-            self.counters.other_connection += 1
-            return
-        if self.welcome is None or welcome.session_id != self.welcome.session_id:
-            self.mirror.reset()
-            self.clock.reset()
-            self.stream.reset()  # else state goes on: a restarted front numbers its frames above the old one's
-        self.clock.restart()  # this machine may have slept
-        self.stream.reconnected()
-        self.mirror.synced = False
-        self.welcome = welcome
-        self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
-        self.phase = Phase.SYNCING
-        self._joined_at = now_ns
-        self._heartbeat_ns = heartbeat_period(welcome)
-        self._heartbeat_at = now_ns + self._heartbeat_ns // 2
-        self._snapshot_at = now_ns
-        if self.stop.message is not None:
-            self.stop.ask(self.stop.message)
-            self._queue(self.stop.message)
-        if self.tracking_epoch:
-            self._queue(TrackingEpoch(self.tracking_epoch))
-        self._keep_up(now_ns)
-
-    def _refused(self, refused: Refused, now_ns: int) -> None:
-        if self.phase is not Phase.JOINING:
-            return
-        if refused.code == RefusalCode.RESUME_TOKEN and self.identity.resume_token:
-            self.identity.resume_token = b""  # used up or forgotten: join as somebody new
-            self._say_hello(now_ns)
-        elif refused.code in TRANSIENT and self.welcome is not None:
-            self._wait(now_ns)
-        else:
-            self.phase = Phase.REFUSED
-            self.failure = (VersionError if refused.code == RefusalCode.VERSION else RefusedError)(refused)
-
-    def _fault(self, fault: ProtocolFault, now_ns: int) -> None:
-        self.counters.fault(fault.code)
-        self._deliver(fault)
-        if fault.code in NOT_TAKEN:
-            self.not_taken = fault
-        elif fault.code in ("stalled", "recovered"):
-            self.stalled = fault.code == "stalled"
-        elif (end := end_for_good(fault)) is not None:
-            self.failure = RefusedError(end)
-            self.phase = Phase.REFUSED
-        elif fault.code == "session_ended" and self.joined:
-            self.counters.reconnects += 1
-            self._wait(now_ns)
-        elif fault.code in ("dropped", "hello"):
-            self.lost(now_ns)
-
-    def _snapshot(self, snapshot: Snapshot, bulk: Sequence[bytes]) -> None:
-        poses = poses_from_bytes(bulk[0] if bulk else b"", len(snapshot.bodies))
-        if poses is None:
-            self.counters.malformed += 1
-            return
-        self.counters.snapshots += 1
-        for event in self.mirror.apply_snapshot(snapshot):
-            self._deliver(event)
-        if self.mirror.estop:
-            self.stop.withdraw()
-        self.stream.scene_epoch = self.mirror.scene_epoch
-        self.stream.keep_presence(self.mirror.connected)
-        self.stream.load_keyframe(snapshot.state_seq, poses)
-        self._maybe_ready()
-
-    def _maybe_ready(self) -> None:
-        if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.settled:
-            self.phase = Phase.READY
-
-    def _deliver(self, message: Event | Feedback | ProtocolFault | Reply) -> None:
-        if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
-            self.stream.forget_presence(message.body.participant)
-        if len(self.inbox) >= MAX_INBOX:
-            self.inbox.popleft()
-            self.counters.inbox_dropped += 1
-        self.inbox.append(message)
 
     # --- timers -------------------------------------------------------------------------------------------------------
 
