@@ -147,7 +147,7 @@ def check_keyframe(data: bytes) -> None:
 
 def address_texts(rng: Random) -> bytes:
     key = rng.choice(("A" * 43, "AAAA", "", "_-" * 21 + "A"))
-    code = rng.choice(("7KQ2-M4XD", "7kq2m4xd", "x", "%F0%9F", ""))
+    code = rng.choice(("7KQ2-M4XD-9PTR", "7kq2m4xd9ptr", "x", "%F0%9F", ""))
     host = rng.choice(("10.0.0.5", "[::1]", "lab.local", "::1", "²", "", "%", "[", "lab:²", "x" * 300))
     port = rng.choice((":7721", ":0", ":99999", ":²", ":-1", "", ":٣"))
     if rng.random() < 0.4:

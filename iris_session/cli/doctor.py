@@ -27,7 +27,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session doctor                      the session on this machine\n"
         "  iris-session doctor 192.168.1.20         from a client's machine\n"
-        "  iris-session doctor --session lab-1 --code 7KQ2-M4XD\n"
+        "  iris-session doctor --session lab-1 --code 7KQ2-M4XD-9PTR\n"
         "  iris-session doctor --server             the machine that is to serve",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

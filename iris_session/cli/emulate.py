@@ -16,7 +16,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n"
         "  iris-session emulate                                   one person who moves a robot about\n"
         "  iris-session emulate --behaviour observer --count 3    three people who only look\n"
-        "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD     the first time at a session in the lab\n"
+        "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD-9PTR     the first time at a session in the lab\n"
         "  iris-session emulate --session lab-1                   later, by its name\n"
         "  iris-session emulate --headset name=ann,behaviour=giver,robot=left "
         "--headset name=bob,behaviour=receiver,robot=right",

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
 import zmq
-from zmq.auth import load_certificate
 
 from iris_session.client.errors import IdentityError
+from iris_session.keys import KeysError, load_public, load_secret
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 
 STATE_HWM: Final = 2
@@ -39,13 +39,10 @@ class CurveKeys:
     def from_files(cls, server_file: str | os.PathLike[str], own_secret_file: str | os.PathLike[str]) -> CurveKeys:
         """From ZeroMQ certificates: the server's `*.key`, and our own `*.key_secret`. Raises `IdentityError`."""
         try:
-            server_public, _ = load_certificate(server_file)
-            public, secret = load_certificate(own_secret_file)
-        except (OSError, ValueError) as error:
-            raise IdentityError(f"key file cannot be used: {error}") from error
-        if secret is None:
-            raise IdentityError(f"{os.fspath(own_secret_file)} holds no secret key: give the *.key_secret file")
-        return cls(server_public, public, secret)
+            server_public, own = load_public(server_file), load_secret(own_secret_file)
+        except KeysError as error:
+            raise IdentityError(str(error)) from None
+        return cls(server_public.encode(), own.public.encode(), own.secret.encode())
 
 
 class ClientSockets:

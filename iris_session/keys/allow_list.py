@@ -9,6 +9,7 @@ import msgspec
 
 from iris_session.keys.curve import fingerprint, raw_key
 from iris_session.keys.files import PATIENCE_S, KeysError, PrivateFolder
+from iris_session.keys.lines import line_of
 from iris_session.protocol.names import Role
 
 FILE: Final = "clients.json"
@@ -63,10 +64,15 @@ class AllowList:
             raise KeysError(
                 f"{self._folder.path / FILE} has {len(entries)} keys, at most {MAX_KEYS} can be: revoke some"
             )
-        try:
-            return {entry.fingerprint: entry for entry in entries}
-        except KeysError as error:
-            raise KeysError(f"{self._folder.path / FILE} is damaged: {error}") from error
+        keys: dict[str, AllowedKey] = {}
+        for index, entry in enumerate(entries):
+            wrong = _wrong(entry, keys)
+            if wrong:
+                text = (self._folder.read(FILE) or b"").decode(errors="replace")
+                where = f"{self._folder.path / FILE} is damaged (line {line_of(text, index)}"
+                raise KeysError(f"{where}: {wrong}): repair it, or move it away")
+            keys[entry.fingerprint] = entry
+        return keys
 
     def allow(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
         """Puts `key` (Z85) on the list, or renames it and sets its roles. Raises `KeysError` for a taken name."""
@@ -75,7 +81,19 @@ class AllowList:
 
     def put(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
         """As `allow`, for who holds the lock. `rename`: a taken name gets a number, `ann-2`."""
-        if not 0 < len(name) <= MAX_NAME or not name.isprintable():
+        entry, entries = self.with_key(name, key, roles, rename=rename)
+        self.replace(entries)
+        return entry
+
+    def replace(self, entries: list[AllowedKey]) -> None:
+        """Writes the whole list, for who holds the lock."""
+        self._folder.write_json(FILE, entries)
+
+    def with_key(
+        self, name: str, key: str, roles: tuple[str, ...], *, rename: bool
+    ) -> tuple[AllowedKey, list[AllowedKey]]:
+        """The entry that `put` would make, and the list with it. Nothing is written."""
+        if not _is_name(name):
             raise KeysError(f"{name!r} is no name for a key: 1 to {MAX_NAME} printable characters")
         entries = self.read()
         mark = fingerprint(raw_key(key))
@@ -91,8 +109,7 @@ class AllowList:
             name, key, checked_roles(roles), old.added if old else utc_now(), old.last_seen if old else ""
         )
         entries[mark] = entry
-        self._folder.write_json(FILE, list(entries.values()))
-        return entry
+        return entry, list(entries.values())
 
     def revoke(self, name_or_fingerprint: str, patience_s: float = PATIENCE_S) -> AllowedKey | None:
         """Takes one key off the list; `None` when it was not on it. Sessions that run notice within half a second."""
@@ -116,6 +133,22 @@ class AllowList:
                 entries[mark] = msgspec.structs.replace(entries[mark], last_seen=utc)
             if noted:
                 self._folder.write_json(FILE, list(entries.values()), durable=False)
+
+
+def _wrong(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
+    """What is wrong with an entry that somebody may have written by hand, empty for nothing."""
+    try:
+        mark = entry.fingerprint
+        checked_roles(entry.roles)
+    except KeysError as error:
+        return str(error)
+    if not _is_name(entry.name):
+        return f"{entry.name[:MAX_NAME]!r} is no name for a key: 1 to {MAX_NAME} printable characters"
+    return f"this key is listed as {others[mark].name!r} already" if mark in others else ""
+
+
+def _is_name(name: str) -> bool:
+    return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
 def _numbered(name: str, taken: set[str]) -> str:

@@ -14,7 +14,7 @@ import zmq
 from zmq.auth import load_certificate
 from zmq.utils import z85
 
-from iris_session.keys.files import KeysError, PrivateFolder
+from iris_session.keys.files import KeysError, PrivateFolder, check_private
 
 Z85_CHARACTERS: Final = 40
 _CERTIFICATE: Final = """#   ZeroMQ CURVE certificate of iris-session.
@@ -71,18 +71,22 @@ class KeyPair:
 
 def load_public(path: str | os.PathLike[str]) -> str:
     """The public key (Z85) in a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
-    return _load(path)[0]
+    return _load(Path(path))[0]
 
 
 def load_secret(path: str | os.PathLike[str]) -> KeyPair:
-    """The key pair in a `*.key_secret` certificate. Raises `KeysError`."""
+    """The key pair in a `*.key_secret` certificate that its owner alone can read. Raises `KeysError`."""
+    path = Path(path)
     public, secret = _load(path)
     if not secret:
-        raise KeysError(f"{os.fspath(path)} holds no secret key: give the *.key_secret file")
+        raise KeysError(f"{path} holds no secret key: give the *.key_secret file")
+    check_private(path, path.stat(), f"chmod 600 {path}")
     try:
         raw_key(secret)
     except KeysError:  # whose text would show it
-        raise KeysError(f"the secret key in {os.fspath(path)} is damaged") from None
+        raise KeysError(f"the secret key in {path} {_wrong(secret)}: make the pair anew") from None
+    if zmq.curve_public(secret.encode()) != public.encode():
+        raise KeysError(f"the two keys in {path} do not belong together: take the file as it was made")
     return KeyPair(public, secret)
 
 
@@ -96,11 +100,29 @@ def pair_in(folder: PrivateFolder, name: str) -> KeyPair:
     return load_secret(folder.path / name)
 
 
-def _load(path: str | os.PathLike[str]) -> tuple[str, str]:
+def _load(path: Path) -> tuple[str, str]:
+    """Both keys of a certificate, the secret one empty when it has none."""
     try:
-        public, secret = load_certificate(Path(path))
+        public, secret = load_certificate(path)
+    except PermissionError:
+        raise KeysError(f"key file {path} cannot be read: its owner has to run chmod u+r {path}") from None
+    except OSError as error:
+        reason = error.strerror or "No such file or directory"  # pyzmq tells of a missing file without a number
+        raise KeysError(f"key file {path} cannot be used: {reason}") from None
+    except (ValueError, IndexError):  # IndexError: a key without "="
+        text = 'a ZeroMQ certificate with a line public-key = "..."'
+        raise KeysError(f"key file {path} cannot be used: it should be {text}") from None
+    try:
         text = public.decode()
         raw_key(text)
-    except (OSError, ValueError, IndexError, KeysError) as error:  # IndexError: a key without quotes
-        raise KeysError(f"key file {os.fspath(path)} cannot be used: {error}") from error
+    except (UnicodeDecodeError, KeysError):
+        wrong = _wrong(public.decode(errors="replace"))
+        raise KeysError(f"key file {path} cannot be used: its public key {wrong}") from None
     return text, secret.decode(errors="replace") if secret else ""
+
+
+def _wrong(key: str) -> str:
+    """What is wrong with a key, without showing it."""
+    if len(key) != Z85_CHARACTERS:
+        return f"has {len(key)} characters, a CURVE key has {Z85_CHARACTERS} of Z85"
+    return f"is not {Z85_CHARACTERS} characters of Z85"

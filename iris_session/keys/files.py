@@ -13,6 +13,8 @@ from typing import Final, TypeVar
 import msgspec
 from filelock import FileLock, Timeout
 
+from iris_session.keys.lines import trouble
+
 LOCK: Final = "lock"
 #: How long a command waits for another process to finish its change; a change takes milliseconds.
 PATIENCE_S: Final = 5.0
@@ -42,7 +44,7 @@ class PrivateFolder:
             status = self.path.stat()
         except OSError as error:
             raise KeysError(f"{self.path} cannot be made: {error.strerror}; set IRIS_HOME to another folder") from error
-        self._check(self.path, status, f"chmod 700 {self.path}")
+        check_private(self.path, status, f"chmod 700 {self.path}")
 
     def read(self, name: str) -> bytes | None:
         """Content of a file, `None` when it is not there. Raises `KeysError` when others may read it."""
@@ -50,7 +52,7 @@ class PrivateFolder:
         try:
             with path.open("rb") as file:
                 status = os.fstat(file.fileno())
-                self._check(path, status, f"chmod 600 {path}")
+                check_private(path, status, f"chmod 600 {path}")
                 data = file.read(min(status.st_size, MAX_FILE_BYTES) + 1)
         except FileNotFoundError:
             return None
@@ -67,8 +69,11 @@ class PrivateFolder:
             return None
         try:
             return msgspec.json.decode(data, type=kind)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise KeysError(f"{self.path / name} is damaged ({error}): repair it, or move it away") from error
+        except msgspec.MsgspecError as error:
+            text = trouble(data.decode(errors="replace"), error)
+        except (UnicodeDecodeError, RecursionError) as error:
+            text = str(error)
+        raise KeysError(f"{self.path / name} is damaged ({text}): repair it, or move it away")
 
     def write(self, name: str, data: bytes, *, durable: bool = True) -> None:
         """Replaces a file as a whole, mode 0600. `durable`: it survives a power cut."""
@@ -94,12 +99,12 @@ class PrivateFolder:
         self.write(name, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n", durable=durable)
 
     def signature(self, name: str) -> tuple[int, int, int] | None:
-        """Changes whenever a file was replaced or edited; `None` while there is none."""
+        """Changes whenever a file was replaced, edited, or got other permissions; `None` while there is none."""
         try:
             status = (self.path / name).stat()
         except OSError:
             return None
-        return status.st_ino, status.st_mtime_ns, status.st_size
+        return status.st_ino, status.st_ctime_ns, status.st_size
 
     @contextlib.contextmanager
     def locked(self, patience_s: float = PATIENCE_S) -> Iterator[None]:
@@ -117,11 +122,12 @@ class PrivateFolder:
         finally:
             lock.release()
 
-    @staticmethod
-    def _check(path: Path, status: os.stat_result, remedy: str) -> None:
-        if os.name != "posix":
-            return  # folders of a user are closed to others there by access lists
-        if status.st_uid != os.geteuid():
-            raise KeysError(f"{path} belongs to another user: set IRIS_HOME to a folder of your own")
-        if stat.S_IMODE(status.st_mode) & 0o077:
-            raise KeysError(f"{path} can be used by other users of this machine: {remedy}")
+
+def check_private(path: Path, status: os.stat_result, remedy: str) -> None:
+    """Raises `KeysError` when a file or folder is not this user's alone. `remedy`: the command that makes it so."""
+    if os.name != "posix":
+        return  # folders of a user are closed to others there by access lists
+    if status.st_uid != os.geteuid():
+        raise KeysError(f"{path} belongs to another user: take a file or folder of your own (IRIS_HOME)")
+    if stat.S_IMODE(status.st_mode) & 0o077:
+        raise KeysError(f"{path} can be used by other users of this machine: {remedy}")

@@ -74,8 +74,8 @@ class JoinCodes:
     def make(
         self, server: KeyPair, *, minutes: float = 10.0, roles: tuple[str, ...] = (), name: str = ""
     ) -> tuple[str, JoinCode]:
-        """A new code `XXXX-XXXX` for sessions with this server key, and what is kept of it."""
-        code = pairing.code_from_bytes(os.urandom(5))
+        """A new code `XXXX-XXXX-XXXX` for sessions with this server key, and what is kept of it."""
+        code = pairing.code_from_bytes(os.urandom(pairing.CODE_BYTES))
         now_s = time.time()
         made = JoinCode(
             os.urandom(8).hex(),
@@ -118,7 +118,7 @@ class JoinCodes:
     ) -> Attempt:
         """Takes the proof of `client_key` (Z85), compared with every open code in constant time.
 
-        The right one puts the key on the list and uses the code up; a wrong one counts against every open code,
+        The right one uses the code up and puts the key on the list; a wrong one counts against every open code,
         because it could have been meant for any of them. Raises `KeysError`; `KeysBusyError` may be tried again.
         """
         server, now_s = fingerprint(server_public), time.time()
@@ -132,10 +132,19 @@ class JoinCodes:
                         known = one
             if known is None:
                 return self._wrong(codes, server, now_s)
-            entry = clients.put(known.name or name, client_key, known.roles, rename=True)
-            used = msgspec.structs.replace(known, secret=b"", paired=entry)
-            self._folder.write_json(FILE, [used if one is known else one for one in codes])
+            entry, listed = clients.with_key(known.name or name, client_key, known.roles, rename=True)
+            # The code first: a process that dies in between has let nobody in, and the code is used up all the same.
+            self._mark(codes, known, entry)
+            try:
+                clients.replace(listed)
+            except KeysError:
+                self._mark(codes, known, None)
+                raise
             return Attempt(entry, known.secret)
+
+    def _mark(self, codes: list[JoinCode], known: JoinCode, entry: AllowedKey | None) -> None:
+        used = msgspec.structs.replace(known, secret=b"", paired=entry)
+        self._folder.write_json(FILE, [used if one is known else one for one in codes])
 
     def _wrong(self, codes: list[JoinCode], server: str, now_s: float) -> Attempt:
         after, exhausted = [], 0

@@ -1,14 +1,16 @@
 """Join codes: how a client and a session prove to each other that they know the same code, without sending it.
 
-A join code is eight characters (40 bits), valid for minutes and for one client. Both sides stretch it once:
+A join code is twelve characters (60 bits), valid for minutes and for one client. Both sides stretch it once:
 
     stretched    = PBKDF2-HMAC-SHA256(code, salt = "iris-pair-1" || server_public, 200,000 iterations, 32 bytes)
     client_proof = HMAC-SHA256(stretched, "client" || server_public || client_public)
     server_proof = HMAC-SHA256(stretched, "server" || server_public || client_public)
 
 Keys are the raw 32 bytes of the CURVE keys in use. So a code guards against somebody in the middle: whoever relays
-with keys of their own gets a proof that is good for nothing, and to search 2**40 codes with 200,000 iterations each
-takes far longer than a code lives. PBKDF2 because every browser and .NET has it.
+with keys of their own gets a proof that is good for nothing but to try codes on, each for the price of 200,000
+iterations; while a code lives, or beforehand for a key of their own, that is possible for a vanishing part of 2**60
+(docs/security.md has the numbers). PBKDF2 because every browser and .NET has it; a password-authenticated key exchange
+would make do with a shorter code, but none is in their standard libraries.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from typing import Final
 
 #: Crockford's base 32: no I, L, O, U. Any of them, and lower case, is read as what it looks like.
 ALPHABET: Final = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
-CODE_CHARACTERS: Final = 8
+CODE_CHARACTERS: Final = 12
+#: Random bytes that a code is made from; it takes 60 bits of them.
+CODE_BYTES: Final = 8
 KEY_BYTES: Final = 32
 ITERATIONS: Final = 200_000
 _SALT: Final = b"iris-pair-1"
@@ -27,19 +31,19 @@ _LOOKS_LIKE: Final = str.maketrans("OILU", "011V")
 
 
 def code_from_bytes(entropy: bytes) -> str:
-    """Join code `XXXX-XXXX` from five random bytes."""
-    if len(entropy) != 5:
-        raise ValueError(f"a join code is made from 5 bytes, not {len(entropy)}")
+    """Join code `XXXX-XXXX-XXXX` from the last 60 bits of eight random bytes."""
+    if len(entropy) != CODE_BYTES:
+        raise ValueError(f"a join code is made from {CODE_BYTES} bytes, not {len(entropy)}")
     number = int.from_bytes(entropy, "big")
-    text = "".join(ALPHABET[(number >> shift) & 31] for shift in range(35, -1, -5))
-    return f"{text[:4]}-{text[4:]}"
+    text = "".join(ALPHABET[(number >> shift) & 31] for shift in range(5 * CODE_CHARACTERS - 5, -1, -5))
+    return f"{text[:4]}-{text[4:8]}-{text[8:]}"
 
 
 def normal_code(text: str) -> str:
     """`text` as typed by a person, in the one form that is stretched. Raises `ValueError` for what is no join code."""
     code = text.upper().translate(_LOOKS_LIKE).replace("-", "").replace(" ", "")
     if len(code) != CODE_CHARACTERS or any(character not in ALPHABET for character in code):
-        raise ValueError(f"{text!r} is not a join code: eight letters and digits, like 7KQ2-M4XD")
+        raise ValueError(f"{text!r} is not a join code: twelve letters and digits, like 7KQ2-M4XD-9PTR")
     return code
 
 

@@ -13,9 +13,9 @@ KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"
 
 @pytest.mark.parametrize("host", ["10.0.0.5", "::1", "lab.local"])
 def test_a_uri_says_everything_and_reads_back(host: str) -> None:
-    uri = pairing_uri(host, 7731, KEY, "7KQ2-M4XD", "lab 1/2")
+    uri = pairing_uri(host, 7731, KEY, "7KQ2-M4XD-9PTR", "lab 1/2")
     assert uri.startswith(f"iris://{host_port(host, 7731)}/?k=")
-    assert Address.parse(uri) == Address(host, 7731, KEY, "7KQ2M4XD", "lab 1/2")
+    assert Address.parse(uri) == Address(host, 7731, KEY, "7KQ2M4XD9PTR", "lab 1/2")
     assert str(Address.parse(uri)) == host_port(host, 7731)
 
 
@@ -31,7 +31,7 @@ def test_a_server_may_be_called_as_the_scheme() -> None:
 
 def test_a_uri_may_say_less_and_more() -> None:
     assert Address.parse("iris://10.0.0.5") == Address("10.0.0.5", 7721)
-    assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd") == Address("10.0.0.5", 7731, "", "7KQ2M4XD")
+    assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd-9ptr") == Address("10.0.0.5", 7731, "", "7KQ2M4XD9PTR")
 
 
 @pytest.mark.parametrize(

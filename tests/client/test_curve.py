@@ -17,6 +17,8 @@ def test_listed_keys_join_and_see_and_others_do_not(tmp_path: Path) -> None:
     server_public, server_secret = create_certificates(tmp_path, "server")
     _, ann_secret = create_certificates(allowed, "ann")
     _, eve_secret = create_certificates(tmp_path, "eve")
+    for secret in (server_secret, ann_secret, eve_secret):
+        Path(secret).chmod(0o600)
     session = LiveSession(curve_secret_file=server_secret, curve_clients_dir=str(allowed))
     try:
         with Client(session.address, name="ann", curve=CurveKeys.from_files(server_public, ann_secret)) as ann:
@@ -32,7 +34,11 @@ def test_listed_keys_join_and_see_and_others_do_not(tmp_path: Path) -> None:
 
 
 def test_wrong_key_files_say_which_is_needed(tmp_path: Path) -> None:
-    public, _ = create_certificates(tmp_path, "ann")
+    public, secret = create_certificates(tmp_path, "ann")
+    with pytest.raises(IdentityError, match="can be used by other users of this machine: chmod 600 .*ann.key_secret"):
+        CurveKeys.from_files(public, secret)
+    Path(secret).chmod(0o600)
+    assert CurveKeys.from_files(public, secret).public == CurveKeys.from_files(public, secret).server_public
     with pytest.raises(IdentityError, match="key_secret"):
         CurveKeys.from_files(public, public)
     with pytest.raises(IdentityError, match="cannot be used"):

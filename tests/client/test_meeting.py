@@ -97,7 +97,7 @@ def test_a_key_that_was_taken_off_the_list_pairs_again_with_a_new_code_only(lab:
 def test_a_wrong_code_stores_nothing(lab: Lab) -> None:
     lab.code()
     with pytest.raises(RefusedError) as refused:
-        lab.join(lab.address, join_code="0000-0000")
+        lab.join(lab.address, join_code="0000-0000-0000")
     assert refused.value.code == RefusalCode.CODE
     assert lab.mine.servers.read() == []
     with pytest.raises(ClientError, match="not a join code"):
@@ -196,7 +196,7 @@ def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
 
     thread = threading.Thread(target=say_yes)
     thread.start()
-    steps = pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD", "ann")
+    steps = pair_key(Address("127.0.0.1", port), server.public, own, "7KQ2-M4XD-9PTR", "ann")
     with pytest.raises(TrustError, match="does not know the join code"):
         deque(steps, maxlen=0)
     thread.join()
@@ -207,7 +207,7 @@ def test_a_session_of_this_machine_needs_no_keys(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "mine"))
     plain = LiveSession()
     try:
-        with Client(plain.address, name="ann", join_code="7KQ2-M4XD"):
+        with Client(plain.address, name="ann", join_code="7KQ2-M4XD-9PTR"):
             pass
     finally:
         plain.close()

@@ -122,7 +122,7 @@ def test_key_that_is_not_on_the_list(encrypted: Server, home: Path) -> None:
 
 
 def test_wrong_code(encrypted: Server, home: Path) -> None:
-    found = doctor(encrypted.address, "--code", "7KQ2-M4XD", home=home)
+    found = doctor(encrypted.address, "--code", "7KQ2-M4XD-9PTR", home=home)
     found.named("code", "join code")
     assert found.failed() == {"code"}
 

@@ -160,7 +160,7 @@ def test_wrong_and_expired_codes(lab: Lab, tmp_path: Path, monkeypatch: pytest.M
     process, told = pairing(tmp_path)
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "eve-home"))
     for _ in range(5):
-        assert refusal(lab.server.address, name="Eve", join_code="0000-0000").code == RefusalCode.CODE
+        assert refusal(lab.server.address, name="Eve", join_code="0000-0000-0000").code == RefusalCode.CODE
     assert refusal(lab.server.address, name="Ann", join_code=told["code"]).code == RefusalCode.CODE
     assert ended(process, told) == (1, {"paired": None, "reason": "void"})
     monkeypatch.setenv("IRIS_HOME", str(lab.home.path))

@@ -265,6 +265,7 @@ def test_notes_of_sessions_that_are_gone_are_passed_over(home: KeyHome) -> None:
 
 def test_zeromq_certificates_are_read(tmp_path: Path) -> None:
     public, secret = create_certificates(tmp_path, "ann")
+    Path(secret).chmod(0o600)
     pair = load_secret(secret)
     assert load_public(public) == pair.public
     assert pair.fingerprint == fingerprint(raw_key(pair.public))

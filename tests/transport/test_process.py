@@ -387,3 +387,4 @@ def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
     public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
     assert secret is not None
     return public, secret
+    (folder / f"{name}.key_secret").chmod(0o600)

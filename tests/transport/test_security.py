@@ -278,6 +278,8 @@ def test_a_director_revokes_even_where_the_list_cannot_be_changed(open_session: 
     folder = tmp_path / "clients"
     folder.mkdir()
     server_file, _ = create_certificates(tmp_path, "server")
+    for path in (*tmp_path.glob("*.key_secret"), *folder.glob("*.key_secret")):
+        path.chmod(0o600)
     ann_file, _ = create_certificates(folder, "ann")
     secret = server_file.replace(".key", ".key_secret")
     session = open_session(curve_secret_file=secret, curve_clients_dir=str(folder))
