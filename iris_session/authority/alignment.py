@@ -12,7 +12,7 @@ from typing import Final
 from anchors.pose import apply, compose, distance, inverse, quat_angle, quat_normalize
 from iris_session.authority import engagement
 from iris_session.authority.context import Context
-from iris_session.authority.state import Participant
+from iris_session.authority.state import Participant, Warned
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
@@ -78,14 +78,10 @@ def propose(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
     if error > ctx.config.max_error_at_robot_m:
         return refuse_at_robot(ctx, p, "the robot", error, m.advice)
     tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
-    if tilted and not p.tilt_warned:
-        degrees = math.degrees(m.residual_tilt_rad)
-        text = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
-        ctx.emit(Notice("warning", text, p.id))
-    p.tilt_warned = tilted
-    if m.advice and not tilted and m.advice != p.advised:
-        ctx.emit(Notice("warning", f"alignment of {p.name}: {m.advice}"[:MAX_TEXT], p.id))
-    p.advised = m.advice
+    degrees = math.degrees(m.residual_tilt_rad)
+    tilt = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
+    _warn(ctx, p, "tilt", tilt if tilted else "", same="tilted")
+    _warn(ctx, p, "advice", f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else "", same=m.advice)
     placed = p.alignment is not None and p.alignment.kind == AlignmentKind.PLACED
     if placed or not _is_news(ctx, p, m, error):
         return None
@@ -96,6 +92,28 @@ def propose(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
     return _accept(
         ctx, p, AlignmentKind.MEASURED, T, tuple(map(float, m.covariance)), float(m.error_at_anchor_m), error
     )
+
+
+def _warn(ctx: Context, p: Participant, kind: str, text: str, *, same: str) -> None:
+    """Tells the wearer, at most once per `warning_ns` and kind; what was left out meanwhile is counted in the next one.
+
+    `text` empty: all is well now. `same`: what stays equal in warnings that need not be said again.
+    """
+    w = p.warnings.get(kind)
+    if w is None:
+        if not text:
+            return
+        w = p.warnings[kind] = Warned(said_ns=ctx.now_ns - ctx.config.warning_ns)
+    now = same if text else ""
+    changed, w.seen = now != w.seen, now
+    if not now:
+        w.said = ""
+    elif now != w.said and ctx.now_ns - w.said_ns < ctx.config.warning_ns:
+        w.left_out += changed
+    elif now != w.said:
+        more = f" ({w.left_out} more of these meanwhile)" if w.left_out else ""
+        ctx.emit(Notice("warning", text[: MAX_TEXT - len(more)] + more, p.id))
+        w.said, w.said_ns, w.left_out = now, ctx.now_ns, 0
 
 
 def _valid(ctx: Context, m: AlignmentProposal) -> bool:

@@ -2,6 +2,9 @@
 
 Anything else that touches the object in between (table, a third robot, a virtual hand, a free fall) makes it no
 handover. Contacts flicker for single ticks, so a grip counts as lost only after `handover_flicker_ns`.
+
+Two arms of one person are one giver, or one receiver. So every object is followed twice: from person to person, where
+an arm stands for the other one of its holder, and from arm to arm, for what somebody passes between their own two.
 """
 
 from __future__ import annotations
@@ -20,32 +23,74 @@ def observe(ctx: Context) -> None:
     state.handover_tick = ctx.view.tick
     touched = {c.object: c for c in ctx.view.object_contacts() if c.object in ctx.objects}
     in_hand = [lease.target for lease in ctx.held_objects if lease.lead]
-    for name in in_hand:
-        state.handovers.pop(name, None)
+    for tracks in (state.handovers, state.regrasps):
+        for name in in_hand:
+            tracks.pop(name, None)
+        for name in [n for n in tracks if n not in touched]:
+            if ctx.now_ns - tracks[name].seen_ns > ctx.config.handover_flicker_ns:
+                del tracks[name]
     for name, contact in touched.items():
         if name not in in_hand:
-            _advance(ctx, name, contact)
-    for name in [n for n in state.handovers if n not in touched]:
-        if ctx.now_ns - state.handovers[name].seen_ns > ctx.config.handover_flicker_ns:
-            del state.handovers[name]
+            _advance(ctx, state.handovers, _by_person(ctx, state.handovers.get(name), contact))
+            _advance(ctx, state.regrasps, contact)
 
 
-def _advance(ctx: Context, name: str, c: ObjectContact) -> None:
-    track = ctx.state.handovers.get(name)
+def _by_person(ctx: Context, track: HandoverTrack | None, c: ObjectContact) -> ObjectContact:
+    """The contact with one arm per person: the one in `track`, else the first that touches."""
+    if len(c.touching) < 2 and track is None:
+        return c
+    arms: dict[str, str] = {}  # person, or a robot that nobody has -> the arm that stands for them
+    if track is not None:
+        # The arm that holds on stands for one that let go: it is the one that gives, or takes.
+        track.giver = _that_touches(ctx, track.giver, c)
+        track.receiver = _that_touches(ctx, track.receiver, c)
+        for robot in (track.receiver, track.giver):
+            if robot:
+                arms[_person(ctx, robot)] = robot
+    for robot in (*c.grippers, *c.touching):
+        arms.setdefault(_person(ctx, robot), robot)
+    grippers, touching = (
+        tuple(dict.fromkeys(arms[_person(ctx, robot)] for robot in robots)) for robots in (c.grippers, c.touching)
+    )
+    return ObjectContact(c.object, grippers, touching, c.others)
+
+
+def _that_touches(ctx: Context, robot: str, c: ObjectContact) -> str:
+    """`robot` while it touches, else another arm of the same person that does."""
+    if not robot or robot in c.touching:
+        return robot
+    person = _person(ctx, robot)
+    return next((other for other in (*c.grippers, *c.touching) if _person(ctx, other) == person), robot)
+
+
+def _person(ctx: Context, robot: str) -> str:
+    """Who has a robot; a robot that nobody has stands for itself."""
+    return _holder(ctx, robot) or f"robot {robot}"
+
+
+def _holder(ctx: Context, robot: str) -> str:
+    lease = ctx.state.robots.get(robot)
+    return "" if lease is None else ctx.holder(lease)
+
+
+def _advance(ctx: Context, tracks: dict[str, HandoverTrack], c: ObjectContact) -> None:
+    track = tracks.get(c.object)
     pair = (track.giver, track.receiver or _second(c, track.giver)) if track is not None else ()
     if c.others or (track is not None and any(r not in pair for r in c.touching)):
-        ctx.state.handovers.pop(name, None)
+        tracks.pop(c.object, None)
         return
     if track is None:
         if len(c.grippers) == 1 and c.touching == c.grippers:
-            ctx.state.handovers[name] = HandoverTrack(c.grippers[0], ctx.now_ns, seen_ns=ctx.now_ns)
+            tracks[c.object] = HandoverTrack(c.grippers[0], ctx.now_ns, seen_ns=ctx.now_ns)
         return
     if any(r in c.grippers for r in pair):
         track.seen_ns = ctx.now_ns
     elif ctx.now_ns - track.seen_ns > ctx.config.handover_flicker_ns:
-        del ctx.state.handovers[name]
+        del tracks[c.object]
         return
-    _exchange(ctx, name, track, c)
+    if _exchange(ctx, track, c):
+        _announce(ctx, c.object, track, own=tracks is ctx.state.regrasps)
+        tracks[c.object] = HandoverTrack(track.receiver, track.taken_ns or 0, seen_ns=ctx.now_ns)
 
 
 def _second(c: ObjectContact, giver: str) -> str:
@@ -53,7 +98,8 @@ def _second(c: ObjectContact, giver: str) -> str:
     return next((r for r in c.touching if r != giver), "")
 
 
-def _exchange(ctx: Context, name: str, track: HandoverTrack, c: ObjectContact) -> None:
+def _exchange(ctx: Context, track: HandoverTrack, c: ObjectContact) -> bool:
+    """True when the receiver has had it alone for long enough."""
     now, config = ctx.now_ns, ctx.config
     receiver = track.receiver or _second(c, track.giver)
     both = receiver != "" and track.giver in c.touching and receiver in c.touching
@@ -64,22 +110,22 @@ def _exchange(ctx: Context, name: str, track: HandoverTrack, c: ObjectContact) -
     if track.both_from_ns is None:
         if both:
             track.alone_ns = now  # touched by both before the giver held it long enough: start the hold again
-        return
+        return False
     if track.giver in c.touching:
         track.taken_ns = None
         if receiver not in c.touching and now - track.both_until_ns > config.handover_flicker_ns:
             track.receiver, track.both_from_ns, track.alone_ns = "", None, track.both_until_ns
-        return
+        return False
     if receiver not in c.grippers:
-        return
+        return False
     track.taken_ns = now if track.taken_ns is None else track.taken_ns
-    if now - track.taken_ns >= config.handover_hold_ns:
-        _announce(ctx, name, track)
-        ctx.state.handovers[name] = HandoverTrack(receiver, track.taken_ns, seen_ns=now)
+    return now - track.taken_ns >= config.handover_hold_ns
 
 
-def _announce(ctx: Context, name: str, track: HandoverTrack) -> None:
-    giver, receiver = (ctx.state.robots.get(robot) for robot in (track.giver, track.receiver))
+def _announce(ctx: Context, name: str, track: HandoverTrack, *, own: bool) -> None:
+    """`own`: seen from arm to arm, which says what somebody does with their own two; people are seen as people."""
+    giver, receiver = _holder(ctx, track.giver), _holder(ctx, track.receiver)
+    if own != (giver == receiver != ""):
+        return
     duration = track.both_until_ns - (track.both_from_ns or 0)
-    people = [ctx.holder(lease) if lease is not None else "" for lease in (giver, receiver)]
-    ctx.emit(Handover(name, track.giver, track.receiver, people[0], people[1], duration))
+    ctx.emit(Handover(name, track.giver, track.receiver, giver, receiver, duration))

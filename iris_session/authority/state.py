@@ -46,6 +46,16 @@ class Rejections(msgspec.Struct):
     reported_ns: int | None = None
 
 
+class Warned(msgspec.Struct):
+    """Warnings of one kind to one participant: the one that stands and when it was said, what was seen last, and how
+    many were left out since."""
+
+    said: str = ""
+    said_ns: int = 0
+    seen: str = ""
+    left_out: int = 0
+
+
 class Participant(msgspec.Struct):
     """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
 
@@ -75,8 +85,7 @@ class Participant(msgspec.Struct):
     offset: Pose | None = None
     pivot_world: Vec3 = (0.0, 0.0, 0.0)
     refused_ns: int | None = None
-    advised: str = ""
-    tilt_warned: bool = False
+    warnings: dict[str, Warned] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
     rejections: dict[str, Rejections] = {}
@@ -166,7 +175,10 @@ class FeedbackState(msgspec.Struct):
 
 
 class State(msgspec.Struct):
-    """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`)."""
+    """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
+
+    `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
+    """
 
     robots: dict[str, LeaseState]
     objects: dict[str, LeaseState]
@@ -187,6 +199,7 @@ class State(msgspec.Struct):
     hold_expiry_until_ns: int = 0
     episode: EpisodeChanged | None = None
     handovers: dict[str, HandoverTrack] = {}
+    regrasps: dict[str, HandoverTrack] = {}
     handover_tick: int = -1
     feedback: dict[str, FeedbackState] = {}
     unattributed: dict[str, Rejections] = {}

@@ -70,6 +70,7 @@ def new_scene(ctx: Context, cause: str) -> None:
     """Starts a scene epoch: whatever was sent for the old one no longer counts."""
     ctx.state.scene_epoch += 1
     ctx.state.handovers.clear()
+    ctx.state.regrasps.clear()
     engagement.rearm_all(ctx, HoldReason.SCENE_CHANGED)
     for lease in ctx.state.objects.values():
         lease.lead = 0

@@ -15,7 +15,7 @@ from iris_session.protocol.client_messages import Observation, PlaceAlignment, T
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, ParticipantChanged, SamplesRejected
 
-from .table import SECOND, SMALL, Table, make_view, proposal
+from .table import MS, SECOND, SMALL, Table, make_view, proposal
 
 
 def covariance(position_m: float, rotation_rad: float) -> tuple[float, ...]:
@@ -142,6 +142,30 @@ def test_advice_on_an_accepted_measurement_is_told_once() -> None:
     notices = [e for e in t.events if isinstance(e, Notice)]
     assert [(n.participant, n.reason) for n in notices] == [(anna.id, "")]
     assert "wrong scale" in notices[0].text
+
+
+def test_a_sheet_on_the_edge_of_a_bound_is_told_every_five_seconds_and_counted() -> None:
+    t = Table()
+    anna = t.join()
+    for i in range(60):  # 12 s of proposals at 5 Hz
+        t.step(anna.says(proposal(residual_tilt_rad=0.02 if i % 2 else 0.0)), dt_ns=200 * MS)
+    notices = [e.text for e in t.events if isinstance(e, Notice)]
+    assert len(notices) == 3
+    assert "more of these" not in notices[0]
+    assert "(12 more of these meanwhile)" in notices[1]
+
+
+def test_advice_that_changes_with_every_measurement_is_told_every_five_seconds() -> None:
+    t = Table()
+    anna = t.join()
+    for i in range(30):  # 6 s
+        t.step(anna.says(proposal(advice=f"it measures {i} mm")), dt_ns=200 * MS)
+    bert = t.join()
+    t.step(bert.says(proposal(advice="it measures 7 mm")))
+    notices = [(e.participant, e.text) for e in t.events if isinstance(e, Notice)]
+    assert [who for who, _ in notices] == [anna.id, anna.id, bert.id]  # everybody's own
+    assert "0 mm" in notices[0][1]
+    assert "25 mm (24 more of these meanwhile)" in notices[1][1]
 
 
 def test_alignment_is_frozen_while_engaged() -> None:

@@ -121,3 +121,58 @@ def test_unknown_objects_and_paused_physics_change_nothing() -> None:
     t.step(n_ticks=0)
     t.step()
     assert t.authority.snapshot().count(b"ghost") == 0
+
+
+ARMS = ("a1", "a2", "b1", "b2")
+
+
+def two_arms_each() -> tuple[Table, str, str]:
+    """anna has a1 and a2, bert b1 and b2."""
+    t = Table(robots=tuple(robot(name) for name in ARMS))
+    t.view = msgspec.structs.replace(
+        t.view, tips=dict.fromkeys(ARMS, t.view.tip_pose("left")), q=dict.fromkeys(ARMS, (0.0,) * 7)
+    )
+    anna, bert = t.operator("a1", "a2"), t.operator("b1", "b2")
+    return t, anna.id, bert.id
+
+
+@pytest.mark.parametrize(
+    ("course", "arms"),
+    [
+        (["a1", "a1 b1", "a1 a2 b1", "a1 b1", "b1"], ("a1", "b1")),  # the giver steadies it with the other arm
+        (["a1", "a1 b1", "a1 b1 b2", "b1 b2"], ("a1", "b1")),  # taken with both arms
+        (["a1 a2", "a1 a2 b1", "a2 b1", "b1"], ("a2", "b1")),  # carried with both, the second arm lets go last
+        (["a1", "a1 b1", "a1 b1 b2", "a1 b2", "b2"], ("a1", "b2")),
+        (["a1", "a1 a2", "a2", "a2 b1", "b1"], ("a2", "b1")),  # from hand to hand first
+    ],
+)
+def test_two_arms_of_one_person_are_one_giver_and_one_receiver(course: list[str], arms: tuple[str, str]) -> None:
+    t, anna, bert = two_arms_each()
+    for grippers in course:
+        contact(t, 200, grippers)
+    between = [h for h in handovers(t) if h.giver_participant != h.receiver_participant]
+    assert [(h.giver, h.receiver, h.giver_participant, h.receiver_participant) for h in between] == [
+        (*arms, anna, bert)
+    ]
+
+
+def test_from_one_arm_to_the_other_of_the_same_person() -> None:
+    t, anna, _ = two_arms_each()
+    for grippers in ("a1", "a1 a2", "a2"):
+        contact(t, 200, grippers)
+    assert [(h.giver, h.receiver, h.giver_participant, h.receiver_participant) for h in handovers(t)] == [
+        ("a1", "a2", anna, anna)
+    ]
+
+
+def test_somebody_else_who_touches_too_makes_it_no_handover() -> None:
+    t = Table(robots=tuple(robot(name) for name in ("left", "right", "third")))
+    t.operator("left")
+    t.operator("right")
+    t.operator("third")
+    contact(t, 200, "left")
+    contact(t, 200, "left right")
+    contact(t, 10, "left right", "left right third")
+    contact(t, 200, "left right")
+    contact(t, 200, "right")
+    assert handovers(t) == []
