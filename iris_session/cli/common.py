@@ -13,6 +13,8 @@ from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 if TYPE_CHECKING:
     import mujoco
 
+    from iris_session.runtime.scenes import Scene
+
 
 class CommandError(Exception):
     """The command cannot go on; the text is one line that says what would be right."""
@@ -114,17 +116,23 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
 
 
-def scene_file(scene: str) -> Path:
-    """The file `scene`, or the packaged scene of that name."""
-    from iris_session.physics.scenes import scene_path
+def open_scene(scene: str) -> Scene:
+    """The scene of that name, or in that file; a file or folder in the way of a name is no scene."""
+    from iris_session.physics import load_model
+    from iris_session.runtime.scenes import Scene, scene_by_name
 
     path = Path(scene)
-    if path.exists() or path.suffix:
-        return path
-    try:
-        return scene_path(scene)
-    except FileNotFoundError as error:
-        raise CommandError(f"{scene}: no such file, and {error}") from None
+    if path.suffix or path.is_file():
+        return Scene(load_model(path))
+    return scene_by_name(scene)
+
+
+def scene_names() -> str:
+    """The scenes that can be named, a line each."""
+    from iris_session.runtime.scene_names import SCENE_NAMES
+
+    width = max(map(len, SCENE_NAMES))
+    return "\n".join(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items())
 
 
 def no_robots(model: mujoco.MjModel) -> str:

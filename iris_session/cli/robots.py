@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from iris_session.cli.common import add_json, no_robots, print_json, scene_file
+from iris_session.cli.common import add_json, no_robots, open_scene, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -16,7 +16,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n  iris-session robots scene.xml > robots.toml\n  iris-session robots handover",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", help="MJCF or MJB file, or the name of a packaged scene")
+    parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -25,9 +25,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Prints what `find_robots` sees; an ambiguous model is an error that carries the same TOML."""
     import msgspec
 
-    from iris_session.physics import dump_robots_toml, find_objects, find_robots, load_model
+    from iris_session.physics import dump_robots_toml, find_objects, find_robots
 
-    model = load_model(scene_file(arguments.scene))
+    model = open_scene(arguments.scene).model
     robots = find_robots(model)
     objects = find_objects(model)
     if not robots:

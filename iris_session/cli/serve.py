@@ -14,9 +14,10 @@ from iris_session.cli.common import (
     add_json,
     add_session_options,
     no_robots,
+    open_scene,
     positive_seconds,
     print_json,
-    scene_file,
+    scene_names,
 )
 from iris_session.protocol.names import AssignmentPolicy
 
@@ -30,17 +31,18 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "serve",
         help="share a MuJoCo scene",
         description="Shares a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or named.",
-        epilog="examples:\n"
+        epilog=f"scenes with a name (iiwa and aloha need the folder that IRIS_DATA names):\n{scene_names()}\n\n"
+        "examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
         "  iris-session serve handover --assign ann=left --assign bob=right\n"
-        "  iris-session serve handover --seconds 30     (a scene that comes with the package)\n"
+        "  iris-session serve aloha --seconds 30\n"
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
         "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
         "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (go on where it ended)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", nargs="?", help="MJCF or MJB file, or the name of a packaged scene")
+    parser.add_argument("scene", nargs="?", help="MJCF or MJB file, or the name of a scene, see below")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
     parser.add_argument(
         "--assign",
@@ -116,15 +118,16 @@ def session_name(path: Path) -> str:
 
 def new_session(arguments: argparse.Namespace) -> Session:
     """A session that begins."""
-    from iris_session.physics import load_model, load_robots_toml
+    from iris_session.physics import load_robots_toml
     from iris_session.runtime.session import Session
 
     if arguments.scene is None:
-        raise CommandError("which scene? give an MJCF or MJB file, the name of a packaged scene, or --resume RECORDING")
-    path = scene_file(arguments.scene)
-    model = load_model(path)
-    robots = None if arguments.robots is None else load_robots_toml(arguments.robots, model)
-    return Session(model, config=session_config(arguments, session_name(path)), robots=robots)
+        raise CommandError("which scene? give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
+    scene = open_scene(arguments.scene)
+    robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
+    config = session_config(arguments, session_name(Path(arguments.scene)))
+    config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes)
+    return Session(scene.model, config=config, robots=robots)
 
 
 def resumed_session(arguments: argparse.Namespace) -> Session:
@@ -135,7 +138,7 @@ def resumed_session(arguments: argparse.Namespace) -> Session:
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")
-    model = None if arguments.scene is None else scene_file(arguments.scene)
+    model = None if arguments.scene is None else open_scene(arguments.scene).model
     config = dataclasses.replace(session_config(arguments, "session"), resume=arguments.resume)
     return Session(model, config=config)
 

@@ -19,6 +19,8 @@ from iris_session.runtime.errors import ConfigError
 
 #: A printed sheet lying at the near edge of the demo table; `T_world_anchor` of anchor id "table".
 DEFAULT_ANCHORS: Final[Mapping[str, PoseTuple]] = MappingProxyType({"table": ((0.0, -0.45, 0.0), IDENTITY_QUAT)})
+#: Edge of the code printed on it [m].
+DEFAULT_SHEET_M: Final = 0.16
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,10 @@ class SessionConfig:
     False records nothing. Port 0 takes any free one. `interfaces`: names or addresses of the networks to listen on,
     instead of `host`; `advertise`: the address that others are told when it is none of ours (a forwarding router).
     `beacon_port`: UDP port on which the session tells of itself, 0 for not at all. `anchors`: `T_world_anchor` per
-    anchor id. Off loopback everything is encrypted, with `curve` on loopback too: with the key and the allow-list of
-    the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates `curve_clients`.
+    anchor id; `anchor_sizes`: edge of the printed sheets [m], of those that are to be checked for a misprint (the
+    default one: 0.16). Off loopback everything is encrypted, with `curve` on loopback too: with the key and the
+    allow-list of the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates
+    `curve_clients`.
     `keyframe_s`: distance of the recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes
     on without when refused. `resume`: a recording (or its folder) of our loop to go on from; scene, robots, name,
     authority and control come with it, and what is left at its default here is as it was: addresses, ports, keys.
@@ -46,6 +50,7 @@ class SessionConfig:
     state_hz: float = 60.0
     record: bool | str | Path = True
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
+    anchor_sizes: Mapping[str, float] = field(default_factory=dict)
     curve: bool = False
     curve_key: str = ""
     curve_clients: str = ""
@@ -57,7 +62,7 @@ class SessionConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_anchors(self.anchors)
+        check_anchors(self.anchors, self.anchor_sizes)
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}", self.name):
             raise ConfigError(
                 f"session name {self.name!r} cannot be used: 1 to 48 letters, digits, '.', '_' or '-', "
@@ -73,6 +78,11 @@ class SessionConfig:
             raise ConfigError(f"state_hz {self.state_hz} is out of range: 1 to 240")
         if not 0.5 <= self.keyframe_s <= 60.0:
             raise ConfigError(f"keyframe_s {self.keyframe_s} is out of range: 0.5 to 60")
+
+    def sheet_sizes(self) -> dict[str, float]:
+        """Edge of each printed sheet [m] whose size is known, the default one's included."""
+        known = dict.fromkeys(DEFAULT_ANCHORS, DEFAULT_SHEET_M) if self.anchors == DEFAULT_ANCHORS else {}
+        return {**known, **{name: float(size) for name, size in self.anchor_sizes.items()}}
 
     def recording_path(self) -> Path | None:
         """Where this session records to, None when it does not. The name of a default folder is made at each call."""

@@ -25,11 +25,15 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "str | Path | None": (str, Path, NoneType),
     "tuple[str, ...]": (tuple,),
     "Mapping[str, PoseTuple]": (Mapping,),
+    "Mapping[str, float]": (Mapping,),
     "AuthorityConfig": (msgspec.Struct,),
     "ControlConfig": (msgspec.Struct,),
 }
 #: Quaternions of people's files have few digits.
 UNIT_TOLERANCE: Final = 1e-3
+#: Millimetres in a field of metres are a mistake, not a sheet.
+SMALLEST_SHEET_M: Final = 0.01
+LARGEST_SHEET_M: Final = 5.0
 
 
 def check_types(config: Any) -> None:
@@ -46,8 +50,18 @@ def check_types(config: Any) -> None:
             raise ConfigError(f"{item.name} must be {annotation}, not {type(value).__name__} {value!r:.60}")
 
 
-def check_anchors(anchors: Mapping[str, Any]) -> None:
-    """Raises `ConfigError` for a pose that is no `((x, y, z), (w, x, y, z))` in metres, finite, of unit length."""
+def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any]) -> None:
+    """Raises `ConfigError` for a pose that is no `((x, y, z), (w, x, y, z))` in metres, finite, of unit length, and for
+    the size of an anchor that is none or has none [m]."""
+    for name, size in sizes.items():
+        if name not in anchors:
+            raise ConfigError(f"anchor_sizes: there is no anchor {name!r}: {', '.join(map(repr, anchors)) or 'none'}")
+        number = isinstance(size, int | float) and not isinstance(size, bool)
+        if not (number and SMALLEST_SHEET_M <= size <= LARGEST_SHEET_M):
+            raise ConfigError(
+                f"anchor_sizes: {name!r}: {size!r:.40} is not the edge of a printed sheet in metres, "
+                f"{SMALLEST_SHEET_M:g} to {LARGEST_SHEET_M:g}"
+            )
     for name, pose in anchors.items():
         where = f"anchor {name!r}: {pose!r:.80}"
         try:

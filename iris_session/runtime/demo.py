@@ -138,7 +138,9 @@ def run_demo(
 
     `profile`: every process of people joins over a bad link like this, with the weather of `seed`; empty: directly.
     """
-    session = Session(play.model, config=dataclasses.replace(config, anchors=play.anchors))
+    session = Session(
+        play.model, config=dataclasses.replace(config, anchors=play.anchors, anchor_sizes=play.anchor_sizes)
+    )
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)

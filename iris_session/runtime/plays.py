@@ -6,24 +6,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import mujoco
 
-from anchors.pose import IDENTITY_QUAT, PoseTuple, Vec3
+from anchors.pose import PoseTuple, Vec3
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
 from iris_session.emulator.specs import HandTask, HeadsetSpec
-from iris_session.physics import load_model
-from iris_session.physics.scenes import n_arms_scene, scene_path
-from iris_session.physics.scenes.aloha import SHEET_Z, aloha_scene
 from iris_session.physics.scenes.generators import arm_names, bearing_of, circle_radius
-from iris_session.physics.scenes.iiwa import iiwa_radius, iiwa_scene
-from iris_session.physics.scenes.parts import add_sheet, sheet_place
+from iris_session.physics.scenes.iiwa import iiwa_radius
 from iris_session.protocol.names import Device
 from iris_session.runtime.errors import ConfigError
+from iris_session.runtime.scenes import Scene, aloha, arms, iiwa, scene_by_name
 
 MOST_OPERATORS: Final = 8
 MOST_OBSERVERS: Final = 16
@@ -43,6 +41,7 @@ class Play:
     people: tuple[HeadsetSpec, ...]
     objects: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    anchor_sizes: Mapping[str, float] = field(default_factory=dict)
 
 
 def make_play(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Play:
@@ -54,7 +53,7 @@ def make_play(name: str, operators: int = 2, observers: int = 0, seed: int = 0) 
     play = PLAYS[name](operators, seed)
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
     watching = tuple(_observer(i, observers, sheet, seed) for i in range(observers))
-    return Play(play.name, play.model, play.anchors, (*play.people, *watching), play.objects, play.notes)
+    return dataclasses.replace(play, people=(*play.people, *watching))
 
 
 # --- arms around a table ----------------------------------------------------------------------------------------------
@@ -63,18 +62,20 @@ def make_play(name: str, operators: int = 2, observers: int = 0, seed: int = 0) 
 def _handover(operators: int, seed: int) -> Play:
     _check_operators("handover", operators)
     if operators == 2:
-        play = Play("handover", load_model(scene_path("handover")), {}, (), ("hammer",))
+        play = _play("handover", scene_by_name("handover"), ("hammer",))
         return _around(play, operators, 0.6, "arm", seed)
-    spec = n_arms_scene(operators)
-    add_sheet(spec, sheet_place(operators))
-    play = Play("handover", spec.compile(), {}, (), _things(operators))
+    play = _play("handover", arms(operators), _things(operators))
     return _around(play, operators, circle_radius(operators), "arm", seed)
 
 
 def _iiwa(operators: int, seed: int) -> Play:
     _check_operators("iiwa", operators)
-    play = Play("iiwa", iiwa_scene(operators).compile(), {}, (), _things(operators))
-    return _around(play, operators, iiwa_radius(operators), "iiwa", seed)
+    return _around(_play("iiwa", iiwa(operators), _things(operators)), operators, iiwa_radius(operators), "iiwa", seed)
+
+
+def _play(name: str, scene: Scene, objects: tuple[str, ...]) -> Play:
+    """Without its cast."""
+    return Play(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes)
 
 
 def _check_operators(demo: str, operators: int) -> None:
@@ -92,8 +93,7 @@ def _things(operators: int) -> tuple[str, ...]:
 def _around(play: Play, operators: int, radius: float, arm: str, seed: int) -> Play:
     """Casts neighbours as pairs: the first gives to the second, the third to the fourth. Who is left over has no
     partner."""
-    place = sheet_place(operators)
-    sheet: PoseTuple = (place, IDENTITY_QUAT)
+    sheet = play.anchors[DEFAULT_ANCHOR_ID]
     robots = arm_names(operators)
     people = []
     notes = []
@@ -111,11 +111,11 @@ def _around(play: Play, operators: int, radius: float, arm: str, seed: int) -> P
                 object=play.objects[min(i // 2, len(play.objects) - 1)],
                 arm=arm,
                 seed=seed + i,
-                eye=_seat(i, operators, radius, place),
+                eye=_seat(i, operators, radius, sheet[0]),
                 T_world_anchor=sheet,
             )
         )
-    return Play(play.name, play.model, {DEFAULT_ANCHOR_ID: sheet}, tuple(people), play.objects, tuple(notes))
+    return dataclasses.replace(play, people=tuple(people), notes=tuple(notes))
 
 
 def _seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
@@ -135,7 +135,8 @@ def _aloha(operators: int, seed: int) -> Play:
             f"demo aloha has two stations with two arms each: 2 operators, not {operators}. For more people: "
             "iris-session demo handover --operators N"
         )
-    sheet: PoseTuple = ((0.0, 0.0, SHEET_Z), IDENTITY_QUAT)
+    play = _play("aloha", aloha(), ("red_board", "blue_board"))
+    sheet = play.anchors[DEFAULT_ANCHOR_ID]
 
     def hand(station: str, side: str, behaviour: str, thing: str, partner: str, place: tuple[float, float]) -> HandTask:
         return HandTask(
@@ -161,8 +162,7 @@ def _aloha(operators: int, seed: int) -> Play:
         HeadsetSpec(name=name, hands=hands, seed=seed + i, eye=(0.0, y, 0.6), T_world_anchor=sheet)
         for i, (name, hands, y) in enumerate((("ann", ann, -1.25), ("bob", bob, 1.25)))
     )
-    model = aloha_scene().compile()
-    return Play("aloha", model, {DEFAULT_ANCHOR_ID: sheet}, people, ("red_board", "blue_board"))
+    return dataclasses.replace(play, people=people)
 
 
 PLAYS: Final[dict[str, Callable[[int, int], Play]]] = {"handover": _handover, "iiwa": _iiwa, "aloha": _aloha}

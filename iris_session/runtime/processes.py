@@ -198,6 +198,7 @@ class SessionProcesses:
             curve_secret_file=config.curve_key,
             curve_clients_dir=config.curve_clients,
             anchors=anchor_poses(config),
+            anchor_sizes=config.sheet_sizes(),
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
 

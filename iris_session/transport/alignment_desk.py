@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
@@ -17,24 +20,29 @@ _UNSOLVABLE = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 class AlignmentDesk:
     """Observations in, proposals out: when something new was observed, and at most one per `period_ns`."""
 
-    def __init__(self, anchors: dict[str, PoseTuple], period_ns: int) -> None:
+    def __init__(
+        self, anchors: dict[str, PoseTuple], period_ns: int, sizes: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        """`anchors`: `T_world_anchor`. `sizes`: edge of the printed sheets [m], of those whose size is known."""
         self._anchors = anchors
         self._period_ns = period_ns
-        self._estimator = AlignmentEstimator(anchors)
+        self._estimator = AlignmentEstimator(anchors, sizes=sizes)
         self._next_ns = 0
-        self._pending = False  # something of use came since the last estimate
+        self._pending = False  # something that changes the estimate, or what is told, came since the last one
         self._unknown: tuple[str, int] | None = None  # anchor and tracking epoch, to be told
         self._told: tuple[str, int] | None = None
         self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
 
     def observe(self, observation: Observation) -> bool:
-        """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform)."""
+        """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform, a
+        sheet of another size than configured)."""
         if observation.anchor_id not in self._anchors:
             unknown = (observation.anchor_id, observation.tracking_epoch)
             if unknown != self._told:
                 self._unknown = unknown
             return False
         pose = observation.T_tracking_anchor
+        misprints = self._estimator.wrong_size
         try:
             used = self._estimator.add(
                 observation.anchor_id,
@@ -48,7 +56,8 @@ class AlignmentDesk:
             )
         except _UNSOLVABLE:
             return False
-        self._pending = self._pending or used
+        # A sheet of the wrong size is of no use, but it is to be told.
+        self._pending = self._pending or used or self._estimator.wrong_size > misprints
         return used
 
     def due(self, now_ns: int) -> bool:

@@ -101,6 +101,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     curve_secret_file: str = ""
     curve_clients_dir: str = ""
     anchors: dict[str, Pose] = {}
+    anchor_sizes: dict[str, float] = {}
     forward_observations: bool = False
     recorder_endpoint: str = ""
 

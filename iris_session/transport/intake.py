@@ -269,7 +269,9 @@ class Intake:
     def _observe(self, connection: Connection, observation: Observation) -> None:
         desk = self.desks.get(connection.number)
         if desk is None:
-            desk = self.desks[connection.number] = AlignmentDesk(self._anchors, self._config.proposal_period_ns)
+            desk = self.desks[connection.number] = AlignmentDesk(
+                self._anchors, self._config.proposal_period_ns, self._config.anchor_sizes
+            )
         if not desk.observe(observation):
             self._drops.count("observation_unusable", connection.number)
 

@@ -65,11 +65,22 @@ def test_defaults_listen_on_loopback_only() -> None:
         ({"anchors": {"a": ((0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}}, "must be T_world_anchor as"),
         ({"anchors": {"a": ((0.0, 0.0, math.nan), (1.0, 0.0, 0.0, 0.0))}}, "not finite"),
         ({"anchors": {"a": ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))}}, "has length 1.41, it must be 1"),
+        ({"anchor_sizes": {"b": 0.16}}, "no anchor 'b': 'table'"),
+        ({"anchor_sizes": {"table": 160}}, "160 is not the edge of a printed sheet in metres"),
+        ({"anchor_sizes": {"table": "16 cm"}}, "not the edge"),
     ],
 )
 def test_wrong_types_and_anchors_say_what_is_right(fields: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         SessionConfig(**fields)
+
+
+def test_the_size_of_the_default_sheet_is_known_and_that_of_others_when_it_is_given() -> None:
+    door = {"door": ((1.2, 0.0, 0.4), (1.0, 0.0, 0.0, 0.0))}
+    assert SessionConfig().sheet_sizes() == {"table": 0.16}
+    assert SessionConfig(anchor_sizes={"table": 0.2}).sheet_sizes() == {"table": 0.2}
+    assert SessionConfig(anchors=door).sheet_sizes() == {}
+    assert SessionConfig(anchors=door, anchor_sizes={"door": 1}).sheet_sizes() == {"door": 1.0}
 
 
 def test_what_is_no_scene_says_what_is_right() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,6 +21,22 @@ ANCHORS: dict[str, PoseTuple] = {"table": ((1.0, 2.0, 0.8), IDENTITY_POSE[1])}
 
 def seen(i: int = 0, anchor: str = "table", epoch: int = 1, pose: Pose = IDENTITY) -> Observation:
     return Observation(anchor, "qr", pose, i, epoch, viewpoint_id=i)
+
+
+def test_a_misprinted_sheet_is_told_though_none_of_its_observations_is_used() -> None:
+    desk = AlignmentDesk(ANCHORS, PERIOD, {"table": 0.16})
+    for i in range(20):
+        assert not desk.observe(msgspec.structs.replace(seen(i), size_m=0.2))
+    assert desk.due(0)
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert proposal.refused
+    assert "measures 200 mm, not 160 mm" in proposal.advice
+    for i in range(20, 40):
+        assert desk.observe(msgspec.structs.replace(seen(i), size_m=0.161))
+    proposal = desk.propose(PERIOD)
+    assert proposal is not None
+    assert not proposal.refused
 
 
 def test_too_few_observations_are_refused_with_advice_once() -> None:

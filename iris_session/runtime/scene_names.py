@@ -1,0 +1,14 @@
+"""The scenes that can be named, for help texts: nothing heavy is imported. How they are made is in `scenes`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+SCENE_NAMES: Final = {
+    "handover": "two arms, a hammer, a board",
+    "arm": "one arm",
+    "arms": "eight arms around a table; arms1 to arms12 for another number",
+    "iiwa": "two KUKA iiwa 14 around a table; iiwa1 to iiwa8 for another number",
+    "aloha": "two ALOHA stations face to face, four arms",
+    "bodies": "300 bodies that fly about, no robot",
+}
