@@ -22,11 +22,13 @@ from iris_session.protocol.limits import (
     MAX_BEACON_BYTES,
     MAX_CLIENT_BYTES,
     MAX_INTRODUCTION_BYTES,
+    MAX_MEDIA_HEADER_BYTES,
     MAX_PRESENCE_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
 )
+from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
     EventKind,
@@ -100,6 +102,8 @@ _state_header: Final = msgspec.msgpack.Decoder(StateHeader)
 _presence: Final = msgspec.msgpack.Decoder(Presence)
 _beacon: Final = msgspec.msgpack.Decoder(Beacon)
 _introduction: Final = msgspec.msgpack.Decoder(Introduction)
+_media_header: Final = msgspec.msgpack.Decoder(MediaHeader)
+_media_push: Final = msgspec.msgpack.Decoder(MediaPush)
 
 #: Bytes of the length before an introduction.
 INTRODUCTION_PREFIX: Final = 4
@@ -171,6 +175,26 @@ def encode_presence(presence: Presence) -> bytes:
 def decode_presence(data: Bytes) -> Presence:
     """Inverse of `encode_presence`. Raises `TooLargeError` or `MalformedError`."""
     return _decode("presence", _presence, data, MAX_PRESENCE_BYTES)
+
+
+def encode_media_header(header: MediaHeader) -> bytes:
+    """Second frame of a media message, after the topic."""
+    return _encoder.encode(header)
+
+
+def decode_media_header(data: Bytes) -> MediaHeader:
+    """Inverse of `encode_media_header`. Raises `TooLargeError` or `MalformedError`."""
+    return _decode("media header", _media_header, data, MAX_MEDIA_HEADER_BYTES)
+
+
+def encode_media_push(push: MediaPush) -> bytes:
+    """First frame of what a source hands in."""
+    return _encoder.encode(push)
+
+
+def decode_media_push(data: Bytes) -> MediaPush:
+    """Inverse of `encode_media_push`. Raises `TooLargeError` or `MalformedError`."""
+    return _decode("media push", _media_push, data, MAX_MEDIA_HEADER_BYTES)
 
 
 def encode_beacon(beacon: Beacon) -> bytes:

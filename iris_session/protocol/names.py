@@ -263,6 +263,12 @@ class BudgetClass:
     NONE: Final = "none"
 
 
+class MediaEncoding:
+    """What the bytes of a media frame are."""
+
+    BYTES: Final = "bytes"  # only source and receiver know
+
+
 class LateCause:
     """Where the time of a late tick went."""
 

@@ -30,12 +30,13 @@ from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
 class Endpoints(msgspec.Struct, frozen=True):
-    """Ports of the other channels on the host that the client already talks to."""
+    """Ports of the other channels on the host that the client already talks to. `media_ingest`: for media sources."""
 
     state: Count = 0
     media: Count = 0
     assets: Count = 0
     web: Count = 0
+    media_ingest: Count = 0
 
 
 class Welcome(Message, frozen=True, tag="welcome"):

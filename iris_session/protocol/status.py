@@ -10,6 +10,7 @@ from collections.abc import Iterable
 import msgspec
 
 from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Text
+from iris_session.protocol.media import StreamBudget
 
 
 class GetStatus(Message, frozen=True, tag="get_status"):
@@ -23,7 +24,8 @@ class ClientReport(Message, frozen=True, tag="client_report"):
 
     Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
     `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
-    `media_bytes_per_s`, `media_age_ms`: of the media channel. `display_hz`: frames drawn, 0 when nothing is.
+    `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
+    nothing is. `media_limit_mbit_per_s`: the client wants no more media than that, 0 for no limit of its own.
     """
 
     age_ms_p50: float
@@ -35,17 +37,21 @@ class ClientReport(Message, frozen=True, tag="client_report"):
     media_bytes_per_s: float = 0.0
     media_age_ms: float = 0.0
     display_hz: float = 0.0
+    media_limit_mbit_per_s: float = 0.0
 
 
 class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
-    """What media this client gets from now on: subscribe to topics of `budget_class` (`BudgetClass`) only.
+    """What media this client gets from now on. Sent after `Welcome`, and whenever it changes.
 
-    State and control are never cut. `mbit_per_s`: bound of all media together, 0 for none stated.
+    `budget_class`: the lowest class among the streams that it subscribed to. State and control are never cut.
+    `mbit_per_s`: bound of all media together, 0 for none. `reason`: why it is not everything. `streams`: every stream
+    that there is.
     """
 
     budget_class: Name
     mbit_per_s: float = 0.0
     reason: Text = ""
+    streams: tuple[StreamBudget, ...] = ()
 
 
 class Quantiles(msgspec.Struct, frozen=True, array_like=True):
@@ -71,6 +77,8 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
     `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
     `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
+    `media`: the streams that it subscribed to, `budget_class` the lowest of theirs, empty without one.
+    `media_bytes_per_s`: sent to it, `media_drops`: frames that its link did not take in time, since it joined.
     """
 
     id: Name
@@ -99,6 +107,9 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     drops: Count = 0
     reported: bool = False
     lost: Name = ""
+    media: tuple[StreamBudget, ...] = ()
+    media_bytes_per_s: float = 0.0
+    media_drops: Count = 0
 
 
 class RobotReport(msgspec.Struct, frozen=True):
@@ -125,6 +136,17 @@ class RecorderReport(msgspec.Struct, frozen=True):
     lost_rows: Count = 0
     spilled_bytes: Count = 0
     text: Text = ""
+
+
+class MediaStreamReport(msgspec.Struct, frozen=True):
+    """One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
+    `subscribers`: participants who want it."""
+
+    stream: Name
+    hz: float = 0.0
+    mbit_per_s: float = 0.0
+    source: Name = ""
+    subscribers: Count = 0
 
 
 class StatusReport(Message, frozen=True, tag="status_report"):
@@ -166,3 +188,4 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     entries_per_s: float = 0.0
     warnings: tuple[Text, ...] = ()
     authority_silent_ns: Nanoseconds = -1
+    media: tuple[MediaStreamReport, ...] = ()

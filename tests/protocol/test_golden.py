@@ -18,6 +18,7 @@ from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.generate import rigid_reference
 from iris_session.protocol.generate.conversions import from_three, from_unity, to_three, to_unity
+from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from tests.streams.poses import random_poses
@@ -30,6 +31,8 @@ CODECS: dict[str, tuple[Any, Any, Any]] = {
     "server": (ServerEnvelope, codec.encode_server, codec.decode_server),
     "state_header": (StateHeader, codec.encode_state_header, codec.decode_state_header),
     "presence": (Presence, codec.encode_presence, codec.decode_presence),
+    "media_header": (MediaHeader, codec.encode_media_header, codec.decode_media_header),
+    "media_push": (MediaPush, codec.encode_media_push, codec.decode_media_push),
     "beacon": (Beacon, codec.encode_beacon, lambda data: msgspec.msgpack.decode(data, type=Beacon)),
 }
 

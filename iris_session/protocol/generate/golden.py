@@ -19,6 +19,7 @@ from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sa
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.generate import conversions, rigid_reference
 from iris_session.protocol.generate.examples import extreme, full, least
+from iris_session.protocol.media import MediaHeader, MediaPush
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import (
     Event,
@@ -38,6 +39,8 @@ def golden() -> str:
         "server": [*_messages("server", codec.SERVER_TYPES.values()), *_events()],
         "state_header": list(_values("state_header", StateHeader)),
         "presence": list(_values("presence", Presence)),
+        "media_header": list(_values("media_header", MediaHeader)),
+        "media_push": list(_values("media_push", MediaPush)),
         "beacon": list(_values("beacon", Beacon)),
         "decode_only": list(_decode_only()),
         "malformed": list(_malformed()),

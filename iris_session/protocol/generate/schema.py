@@ -13,7 +13,7 @@ from typing import Any, Final, get_args
 
 import msgspec
 
-from iris_session.protocol import client_messages, common, discovery, names, server_messages, status
+from iris_session.protocol import client_messages, common, discovery, media, names, server_messages, status
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,11 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.RobotInfo,
         server_messages.BodyInfo,
         status.Quantiles,
+        media.StreamBudget,
         status.ParticipantReport,
         status.RobotReport,
         status.RecorderReport,
+        status.MediaStreamReport,
     ),
     "client": UNIONS["ClientMessage"],
     "server": UNIONS["ServerMessage"],
@@ -91,6 +93,8 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.StateHeader,
         server_messages.PresenceItem,
         server_messages.Presence,
+        media.MediaHeader,
+        media.MediaPush,
         discovery.Beacon,
         discovery.Introduction,
     ),
@@ -131,6 +135,11 @@ _ENUMS: Final[dict[str, str]] = {
     "Paired.roles": "Role",
     "Audited.kind": "AuditKind",
     "DeliveryBudget.budget_class": "BudgetClass",
+    "StreamBudget.budget_class": "BudgetClass",
+    "MediaHeader.budget_class": "BudgetClass",
+    "MediaHeader.encoding": "MediaEncoding",
+    "MediaPush.classes": "BudgetClass",
+    "MediaPush.encoding": "MediaEncoding",
     "ParticipantReport.role": "Role",
     "ParticipantReport.alignment": "AlignmentKind",
     "ParticipantReport.budget_class": "BudgetClass",

@@ -94,6 +94,8 @@ def _limits() -> str:
     for name, size in (
         ("state header", limits.MAX_STATE_HEADER_BYTES),
         ("presence", limits.MAX_PRESENCE_BYTES),
+        ("media header", limits.MAX_MEDIA_HEADER_BYTES),
+        ("media frame", limits.MAX_MEDIA_FRAME_BYTES),
         ("beacon", limits.MAX_BEACON_BYTES),
     ):
         lines.append(f"| {name} | client | {size:,} | - | - |")

@@ -300,6 +300,14 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// What the bytes of a media frame are.
+    /// </summary>
+    public static class MediaEncoding
+    {
+        public const string Bytes = "bytes";
+    }
+
+    /// <summary>
     /// Where the time of a late tick went.
     /// </summary>
     public static class LateCause
@@ -1122,7 +1130,7 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// Ports of the other channels on the host that the client already talks to.
+    /// Ports of the other channels on the host that the client already talks to. media_ingest: for media sources.
     /// </summary>
     public sealed class Endpoints : WireValue
     {
@@ -1130,6 +1138,7 @@ namespace IrisSession.Protocol
         public long Media = 0;
         public long Assets = 0;
         public long Web = 0;
+        public long MediaIngest = 0;
 
         public static Endpoints Read(WireReader reader)
         {
@@ -1142,6 +1151,7 @@ namespace IrisSession.Protocol
                     case "media": value.Media = reader.ReadLong(); break;
                     case "assets": value.Assets = reader.ReadLong(); break;
                     case "web": value.Web = reader.ReadLong(); break;
+                    case "media_ingest": value.MediaIngest = reader.ReadLong(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1150,7 +1160,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("state");
             writer.Write(State);
             writer.Write("media");
@@ -1159,6 +1169,8 @@ namespace IrisSession.Protocol
             writer.Write(Assets);
             writer.Write("web");
             writer.Write(Web);
+            writer.Write("media_ingest");
+            writer.Write(MediaIngest);
         }
     }
 
@@ -1333,12 +1345,53 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// One media stream, and what a client gets of it. mbit_per_s: of that class, as measured.
+    /// </summary>
+    public sealed class StreamBudget : WireValue
+    {
+        public string Stream = "";
+        public string BudgetClass = "full";
+        public double MbitPerS = 0.0;
+
+        public static StreamBudget Read(WireReader reader)
+        {
+            StreamBudget value = new StreamBudget();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "stream": value.Stream = reader.ReadString(); seen |= 1u; break;
+                    case "budget_class": value.BudgetClass = reader.ReadString(); break;
+                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of StreamBudget");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("stream");
+            writer.Write(Stream);
+            writer.Write("budget_class");
+            writer.Write(BudgetClass);
+            writer.Write("mbit_per_s");
+            writer.Write(MbitPerS);
+        }
+    }
+
+    /// <summary>
     /// One participant, as the session sees it. Times in *_ns are durations until now, -1 for never.
     ///
     /// capture_to_receive: device to front. state_age: end of tick to application, as its client reports it.
     /// alignment_void_ns: since the tracking frame jumped and voided the alignment, -1 for not so.
     /// lost: why the front lost its connection (silent, closed, slow, ...), empty while connected.
     /// rejected: samples by reason, drops: messages thrown away, both since it joined. reported: its client reports.
+    /// media: the streams that it subscribed to, budget_class the lowest of theirs, empty without one.
+    /// media_bytes_per_s: sent to it, media_drops: frames that its link did not take in time, since it joined.
     /// </summary>
     public sealed class ParticipantReport : WireValue
     {
@@ -1368,6 +1421,9 @@ namespace IrisSession.Protocol
         public long Drops = 0;
         public bool Reported = false;
         public string Lost = "";
+        public StreamBudget[] Media = new StreamBudget[0];
+        public double MediaBytesPerS = 0.0;
+        public long MediaDrops = 0;
 
         public static ParticipantReport Read(WireReader reader)
         {
@@ -1403,6 +1459,9 @@ namespace IrisSession.Protocol
                     case "drops": value.Drops = reader.ReadLong(); break;
                     case "reported": value.Reported = reader.ReadBool(); break;
                     case "lost": value.Lost = reader.ReadString(); break;
+                    case "media": value.Media = reader.ReadArray(Protocol.StreamBudget.Read); break;
+                    case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
+                    case "media_drops": value.MediaDrops = reader.ReadLong(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1412,7 +1471,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(26);
+            writer.WriteMapHeader(29);
             writer.Write("id");
             writer.Write(Id);
             writer.Write("name");
@@ -1465,6 +1524,12 @@ namespace IrisSession.Protocol
             writer.Write(Reported);
             writer.Write("lost");
             writer.Write(Lost);
+            writer.Write("media");
+            writer.Write(Media);
+            writer.Write("media_bytes_per_s");
+            writer.Write(MediaBytesPerS);
+            writer.Write("media_drops");
+            writer.Write(MediaDrops);
         }
     }
 
@@ -1578,6 +1643,54 @@ namespace IrisSession.Protocol
             writer.Write(SpilledBytes);
             writer.Write("text");
             writer.Write(Text);
+        }
+    }
+
+    /// <summary>
+    /// One media stream, at its best class. source: its publisher's name, empty for the session's own process.
+    /// subscribers: participants who want it.
+    /// </summary>
+    public sealed class MediaStreamReport : WireValue
+    {
+        public string Stream = "";
+        public double Hz = 0.0;
+        public double MbitPerS = 0.0;
+        public string Source = "";
+        public long Subscribers = 0;
+
+        public static MediaStreamReport Read(WireReader reader)
+        {
+            MediaStreamReport value = new MediaStreamReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "stream": value.Stream = reader.ReadString(); seen |= 1u; break;
+                    case "hz": value.Hz = reader.ReadDouble(); break;
+                    case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
+                    case "source": value.Source = reader.ReadString(); break;
+                    case "subscribers": value.Subscribers = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 1u) != 1u) throw new WireException("missing field of MediaStreamReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(5);
+            writer.Write("stream");
+            writer.Write(Stream);
+            writer.Write("hz");
+            writer.Write(Hz);
+            writer.Write("mbit_per_s");
+            writer.Write(MbitPerS);
+            writer.Write("source");
+            writer.Write(Source);
+            writer.Write("subscribers");
+            writer.Write(Subscribers);
         }
     }
 
@@ -2711,7 +2824,8 @@ namespace IrisSession.Protocol
     ///
     /// Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
     /// missed: frames that were sent (by state_seq) and not delivered. rtt_ms: lowest round trip of late.
-    /// media_bytes_per_s, media_age_ms: of the media channel. display_hz: frames drawn, 0 when nothing is.
+    /// media_bytes_per_s, media_age_ms (median since capture): of the media channel. display_hz: frames drawn, 0 when
+    /// nothing is. media_limit_mbit_per_s: the client wants no more media than that, 0 for no limit of its own.
     /// </summary>
     public sealed class ClientReport : ClientMessage
     {
@@ -2726,6 +2840,7 @@ namespace IrisSession.Protocol
         public double MediaBytesPerS = 0.0;
         public double MediaAgeMs = 0.0;
         public double DisplayHz = 0.0;
+        public double MediaLimitMbitPerS = 0.0;
 
         public static ClientReport Read(WireReader reader)
         {
@@ -2744,6 +2859,7 @@ namespace IrisSession.Protocol
                     case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
                     case "media_age_ms": value.MediaAgeMs = reader.ReadDouble(); break;
                     case "display_hz": value.DisplayHz = reader.ReadDouble(); break;
+                    case "media_limit_mbit_per_s": value.MediaLimitMbitPerS = reader.ReadDouble(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -2753,7 +2869,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(10);
+            writer.WriteMapHeader(11);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("age_ms_p50");
@@ -2774,6 +2890,8 @@ namespace IrisSession.Protocol
             writer.Write(MediaAgeMs);
             writer.Write("display_hz");
             writer.Write(DisplayHz);
+            writer.Write("media_limit_mbit_per_s");
+            writer.Write(MediaLimitMbitPerS);
         }
     }
 
@@ -3334,6 +3452,7 @@ namespace IrisSession.Protocol
         public double EntriesPerS = 0.0;
         public string[] Warnings = new string[0];
         public long AuthoritySilentNs = -1;
+        public MediaStreamReport[] Media = new MediaStreamReport[0];
 
         public static StatusReport Read(WireReader reader)
         {
@@ -3371,6 +3490,7 @@ namespace IrisSession.Protocol
                     case "entries_per_s": value.EntriesPerS = reader.ReadDouble(); break;
                     case "warnings": value.Warnings = reader.ReadStrings(); break;
                     case "authority_silent_ns": value.AuthoritySilentNs = reader.ReadLong(); break;
+                    case "media": value.Media = reader.ReadArray(Protocol.MediaStreamReport.Read); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3380,7 +3500,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(29);
+            writer.WriteMapHeader(30);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -3439,13 +3559,17 @@ namespace IrisSession.Protocol
             writer.Write(Warnings);
             writer.Write("authority_silent_ns");
             writer.Write(AuthoritySilentNs);
+            writer.Write("media");
+            writer.Write(Media);
         }
     }
 
     /// <summary>
-    /// What media this client gets from now on: subscribe to topics of budget_class (BudgetClass) only.
+    /// What media this client gets from now on. Sent after Welcome, and whenever it changes.
     ///
-    /// State and control are never cut. mbit_per_s: bound of all media together, 0 for none stated.
+    /// budget_class: the lowest class among the streams that it subscribed to. State and control are never cut.
+    /// mbit_per_s: bound of all media together, 0 for none. reason: why it is not everything. streams: every stream
+    /// that there is.
     /// </summary>
     public sealed class DeliveryBudget : ServerMessage
     {
@@ -3454,6 +3578,7 @@ namespace IrisSession.Protocol
         public string BudgetClass = "";
         public double MbitPerS = 0.0;
         public string Reason = "";
+        public StreamBudget[] Streams = new StreamBudget[0];
 
         public static DeliveryBudget Read(WireReader reader)
         {
@@ -3466,6 +3591,7 @@ namespace IrisSession.Protocol
                     case "budget_class": value.BudgetClass = reader.ReadString(); seen |= 1u; break;
                     case "mbit_per_s": value.MbitPerS = reader.ReadDouble(); break;
                     case "reason": value.Reason = reader.ReadString(); break;
+                    case "streams": value.Streams = reader.ReadArray(Protocol.StreamBudget.Read); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3475,7 +3601,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("budget_class");
@@ -3484,6 +3610,8 @@ namespace IrisSession.Protocol
             writer.Write(MbitPerS);
             writer.Write("reason");
             writer.Write(Reason);
+            writer.Write("streams");
+            writer.Write(Streams);
         }
     }
 
@@ -4528,6 +4656,93 @@ namespace IrisSession.Protocol
             writer.Write(SessionTime);
             writer.Write(PublishedNs);
             writer.Write(Items);
+        }
+    }
+
+    /// <summary>
+    /// Second frame of a media message: topic before it, one bulk frame after it.
+    ///
+    /// seq: of the stream, as its source handed it in; at half and quarter some are left out. capture_ns: when it
+    /// was captured or computed, published_ns: when it was handed to the socket, both session time. dropped: frames of
+    /// this subscriber that its link did not take before newer ones were there, since it subscribed.
+    /// </summary>
+    public sealed class MediaHeader : WireValue
+    {
+        public string Stream = "";
+        public string BudgetClass = "";
+        public long SceneEpoch = 0;
+        public long Seq = 0;
+        public long CaptureNs = 0;
+        public long PublishedNs = 0;
+        public string Encoding = "bytes";
+        public long Dropped = 0;
+
+        public static MediaHeader Read(WireReader reader)
+        {
+            MediaHeader value = new MediaHeader();
+            int n = reader.ReadArrayHeader();
+            if (n < 6) throw new WireException("MediaHeader of " + n + " elements, expected 6");
+            value.Stream = reader.ReadString();
+            value.BudgetClass = reader.ReadString();
+            value.SceneEpoch = reader.ReadLong();
+            value.Seq = reader.ReadLong();
+            value.CaptureNs = reader.ReadLong();
+            value.PublishedNs = reader.ReadLong();
+            if (n > 6) value.Encoding = reader.ReadString();
+            if (n > 7) value.Dropped = reader.ReadLong();
+            for (int i = 8; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(8);
+            writer.Write(Stream);
+            writer.Write(BudgetClass);
+            writer.Write(SceneEpoch);
+            writer.Write(Seq);
+            writer.Write(CaptureNs);
+            writer.Write(PublishedNs);
+            writer.Write(Encoding);
+            writer.Write(Dropped);
+        }
+    }
+
+    /// <summary>
+    /// First frame of what a source hands in; a bulk frame for each of classes follows, in their order.
+    ///
+    /// classes: full, and any of half and quarter that the source has in a coarser form.
+    /// </summary>
+    public sealed class MediaPush : WireValue
+    {
+        public string Stream = "";
+        public long SceneEpoch = 0;
+        public long CaptureNs = 0;
+        public string[] Classes = new string[] { "full" };
+        public string Encoding = "bytes";
+
+        public static MediaPush Read(WireReader reader)
+        {
+            MediaPush value = new MediaPush();
+            int n = reader.ReadArrayHeader();
+            if (n < 3) throw new WireException("MediaPush of " + n + " elements, expected 3");
+            value.Stream = reader.ReadString();
+            value.SceneEpoch = reader.ReadLong();
+            value.CaptureNs = reader.ReadLong();
+            if (n > 3) value.Classes = reader.ReadStrings();
+            if (n > 4) value.Encoding = reader.ReadString();
+            for (int i = 5; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(5);
+            writer.Write(Stream);
+            writer.Write(SceneEpoch);
+            writer.Write(CaptureNs);
+            writer.Write(Classes);
+            writer.Write(Encoding);
         }
     }
 

@@ -247,6 +247,12 @@ export const BudgetClass = {
 } as const;
 export type BudgetClass = (typeof BudgetClass)[keyof typeof BudgetClass] | (string & {});
 
+/** What the bytes of a media frame are. */
+export const MediaEncoding = {
+  BYTES: "bytes",
+} as const;
+export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
+
 /** Where the time of a late tick went. */
 export const LateCause = {
   SCHEDULER: "scheduler",
@@ -336,12 +342,13 @@ export type Applied = [
   step_ns: number,
 ];
 
-/** Ports of the other channels on the host that the client already talks to. */
+/** Ports of the other channels on the host that the client already talks to. `media_ingest`: for media sources. */
 export interface Endpoints {
   state?: number;
   media?: number;
   assets?: number;
   web?: number;
+  media_ingest?: number;
 }
 
 /** One row of the roster. */
@@ -380,6 +387,13 @@ export type Quantiles = [
   p99: number,
 ];
 
+/** One media stream, and what a client gets of it. `mbit_per_s`: of that class, as measured. */
+export interface StreamBudget {
+  stream: string;
+  budget_class?: BudgetClass;
+  mbit_per_s?: number;
+}
+
 /**
  * One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
  *
@@ -387,6 +401,8 @@ export type Quantiles = [
  * `alignment_void_ns`: since the tracking frame jumped and voided the alignment, -1 for not so.
  * `lost`: why the front lost its connection (`silent`, `closed`, `slow`, ...), empty while connected.
  * `rejected`: samples by reason, `drops`: messages thrown away, both since it joined. `reported`: its client reports.
+ * `media`: the streams that it subscribed to, `budget_class` the lowest of theirs, empty without one.
+ * `media_bytes_per_s`: sent to it, `media_drops`: frames that its link did not take in time, since it joined.
  */
 export interface ParticipantReport {
   id: string;
@@ -415,6 +431,9 @@ export interface ParticipantReport {
   drops?: number;
   reported?: boolean;
   lost?: string;
+  media?: StreamBudget[];
+  media_bytes_per_s?: number;
+  media_drops?: number;
 }
 
 /** One robot: who has it, what it does, and why it holds. */
@@ -441,6 +460,18 @@ export interface RecorderReport {
   lost_rows?: number;
   spilled_bytes?: number;
   text?: string;
+}
+
+/**
+ * One media stream, at its best class. `source`: its publisher's name, empty for the session's own process.
+ * `subscribers`: participants who want it.
+ */
+export interface MediaStreamReport {
+  stream: string;
+  hz?: number;
+  mbit_per_s?: number;
+  source?: string;
+  subscribers?: number;
 }
 
 /**
@@ -690,7 +721,8 @@ export interface GetStatus {
  *
  * Ages are from the end of the tick to the application, by the client's clock estimate [ms], over the last second.
  * `missed`: frames that were sent (by `state_seq`) and not delivered. `rtt_ms`: lowest round trip of late.
- * `media_bytes_per_s`, `media_age_ms`: of the media channel. `display_hz`: frames drawn, 0 when nothing is.
+ * `media_bytes_per_s`, `media_age_ms` (median since capture): of the media channel. `display_hz`: frames drawn, 0 when
+ * nothing is. `media_limit_mbit_per_s`: the client wants no more media than that, 0 for no limit of its own.
  */
 export interface ClientReport {
   type: "client_report";
@@ -703,6 +735,7 @@ export interface ClientReport {
   media_bytes_per_s?: number;
   media_age_ms?: number;
   display_hz?: number;
+  media_limit_mbit_per_s?: number;
 }
 
 /** Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once. */
@@ -866,18 +899,22 @@ export interface StatusReport {
   entries_per_s?: number;
   warnings?: string[];
   authority_silent_ns?: number;
+  media?: MediaStreamReport[];
 }
 
 /**
- * What media this client gets from now on: subscribe to topics of `budget_class` (`BudgetClass`) only.
+ * What media this client gets from now on. Sent after `Welcome`, and whenever it changes.
  *
- * State and control are never cut. `mbit_per_s`: bound of all media together, 0 for none stated.
+ * `budget_class`: the lowest class among the streams that it subscribed to. State and control are never cut.
+ * `mbit_per_s`: bound of all media together, 0 for none. `reason`: why it is not everything. `streams`: every stream
+ * that there is.
  */
 export interface DeliveryBudget {
   type: "delivery_budget";
   budget_class: BudgetClass;
   mbit_per_s?: number;
   reason?: string;
+  streams?: StreamBudget[];
 }
 
 export interface ParticipantJoined {
@@ -1098,6 +1135,37 @@ export type Presence = [
   items: PresenceItem[],
 ];
 
+/**
+ * Second frame of a media message: topic before it, one bulk frame after it.
+ *
+ * `seq`: of the stream, as its source handed it in; at `half` and `quarter` some are left out. `capture_ns`: when it
+ * was captured or computed, `published_ns`: when it was handed to the socket, both session time. `dropped`: frames of
+ * this subscriber that its link did not take before newer ones were there, since it subscribed.
+ */
+export type MediaHeader = [
+  stream: string,
+  budget_class: BudgetClass,
+  scene_epoch: number,
+  seq: number,
+  capture_ns: number,
+  published_ns: number,
+  encoding?: MediaEncoding,
+  dropped?: number,
+];
+
+/**
+ * First frame of what a source hands in; a bulk frame for each of `classes` follows, in their order.
+ *
+ * `classes`: `full`, and any of `half` and `quarter` that the source has in a coarser form.
+ */
+export type MediaPush = [
+  stream: string,
+  scene_epoch: number,
+  capture_ns: number,
+  classes?: BudgetClass[],
+  encoding?: MediaEncoding,
+];
+
 /** UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned. */
 export interface Beacon {
   protocol: number;
@@ -1216,7 +1284,7 @@ export const DEFAULTS = {
   pair: { software: "" },
   remove_participant: { revoke: false, reason: "" },
   get_status: { request_id: 0 },
-  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0 },
+  client_report: { missed: 0, rtt_ms: 0.0, bytes_per_s: 0.0, media_bytes_per_s: 0.0, media_age_ms: 0.0, display_hz: 0.0, media_limit_mbit_per_s: 0.0 },
   welcome: { key_fingerprint: "" },
   refused: { advice: "", supported_versions: [1] },
   protocol_fault: { reason: "" },
@@ -1226,8 +1294,8 @@ export const DEFAULTS = {
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1 },
-  delivery_budget: { mbit_per_s: 0.0, reason: "" },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [] },
+  delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},
   participant_left: { grace: false },

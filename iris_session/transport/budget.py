@@ -1,0 +1,235 @@
+"""How much media each client gets: a class per stream, lowered when its link suffers. Pure: no clock, no sockets.
+
+What suffers first on a crowded link is the age of state, because media and state share one way. So the judge is what
+a client reports of its state, beside what its media connection does not take. Lowering is quick and aims below what
+came through; rising is one step at a time, and after every step that had to be taken back the next waits longer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from iris_session.protocol.media import CLASSES
+
+MILLISECOND: Final = 1_000_000
+SECOND: Final = 1_000_000_000
+#: Index of `BudgetClass.NONE`.
+NOTHING: Final = len(CLASSES) - 1
+
+#: State that is so much older than it was at its best counts as late [ms], and half of that best beside it.
+RISE_MS: Final = 40.0
+#: More frames of state are missed than at best, by this share.
+RISE_MISSED: Final = 0.3
+#: Reports among which the best is looked for: a minute.
+REMEMBERED: Final = 60
+#: Share of due frames that a connection did not take, in two measures in a row, that says that the link is full.
+BLOCKED: Final = 0.25
+#: After a change: what is under way still has to come through, and a report covers the second before it.
+SETTLE_NS: Final = 500 * MILLISECOND
+REPORT_COVERS_NS: Final = 900 * MILLISECOND
+SILENT_NS: Final = 3 * SECOND
+#: Share of what came through that is asked for after it was too much.
+LESS: Final = 0.7
+#: What was asked for may grow by this share before it counts as more than allowed.
+SLACK: Final = 1.15
+#: Distance of steps up. To what has failed it doubles each time, until that works.
+CLIMB_NS: Final = 3 * SECOND
+CLIMB_MAX_NS: Final = 48 * SECOND
+#: Trouble this soon after a step up is blamed on it; without any it has worked.
+PROBE_NS: Final = 3 * SECOND
+#: Without any media, trouble that stays so long has other causes: it is how this link is now.
+RELEARN_NS: Final = 5 * SECOND
+
+#: Bytes per second of every stream at full, half, quarter: what a client would be sent.
+Rates = Mapping[str, Sequence[float]]
+
+
+class Report(NamedTuple):
+    """What a client says of its state. `age_ms`: median, 0 when none came."""
+
+    age_ms: float
+    missed_share: float
+
+
+class Measure(NamedTuple):
+    """One look at a client. `report`: its newest, `None` without a new one since the last look. `taken`, `due`: media
+    frames that its connection took, of those that were due, since then. `limit`: bytes per second that it wants at
+    most, 0 for no limit."""
+
+    report: Report | None
+    taken: int = 0
+    due: int = 0
+    limit: float = 0.0
+
+
+class Grant(NamedTuple):
+    """`levels`: index into `CLASSES` by stream. `bytes_per_s`: bound of all together, 0 for none."""
+
+    levels: dict[str, int]
+    bytes_per_s: float = 0.0
+    reason: str = ""
+
+
+def cost(rates: Rates, levels: Mapping[str, int]) -> float:
+    """Bytes per second of all streams at these levels. A coarser class never counts more than a finer one."""
+    return sum(_rate(rates[stream], levels.get(stream, 0)) for stream in sorted(rates))
+
+
+def ladder(rates: Rates) -> list[dict[str, int]]:
+    """From everything to nothing: each step lowers the stream that costs the most."""
+    levels = dict.fromkeys(sorted(rates), 0)
+    steps = [dict(levels)]
+    while any(level < NOTHING for level in levels.values()):
+        lowest = max(
+            (stream for stream in levels if levels[stream] < NOTHING),
+            key=lambda stream: (_rate(rates[stream], levels[stream]), -levels[stream], stream),
+        )
+        levels[lowest] += 1
+        steps.append(dict(levels))
+    return steps
+
+
+def fit(rates: Rates, bytes_per_s: float) -> dict[str, int]:
+    """The first rung of the ladder that costs no more than that; nothing at all for no budget."""
+    steps = ladder(rates)
+    if bytes_per_s <= 0.0:
+        return steps[-1]
+    return next(levels for levels in steps if cost(rates, levels) <= bytes_per_s)
+
+
+def _rate(rates: Sequence[float], level: int) -> float:
+    return 0.0 if level >= NOTHING else min(rates[: level + 1])
+
+
+class _Line:
+    """What is remembered of one client."""
+
+    def __init__(self) -> None:
+        self.levels: dict[str, int] = {}
+        self.budget = math.inf
+        self.reason = ""
+        self.ages: deque[float] = deque(maxlen=REMEMBERED)
+        self.missed: deque[float] = deque(maxlen=REMEMBERED)
+        self.reported_ns = -1
+        self.late = ""  # what the newest report says against us
+        self.blocked = 0  # measures in a row
+        self.sent = 1.0  # share of what was due that was taken lately
+        self.changed_ns = self.climbed_ns = self.troubled_ns = -SILENT_NS
+        self.climb_ns = CLIMB_NS
+        self.failed = math.inf  # what a step up cost that had to be taken back
+        self.innocent_ns = -1  # since when there is trouble without any media
+
+
+class BudgetController:
+    """All clients of a session. `update` is called a few times a second for each."""
+
+    def __init__(self) -> None:
+        self._lines: dict[int, _Line] = {}
+
+    def forget(self, client: int) -> None:
+        """A client is gone."""
+        self._lines.pop(client, None)
+
+    def update(self, client: int, measure: Measure, rates: Rates, now_ns: int) -> Grant:
+        """What a client gets of the streams in `rates`, those that it wants. `now_ns` must not go back."""
+        line = self._lines.get(client)
+        if line is None:
+            line = self._lines[client] = _Line()
+        limit = measure.limit or math.inf
+        self._take_streams(line, rates)
+        trouble = self._trouble(line, measure, now_ns)
+        present = cost(rates, line.levels)
+        if trouble:
+            line.troubled_ns = now_ns
+        if trouble and present > 0.0:
+            line.innocent_ns = -1
+            self._lower(line, rates, LESS * present * line.sent, trouble, now_ns)
+        elif trouble:
+            self._not_to_blame(line, now_ns)
+        else:
+            line.innocent_ns = -1
+            self._climb(line, rates, limit, now_ns)
+        allowed = min(line.budget, limit)
+        if cost(rates, line.levels) > SLACK * allowed:
+            line.levels = fit(rates, allowed)
+            line.reason = line.reason if line.budget <= limit else "the client asked for no more"
+        bound = 0.0 if math.isinf(allowed) else allowed
+        return Grant(dict(line.levels), bound, line.reason if bound or any(line.levels.values()) else "")
+
+    # --- what is wrong -----------------------------------------------------------------------------------------------
+
+    def _trouble(self, line: _Line, measure: Measure, now_ns: int) -> str:
+        """Why this client should get less, empty when all is well."""
+        if measure.report is not None:
+            self._judge(line, measure.report, now_ns)
+        if measure.due:
+            share = measure.taken / measure.due
+            line.sent = share
+            line.blocked = line.blocked + 1 if 1.0 - share > BLOCKED else 0
+        if line.reported_ns >= 0 and now_ns - line.reported_ns > SILENT_NS:
+            line.sent = 0.0
+            return "the client has not reported for 3 s"
+        if now_ns - line.changed_ns < SETTLE_NS:
+            return ""
+        if line.blocked >= 2:
+            return "the link does not take all media"
+        return line.late
+
+    def _judge(self, line: _Line, report: Report, now_ns: int) -> None:
+        line.reported_ns = now_ns
+        line.late = ""
+        if now_ns - line.changed_ns >= REPORT_COVERS_NS:
+            best = min(line.ages, default=math.inf)
+            if report.age_ms > 1.5 * best + RISE_MS:
+                line.late = f"state came {report.age_ms:.0f} ms old, {best:.0f} ms at best"
+            elif report.missed_share > min(line.missed, default=1.0) + RISE_MISSED:
+                line.late = f"{100 * report.missed_share:.0f} % of state was missed"
+        if report.age_ms > 0.0:
+            line.ages.append(report.age_ms)
+            line.missed.append(report.missed_share)
+
+    def _not_to_blame(self, line: _Line, now_ns: int) -> None:
+        if line.innocent_ns < 0:
+            line.innocent_ns = now_ns
+        elif now_ns - line.innocent_ns > RELEARN_NS and line.ages:
+            age, missed = line.ages[-1], line.missed[-1]
+            for past, last in ((line.ages, age), (line.missed, missed)):
+                past.clear()
+                past.append(last)
+            line.late, line.innocent_ns = "", -1
+
+    # --- what is done ------------------------------------------------------------------------------------------------
+
+    def _take_streams(self, line: _Line, rates: Rates) -> None:
+        """A stream that is new to this client begins with everything, or with nothing while there is too much."""
+        first = 0 if math.isinf(line.budget) else NOTHING
+        line.levels = {stream: line.levels.get(stream, first) for stream in sorted(rates)}
+
+    def _lower(self, line: _Line, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
+        if now_ns - line.climbed_ns <= PROBE_NS:
+            line.failed = min(line.failed, cost(rates, line.levels))
+            line.climb_ns = min(2 * line.climb_ns, CLIMB_MAX_NS)
+        levels = fit(rates, bytes_per_s)
+        line.levels = {stream: max(level, line.levels[stream]) for stream, level in levels.items()}
+        line.budget, line.reason = bytes_per_s, reason
+        line.changed_ns = now_ns
+        line.blocked, line.late = 0, ""
+
+    def _climb(self, line: _Line, rates: Rates, limit: float, now_ns: int) -> None:
+        calm_ns = now_ns - max(line.changed_ns, line.troubled_ns)
+        present = cost(rates, line.levels)
+        if present >= line.failed and calm_ns > PROBE_NS:
+            line.failed, line.climb_ns = math.inf, CLIMB_NS  # it works now
+        if math.isinf(line.budget) and not any(line.levels.values()):
+            return
+        better = [levels for levels in reversed(ladder(rates)) if cost(rates, levels) > present]
+        wanted = cost(rates, better[0]) if better else present
+        if wanted > limit or calm_ns < (line.climb_ns if wanted >= line.failed else CLIMB_NS):
+            return
+        # Where nothing costs more, what is left to give is given.
+        line.levels = better[0] if better else dict.fromkeys(rates, 0)
+        line.budget = wanted if any(line.levels.values()) else math.inf
+        line.changed_ns = line.climbed_ns = now_ns
