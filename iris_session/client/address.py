@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import binascii
+import ipaddress
+import re
 from dataclasses import dataclass, replace
 from typing import Final
 from urllib.parse import parse_qs, quote, urlsplit
@@ -14,6 +16,10 @@ from iris_session.protocol.pairing import KEY_BYTES, normal_code
 
 DEFAULT_CONTROL_PORT: Final = 7721
 SCHEME: Final = "iris"
+#: One part of a name between its dots. Some networks have underscores in theirs.
+_LABEL: Final = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+_SCOPE: Final = re.compile(r"[A-Za-z0-9._-]{1,32}")
+MAX_NAME: Final = 253
 _EXAMPLE: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
 
 
@@ -49,6 +55,20 @@ def host_port(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
+def is_host(host: str) -> bool:
+    """Whether it can be the name or address of a host. The system's resolver and libzmq raise errors of their own for
+    what cannot."""
+    if ":" in host:
+        address, _, scope = host.partition("%")
+        try:
+            ipaddress.IPv6Address(address)
+        except ValueError:
+            return False
+        return not scope or _SCOPE.fullmatch(scope) is not None
+    labels = host.removesuffix(".").split(".")
+    return len(host) <= MAX_NAME and host[:1] != "_" and all(_LABEL.fullmatch(label) for label in labels)
+
+
 def pairing_uri(host: str, port: int, server_key: str, join_code: str = "", session: str = "") -> str:
     """`iris://HOST:CONTROL/?k=KEY&c=CODE&n=NAME`: what a pairing QR code says. `server_key`: Z85; in the URI its 32 raw
     bytes in base64url without padding."""
@@ -63,7 +83,7 @@ def _from_text(address: str) -> Address:
     host, separator, port = text.rpartition(":")
     if not separator or (text.count(":") > 1 and not text.startswith("[")) or text.endswith("]"):
         host, port = text, str(DEFAULT_CONTROL_PORT)
-    if not host.strip("[]") or not _is_port(port):
+    if not is_host(host.strip("[]")) or not _is_port(port):
         raise ClientError(f"address {address!r} is not HOST:PORT, for example {_EXAMPLE}")
     return Address(host.strip("[]"), int(port))
 

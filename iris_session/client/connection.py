@@ -3,6 +3,7 @@
     IDLE --open()--> JOINING --Welcome--> SYNCING --snapshot and clock--> READY
     JOINING, SYNCING, READY --silence, lost(), session_ended--> WAITING (back-off, none at first) --> JOINING
     JOINING --Refused--> REFUSED (`failure` says why)          any --close()--> CLOSED
+    JOINING --Refused that passes (too many at once)--> WAITING (`put_off` says why)
 
 The shell opens a fresh control socket whenever `generation` changes, passes received frames to `receive`, calls `tick`
 at the latest at `next_deadline_ns`, and sends what `peek_outgoing` shows. All `now_ns` are one monotonic clock.
@@ -17,7 +18,7 @@ import msgspec
 
 from iris_session.client.answers import Answers
 from iris_session.client.clock import ClockSync
-from iris_session.client.errors import ClientError, NotConnectedError
+from iris_session.client.errors import ClientError, NotConnectedError, RefusedError
 from iris_session.client.identity import Identity
 from iris_session.client.limits import (
     BACKOFF_MAX_NS,
@@ -52,6 +53,7 @@ from iris_session.protocol.server_messages import (
     Event,
     Feedback,
     ProtocolFault,
+    Refused,
     Reply,
     Welcome,
 )
@@ -68,6 +70,7 @@ class Connection(Receiving):
         self.generation = 0
         self.welcome: Welcome | None = None
         self.failure: ClientError | None = None
+        self.put_off: Refused | None = None  # the newest refusal that passes, until a session lets us in
         self.wake_ns = 0  # when the shell has something to do that is not ours; 0: never
         self.not_taken: ProtocolFault | None = None  # the newest fault of `NOT_TAKEN`
         self.stalled = False
@@ -97,7 +100,7 @@ class Connection(Receiving):
 
     def open(self, now_ns: int) -> None:
         """Starts joining, also after a refusal."""
-        self.failure = None
+        self.failure = self.put_off = None
         self._backoff_ns = BACKOFF_MIN_NS
         self._say_hello(now_ns)
 
@@ -207,6 +210,8 @@ class Connection(Receiving):
 
     def describe(self) -> str:
         """One line for people: why there is no connection now."""
+        if self.phase in (Phase.WAITING, Phase.JOINING) and self.put_off is not None:
+            return f"not let in yet, trying again: {RefusedError(self.put_off)}"
         if self.phase in (Phase.WAITING, Phase.JOINING):
             return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
         texts = {Phase.IDLE: "not connected: call connect() first", Phase.CLOSED: "this client was closed"}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import ipaddress
-import re
 import select
 import socket
 import time
@@ -16,8 +15,9 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
-from iris_session.client.address import host_port
+from iris_session.client.address import host_port, is_host
 from iris_session.client.errors import ClientError
+from iris_session.client.resolving import resolve
 from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_beacon, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError, VersionError
@@ -29,7 +29,7 @@ MAX_ADDRESSES: Final = 4
 MAX_DRAIN: Final = 256
 #: More than two periods of a beacon: one may be lost.
 LISTEN_S: Final = 1.0
-_HOST: Final = re.compile(r"[A-Za-z0-9._:-]{1,64}")
+MAX_HOST: Final = 64
 #: A connection that is not there yet, as different systems say it.
 _NOT_YET: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINPROGRESS, errno.ENOTCONN})
 
@@ -143,15 +143,13 @@ def ask_introduction(host: str, control_port: int, timeout_s: float) -> Generato
     Raises `OSError` (nobody there, no answer) or `ProtocolError` (no introduction, or another protocol version).
     """
     until = time.monotonic() + timeout_s
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET  # as the control socket will: names are IPv4
-    _, kind, protocol, _, address = socket.getaddrinfo(
-        host, control_port + INTRODUCTION_OFFSET, family, socket.SOCK_STREAM
-    )[0]
+    target = yield from resolve(host, until)
+    family = socket.AF_INET6 if ":" in target else socket.AF_INET
     data = b""
-    with socket.socket(family, kind, protocol) as asking:
+    with socket.socket(family, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         with contextlib.suppress(BlockingIOError):
-            asking.connect(address)
+            asking.connect((target, control_port + INTRODUCTION_OFFSET))
         while (introduction := decode_introduction(data)) is None:
             try:
                 more = asking.recv(INTRODUCTION_PREFIX + MAX_INTRODUCTION_BYTES + 1 - len(data))
@@ -174,7 +172,8 @@ def plausible(beacon: Beacon) -> bool:
     return (
         all(text.isprintable() for text in texts)
         and bool(beacon.session_id and beacon.session_name)
-        and _HOST.fullmatch(beacon.host) is not None
+        and len(beacon.host) <= MAX_HOST
+        and is_host(beacon.host)
         and 0 < beacon.control < 65536
     )
 

@@ -45,6 +45,8 @@ class Joining:
 
     def why_not_in(self, when: str) -> str:
         """For people: where we have not been let in, `when`, and what stands in the way as far as we know."""
+        if self.connection.put_off is not None and self._meeting is None:
+            return f"{self.address} {when}: {RefusedError(self.connection.put_off)}"
         note = self._note if self._meeting is None else self._meeting.note or self._note
         return f"{self.address} {when}: is `iris-session serve` running there?{f' ({note})' if note else ''}"
 
@@ -90,6 +92,8 @@ class Joining:
         elif self._may_pair():
             self._paired_anew = True  # once: a key that is taken off the list again stays off
             self._begin_meeting(repair=True)
+        elif connection.put_off is not None:
+            return  # somebody is there: `connection` says hello again
         elif connection.phase is Phase.WAITING and not met.session_id and self._wanted.curve is None:
             self._begin_meeting()  # nobody was there to introduce himself: somebody may be now
 

@@ -20,7 +20,7 @@ MAX_INBOX: Final = 1024
 MAX_PENDING: Final = 64
 MAX_GRANTED: Final = 4096  # targets of which an answer spoke
 
-#: Refusals that pass: somebody who was in before keeps trying.
+#: Refusals that pass: somebody who was in before keeps trying (after `rate` everybody does).
 TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
 #: Faults about a message of ours that the session could not read: whoever waits for its answer waits in vain.
 NOT_TAKEN: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LARGE})

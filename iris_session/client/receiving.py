@@ -45,6 +45,7 @@ class Receiving:
     phase: Phase
     welcome: Welcome | None
     failure: ClientError | None
+    put_off: Refused | None
     not_taken: ProtocolFault | None
     stalled: bool
     tracking_epoch: int
@@ -138,6 +139,7 @@ class Receiving:
         self.stream.reconnected()
         self.mirror.synced = False
         self.welcome = welcome
+        self.put_off = None
         self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
         self.phase = Phase.SYNCING
         self._joined_at = now_ns
@@ -155,9 +157,11 @@ class Receiving:
         if self.phase is not Phase.JOINING:
             return
         if refused.code == RefusalCode.RESUME_TOKEN and self.identity.resume_token:
-            self.identity.resume_token = b""  # used up or forgotten: join as somebody new
+            # Used up or forgotten: join as somebody new.
+            self.counters.identity_unwritten += not self.identity.remember(b"")
             self._say_hello(now_ns)
-        elif refused.code in TRANSIENT and self.welcome is not None:
+        elif refused.code == RefusalCode.RATE or (refused.code in TRANSIENT and self.welcome is not None):
+            self.put_off = refused
             self._wait(now_ns)
         else:
             self.phase = Phase.REFUSED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from iris_session.client import ClientError
-from iris_session.client.address import Address, host_port, pairing_uri
+from iris_session.client.address import Address, host_port, is_host, pairing_uri
 from iris_session.keys import KeyPair
 
 KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"
@@ -31,7 +31,9 @@ def test_a_server_may_be_called_as_the_scheme() -> None:
 
 def test_a_uri_may_say_less_and_more() -> None:
     assert Address.parse("iris://10.0.0.5") == Address("10.0.0.5", 7721)
-    assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd-9ptr") == Address("10.0.0.5", 7731, "", "7KQ2M4XD9PTR")
+    assert Address.parse("IRIS://10.0.0.5:7731/?later=1&c=7kq2-m4xd-9ptr") == Address(
+        "10.0.0.5", 7731, "", "7KQ2M4XD9PTR"
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,3 +44,20 @@ def test_a_damaged_uri_says_what_one_looks_like(uri: str) -> None:
     with pytest.raises(ClientError, match="iris://HOST:PORT") as error:
         Address.parse(uri)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "host", ["10.0.0.5", "lab", "lab-1.local", "a_b.", "xn--bcher-kva.example", "::1", "fe80::1%eth0"]
+)
+def test_hosts(host: str) -> None:
+    assert is_host(host)
+    assert Address.parse(f"[{host}]:7731" if ":" in host else f"{host}:7731").host == host
+
+
+@pytest.mark.parametrize(
+    "host", ["a..b", ".a", "-", "a b", "*", "a/b", "x" * 64, "a." * 200, "bücher", "a\0b", "\ud800", "::1::2"]
+)
+def test_what_cannot_be_a_host_is_one_line_and_no_error_of_the_resolver(host: str) -> None:
+    assert not is_host(host)
+    with pytest.raises(ClientError, match="is not HOST:PORT"):
+        Address.parse(host)

@@ -214,6 +214,24 @@ def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
     assert wire.connection.failure is None
 
 
+def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire: Wire) -> None:
+    wire.connection.open(0)
+    now, waits = 0, []
+    for _ in range(8):
+        wire.sent()
+        wire.get(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
+        assert wire.connection.phase is Phase.WAITING
+        assert "too many hellos" in wire.connection.describe()
+        waits.append(wire.connection.next_deadline_ns(now) - now)
+        now = wire.connection.next_deadline_ns(now)
+        wire.connection.tick(now)
+    assert waits == sorted(waits)
+    assert waits[-1] == BACKOFF_MAX_NS
+    wire.welcome(now)
+    assert wire.connection.put_off is None
+    assert wire.connection.failure is None
+
+
 @pytest.mark.parametrize(
     ("code", "phase"), [("session_ended", Phase.WAITING), ("dropped", Phase.JOINING), ("hello", Phase.JOINING)]
 )
@@ -388,7 +406,8 @@ def test_a_full_disk_ends_neither_joining_nor_closing(
     wire.join()
     assert wire.connection.identity.resume_token == b"token"
     wire.connection.lost(2 * SECOND)
+    wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), 2 * SECOND, epoch=0)
     wire.welcome(3 * SECOND, b"next")
     wire.connection.close()
-    assert wire.connection.counters.identity_unwritten == 3
+    assert wire.connection.counters.identity_unwritten == 4
     assert len(caplog.records) == 1

@@ -50,6 +50,8 @@ def test_what_anybody_can_send_is_bounded_and_counted(air: tuple[BeaconListener,
     listener, send = air
     for odd in ({"session_name": "\x1b[2J"}, {"control": 0}, {"control": 1 << 40}, {"host": "a b"}, {"session_id": ""}):
         send(other(**odd))
+    for host in ("a..b", "-", "x" * 65):
+        send(other(host=host))
     for data in (b"", b"junk", b"\xff" * 2000, other(protocol=2), msgspec.msgpack.encode({"protocol": 1})):
         send(data)
     for number in range(MAX_SESSIONS + 7):
@@ -60,7 +62,7 @@ def test_what_anybody_can_send_is_bounded_and_counted(air: tuple[BeaconListener,
     found = listener.sessions()
     assert len(found) == MAX_SESSIONS
     assert max(len(one.addresses) for one in found) == MAX_ADDRESSES
-    assert listener.ignored == {"malformed": 9, "other_version": 1, "too_many": 7}
+    assert listener.ignored == {"malformed": 12, "other_version": 1, "too_many": 7}
 
 
 def test_somebody_else_cannot_send_us_to_a_port_of_our_own() -> None:
