@@ -147,11 +147,16 @@ def examine_server(address: str, recordings: Path, *, told: Callable[[str], None
     target = Address.parse(address or LOCAL)
     result = Examination(str(target))
     result.findings.add(*machine(recordings, target.port))
-    if reach.tcp(target, target.host).failed and not address:
+    named, ip = reach.resolved(target)
+    if not ip:
+        result.findings.add(named)
+        return result
+    if reach.tcp(target, ip).failed and not address:
         own = {one.address for addresses in psutil.net_if_addrs().values() for one in addresses}
         here = [found for found in map(_address, reach.beacon("", None)[1]) if found.host in own]
         target = here[0] if here else target
-    if not reach.tcp(target, target.host).failed:
+        ip = reach.resolved(target)[1]
+    if not reach.tcp(target, ip).failed:
         inside = examine(str(target), told=told)
         result.address, result.report = inside.address, inside.report
         result.findings.add(*(one for one in inside.findings if one.check not in ("beacon", "address", "subnet")))

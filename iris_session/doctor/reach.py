@@ -73,8 +73,9 @@ def resolved(address: Address) -> tuple[Finding, str]:
     """The address, and the IP address it stands for (empty when there is none)."""
     try:
         ip = str(socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0][4][0])
-    except OSError as error:
-        text = f"{address.host!r} is the name of no machine that is known here ({error.strerror or error})"
+    except (OSError, UnicodeError) as error:  # UnicodeError: what cannot be a name, such as `a..b`
+        why = error.strerror or error if isinstance(error, OSError) else "it cannot be a name"
+        text = f"{address.host!r} is the name of no machine that is known here ({why})"
         return failed("address", text, "", "type the numbers that `iris-session serve` prints"), ""
     return ok("address", f"{address}" + ("" if ip == address.host else f" is {ip}")), ip
 
@@ -119,8 +120,12 @@ def own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Netw
 
 
 def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str = "control") -> Finding:
-    """Whether somebody takes a connection there. Tells a closed port from a firewall."""
+    """Whether somebody takes a connection there. Tells a closed port from a firewall. `ip`: from `resolved`."""
     port = port or address.port
+    try:
+        ipaddress.ip_address(ip)
+    except ValueError:  # to the system, an empty address would be this machine's own
+        return failed(check, f"{address.host!r} stands for no address to connect to", "", "type the numbers instead")
     family = socket.AF_INET6 if ":" in ip else socket.AF_INET
     began = time.monotonic()
     with socket.socket(family, socket.SOCK_STREAM) as probe:

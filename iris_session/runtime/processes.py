@@ -42,16 +42,11 @@ from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path
 from iris_session.runtime.stepper import Stepper
+from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replaced
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
 from iris_session.transport.sockets import host_in_address
 
 WATCH_PERIOD_NS: Final = 50_000_000
-RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000_000_000)
-#: A process that lived this long is taken as healthy again.
-HEALTHY_NS: Final = 30_000_000_000
-#: A recorder says something twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
-HANGING_NS: Final = 5_000_000_000
-
 #: What the recorder gets to take what is left, and one that was just started before.
 TAKING_S: Final = 5.0
 STARTING_S: Final = 15.0
@@ -61,30 +56,6 @@ FINISHING_S: Final = 10.0
 ENDING_S: Final = 0.2
 
 _log = logging.getLogger(__name__)
-
-
-class _Watch:
-    """When a dead process may be started again."""
-
-    def __init__(self) -> None:
-        self.failures = 0
-        self.restarts = 0
-        self._last_ns = 0
-        self._due_ns = 0
-
-    def dead(self, now_ns: int) -> bool:
-        """True when it is time to start it again; counts the restart."""
-        if not self._due_ns:
-            if now_ns - self._last_ns > HEALTHY_NS:
-                self.failures = 0
-            self._due_ns = now_ns + RESTART_BACKOFF_NS[min(self.failures, len(RESTART_BACKOFF_NS) - 1)]
-        if now_ns < self._due_ns:
-            return False
-        self._due_ns = 0
-        self._last_ns = now_ns
-        self.failures += 1
-        self.restarts += 1
-        return True
 
 
 class SessionProcesses:
@@ -112,12 +83,9 @@ class SessionProcesses:
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
         self.front: FrontProcess | None = None
-        self._front_watch = _Watch()
-        self._recorder_watch = _Watch()
-        self._recorder_hangs = False
-        #: Why the recorder ended, until its successor has written for a while.
-        self.recorder_failure = ""
-        self._recorder_failed_ns = 0
+        self._front_backoff = Backoff()
+        #: Of the recorder, None when nothing is recorded.
+        self.supervisor: RecorderSupervisor | None = None
         self.reporter = Reporter()
         self._next_watch_ns = 0
         self._address = ""
@@ -134,6 +102,7 @@ class SessionProcesses:
             if self.recording is not None:
                 self.recorder = RecorderProcess(self.recording, self._origin_ns)
                 self.recorder.start()
+                self.supervisor = RecorderSupervisor(self.recorder)
                 self.feed = RecorderFeed(self.recorder.feed_endpoint, self.recording.parent)
                 self._in_use = RecordingLock(self.recording, shared=True)
                 self._keeper = NoteKeeper(note_path(self.recording))
@@ -246,19 +215,13 @@ class SessionProcesses:
             return
         self._next_watch_ns = now_ns + WATCH_PERIOD_NS
         self._note()
-        if self.front is not None and not self.front.alive and self._front_watch.dead(now_ns):
-            stepper.post(Marker(request_id=0, text=f"the front process ended and {_replaced(self.front.restart)}"))
-        if self.recorder is not None and not self.recorder.alive and self._recorder_watch.dead(now_ns):
-            failure = self.recorder_failure = self.recorder.failure or "the recorder ended"
-            self._recorder_failed_ns = now_ns
-            stepper.post(Marker(request_id=0, text=f"{failure}; it {_replaced(self.recorder.restart)}"))
-        hangs = self.feed is not None and self.feed.silence_ns > HANGING_NS
-        if hangs and not self._recorder_hangs:
-            stepper.post(Marker(request_id=0, text="the recorder hangs: what it does not take waits on the disk"))
-        self._recorder_hangs = hangs
+        if self.front is not None and not self.front.alive and self._front_backoff.dead(now_ns):
+            what = replaced(self.front.restart, FrontError)
+            stepper.post(Marker(request_id=0, text=f"the front process ended and {what}"))
+        if self.supervisor is not None and self.feed is not None:
+            for text in self.supervisor.look(now_ns, self.feed.silence_ns):
+                stepper.post(Marker(request_id=0, text=text))
         self._watch_plant(stepper)
-        if self.recorder_failure and now_ns - self._recorder_failed_ns > HANGING_NS and not hangs:
-            self.recorder_failure = ""  # its successor writes
         if self.front is not None and self.reporter.due(now_ns):
             self.front.link.send_report(self.reporter.report(stepper, self))
 
@@ -280,11 +243,6 @@ class SessionProcesses:
     def recorder_pid(self) -> int:
         return 0 if self.recorder is None else self.recorder.pid
 
-    @property
-    def recorder_hangs(self) -> bool:
-        """It runs, and has said nothing for `HANGING_NS` though it has something to write."""
-        return self._recorder_hangs
-
     def drops(self) -> dict[str, int]:
         """Everything that was not delivered, by reason."""
         return {**({} if self.front is None else self.front.link.status.drops), **self.own_drops()}
@@ -301,7 +259,8 @@ class SessionProcesses:
         return {reason: count for reason, count in drops.items() if count}
 
     def restarts(self) -> dict[str, int]:
-        return {"front": self._front_watch.restarts, "recorder": self._recorder_watch.restarts}
+        recorder = 0 if self.supervisor is None else self.supervisor.restarts
+        return {"front": self._front_backoff.restarts, "recorder": recorder}
 
     def close(self) -> str:
         """Ends the front (its clients are told), then finishes the recording. May be called twice.
@@ -313,8 +272,10 @@ class SessionProcesses:
             self._note()
             self.front.close(FAREWELL_S)
             self.front = None
+        if self.supervisor is not None:
+            self.supervisor.close()
         feed, self.feed = self.feed, None
-        recorder, self.recorder = self.recorder, None
+        recorder, self.recorder, self.supervisor = self.recorder, None, None
         fault, taken = "", True
         if feed is not None and recorder is not None:
             known = feed.stats.recorders >= recorder.starts  # a new one says nothing until it is there
@@ -341,15 +302,6 @@ class SessionProcesses:
 def anchor_poses(config: SessionConfig) -> dict[str, Pose]:
     """`T_world_anchor` of each sheet, as it travels."""
     return {name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()}
-
-
-def _replaced(restart: Callable[[], None]) -> str:
-    """Starts a process anew. One that cannot be started now (no memory, a full disk) ends no session."""
-    try:
-        restart()
-    except (FrontError, RecordingError) as error:
-        return f"is not replaced: {error}"
-    return "was replaced"
 
 
 def _scene_info(world: World) -> SceneInfo:

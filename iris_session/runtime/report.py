@@ -118,18 +118,18 @@ def robots(stepper: Stepper) -> tuple[RobotReport, ...]:
 
 def recorder_report(processes: SessionProcesses) -> RecorderReport:
     """How the recording does, by what its process said last."""
-    feed, process = processes.feed, processes.recorder
-    if feed is None or process is None:
+    feed, process, seen = processes.feed, processes.recorder, processes.supervisor
+    if feed is None or process is None or seen is None:
         return RecorderReport()
     stats = feed.stats
     said = stats.recorder
-    fault = processes.recorder_failure or process.failure or ("" if said is None else said.fault)
+    fault = seen.failure or ("" if said is None else said.fault)
     state = "running"
     if fault:
         state = "failed"
-    elif not process.alive:
+    elif not seen.alive:
         state = "dead"
-    elif processes.recorder_hangs:
+    elif seen.hangs:
         state = "hangs"
     fault = fault or stats.spill_fault
     return RecorderReport(

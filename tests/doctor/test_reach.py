@@ -121,6 +121,11 @@ def test_names() -> None:
     found, ip = reach.resolved(Address("localhost", 7721))
     assert found.state == "ok"
     assert ip in ("127.0.0.1", "::1")
+    for nobody in ("a..b", "x" * 300, ""):
+        found, ip = reach.resolved(Address(nobody, 7721))
+        assert (found.state, ip) == ("failed", "")
+        assert reach.tcp(Address(nobody, 7721), ip).failed  # not this machine, which an empty address means
+        assert reach.tcp(Address(nobody, 7721), nobody).failed
     found, ip = reach.resolved(Address("no-such-machine.invalid", 7721))
     assert found.failed
     assert ip == ""

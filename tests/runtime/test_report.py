@@ -104,14 +104,13 @@ def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
     assert reporter.due(3 * PERIOD_NS)
 
 
-def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "", text: str = "") -> Any:
+def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "") -> Any:
     """What the report looks at."""
     said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
     return SimpleNamespace(
         feed=SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
-        recorder=SimpleNamespace(alive=alive, failure=text, path="/data/session.rrd"),
-        recorder_hangs=hangs,
-        recorder_failure=failure,
+        recorder=SimpleNamespace(path="/data/session.rrd", part_path="/data/session.rrd"),
+        supervisor=SimpleNamespace(alive=alive, hangs=hangs, failure=failure),
     )
 
 
@@ -121,7 +120,7 @@ def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault:
         ({}, "running", ""),
         ({"hangs": True}, "hangs", ""),
         ({"alive": False}, "dead", ""),
-        ({"alive": False, "text": "no space left"}, "failed", "no space left"),
+        ({"alive": False, "failure": "no space left"}, "failed", "no space left"),
         ({"fault": "cannot be written"}, "failed", "cannot be written"),
         ({"hangs": True, "failure": "no space left"}, "failed", "no space left"),  # dies again and again
     ],
@@ -133,4 +132,4 @@ def test_recorder(fields: dict[str, Any], state: str, text: str) -> None:
 
 
 def test_without_recorder() -> None:
-    assert recorder_report(SimpleNamespace(feed=None, recorder=None)).state == "off"  # type: ignore[arg-type]
+    assert recorder_report(SimpleNamespace(feed=None, recorder=None, supervisor=None)).state == "off"  # type: ignore[arg-type]
