@@ -13,9 +13,6 @@ from iris_session.recording import Recording
 
 #: Growth of the second half that is noise: allocators, caches that fill.
 NOISE_MIB: Final = 6.0
-#: Known growth [MiB/s]: Rerun keeps an index entry of every chunk until it writes the file's footer; seven flushes a
-#: second of three to five chunks are 0.1 to 0.25 MiB/s. It ends with the file.
-KNOWN_MIB_PER_S: Final = {"recorder": 0.3}
 
 
 def check_events(recording: Path, folder: Path) -> tuple[dict[str, int], list[str]]:
@@ -59,7 +56,7 @@ def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, d
         if len(half) < 4:
             continue
         slope = float(np.polyfit(half[:, 0] - half[0, 0], half[:, 1], 1)[0])
-        growth = (slope - KNOWN_MIB_PER_S.get(name, 0.0)) * float(half[-1, 0] - half[0, 0])
+        growth = slope * float(half[-1, 0] - half[0, 0])
         figures[name] = {
             "mib": round(float(half[-1, 1]), 1),
             "mib_at_half": round(float(half[0, 1]), 1),

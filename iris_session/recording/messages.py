@@ -19,8 +19,6 @@ from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
 #: Begins the line on standard error that says why the recorder ended; other lines are Rerun's.
 FAULT_PREFIX: Final = "recorder: "
-#: Chunks after which a new part begins: about an hour. Rerun keeps some 4 KB in memory per chunk for a file's footer.
-PART_CHUNKS: Final = 100_000
 
 
 class RecorderConfig(msgspec.Struct, frozen=True):
@@ -37,18 +35,13 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     samples_endpoint: str
     origin_ns: int
     parent: int
-    part_chunks: int = PART_CHUNKS
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
-    """The last thing in a file that was closed. `step`, `chain`: of its newest row.
-
-    `continues_in`: number of the file in which the recording goes on, 0 when the session ended.
-    """
+    """The last thing in a file that was closed. `step`, `chain`: of its newest row."""
 
     step: int
     chain: bytes
-    continues_in: Count = 0
 
 
 HEADER: Final = b"H"

@@ -49,7 +49,7 @@ DRAIN_MESSAGES: Final = 4096
 #: After SIGTERM or the parent's end: quiet for this long means that everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
-#: An orphan whose file did not grow for so long has no disk to finish on: Rerun waits for one without end.
+#: An orphan whose file did not grow for so long has no disk to finish on: a write to one that hangs has no end.
 ORPHAN_S: Final = 20.0
 ORPHANED: Final = 4
 MIN_FREE_BYTES: Final = 16 << 20
@@ -67,7 +67,6 @@ class Recorder:
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
         self._front = self._bind(zmq.PULL, config.samples_endpoint)
-        self._part = config.part
         self._begin_part()
         with suppress(OSError):
             self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
@@ -131,7 +130,7 @@ class Recorder:
         self._stopping = True
 
     def _begin_part(self) -> None:
-        path = part_path(self._config.path, self._part)
+        path = part_path(self._config.path, self._config.part)
         self._made_folder = claim(Path(path))
         self._writer = RrdWriter(path, self._config.recording_id)
         try:
@@ -140,18 +139,6 @@ class Recorder:
             self._remove()  # the next attempt takes the same number
             raise
         self._syncer = _Syncer(path)
-
-    def _next_part(self) -> None:
-        """Goes on in a new file: each is whole, and Rerun's memory for the footer is bounded."""
-        self._writer.close(continues_in=self._part + 1)
-        self._syncer.stop()
-        self._part += 1
-        try:
-            self._begin_part()
-        except RecorderError as error:
-            raise WriteError(str(error)) from error
-        if self._header is not None:
-            self._writer.header(self._header)
 
     def _bind(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
@@ -177,8 +164,6 @@ class Recorder:
                 if n or now >= status_at:
                     status_at = now + STATUS_S
                     self._say(self._received)
-                if self._writer.chunks >= self._config.part_chunks:
-                    self._next_part()
 
     def _drain_all(self) -> None:
         until = time.monotonic() + FINISH_S
@@ -310,7 +295,7 @@ def claim(path: Path) -> bool:
 
 
 def _try_to_write(path: Path) -> None:
-    """Creates the empty file, after writing more than its beginning: Rerun hangs where that cannot be written."""
+    """Creates the empty file, after writing more than its beginning: said before the session begins."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     try:
         left = bytes(TRIAL_BYTES)
@@ -349,9 +334,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    status = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if status:  # Rerun would wait at its exit, again, for a file that cannot be written
-        os._exit(status)
-    sys.exit(status)
+    sys.exit(main())

@@ -11,6 +11,7 @@ import tempfile
 import warnings
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self, TypeVar
@@ -83,9 +84,8 @@ class Recording:
                 self._add_part(path, prober)
         self.header = self._header(files[0])
         ends = {part: _decode_end(_values(batch, "end")[0]) for part, batch in self._batches(paths.END)}
-        self._find_missing(files, [end.continues_in for end in ends.values()])
-        last = ends.get(len(self.files) - 1)
-        self.end = None if last is None or last.continues_in else last
+        self._find_missing(files)
+        self.end = ends.get(len(self.files) - 1)
 
     @property
     def finished(self) -> bool:
@@ -239,13 +239,16 @@ class Recording:
         self.damage += [f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)]
         return copy
 
-    def _find_missing(self, files: list[str], named: list[int]) -> None:
-        """`files`: what was found; `named`: the parts that closed ones say the recording goes on in, 0 for none."""
-        base, first = paths.split_part(files[0])
-        there = {paths.split_part(path)[1] for path in files}
-        for part in range(first, max(*there, *named, first) + 1):
-            if part not in there:
-                self.missing.append(f"{os.path.basename(paths.part_path(base, part))} is missing")
+    def _find_missing(self, files: list[str]) -> None:
+        """`files`: what was found, in order. A name may hold any number, so gaps are not counted out."""
+        base = os.path.basename(paths.split_part(files[0])[0])
+        numbers = [paths.split_part(path)[1] for path in files]
+        for before, after in pairwise(numbers):
+            first, last = paths.part_path(base, before + 1), paths.part_path(base, after - 1)
+            if after == before + 2:
+                self.missing.append(f"{first} is missing")
+            elif after > before + 2:
+                self.missing.append(f"{first} to {last} are missing")
 
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._batches(paths.HEADER):

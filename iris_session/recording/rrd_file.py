@@ -27,6 +27,8 @@ KIND_END: Final = 0
 KIND_STORE_INFO: Final = 1
 KIND_ARROW: Final = 2
 KIND_LAST: Final = 3
+#: The last message of a file that was closed. Rerun's own has a footer as its body, and more behind it.
+END_MESSAGE: Final = _HEAD.pack(KIND_END, 0)
 _ARROW_HEAD: Final = struct.pack("<Q", KIND_ARROW)
 #: Messages that are tried together; a group that fails is halved until the bad ones are alone.
 GROUP: Final = 256
@@ -88,6 +90,17 @@ def scan(path: str | Path) -> Scan:
     if has_footer and size - at == FILE_TAIL:
         return Scan(found, holes, size, size, False)
     return Scan(found, holes, at, size, at < size and not has_footer)
+
+
+def end_of_messages(data: bytes) -> int:
+    """Where, in the bytes of a whole file, the message lies that ends it. Raises `ValueError`: no such file."""
+    at = FILE_HEAD
+    while at + _HEAD.size <= len(data):
+        kind, length = _HEAD.unpack_from(data, at)
+        if kind == KIND_END:
+            return at
+        at += _HEAD.size + length
+    raise ValueError("a Rerun file without an end")
 
 
 def _message_at(file: BinaryIO, at: int, size: int) -> Message | None:

@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 
 from iris_session.recording.errors import RecorderError
-from iris_session.recording.messages import FAULT_PREFIX, PART_CHUNKS, RecorderConfig
+from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
 
 START_S: Final = 20.0
@@ -29,15 +29,13 @@ class RecorderProcess:
     """A recorder of the file `path`, started by exec, listening on sockets in a private temporary folder.
 
     It runs in a session of its own, so that Ctrl-C of a terminal reaches only the parent. When it has ended, `restart`
-    begins the next part (`session.part2.rrd`); the feed hands it everything that was not written. A part also ends by
-    itself after `part_chunks` chunks, about an hour.
+    begins the next part (`session.part2.rrd`); the feed hands it everything that was not written.
     """
 
-    def __init__(self, path: str | Path, origin_ns: int, part_chunks: int = PART_CHUNKS) -> None:
+    def __init__(self, path: str | Path, origin_ns: int) -> None:
         self.path = str(path)
         self.part = 0
         self._origin_ns = origin_ns
-        self._part_chunks = part_chunks
         # The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one.
         short = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
@@ -114,7 +112,6 @@ class RecorderProcess:
             self.samples_endpoint,
             self._origin_ns,
             os.getpid(),
-            self._part_chunks,
         )
         # RERUN=off in a user's shell would silence the stream.
         environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error"}

@@ -26,6 +26,7 @@ from iris_session.recording.columns import blobs, each, lists, matrix, nanosecon
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob, unpack_model
 from iris_session.recording.messages import Batch, DenialRecord, EndMark, MetricRecord, StateFrame, encode_header
+from iris_session.recording.rrd_stream import RrdStream
 from iris_session.recording.text import describe_denial, describe_event, describe_session
 
 #: Colours of participants in the order of their appearance.
@@ -33,8 +34,6 @@ PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114
 #: A chunk per robot: once a second, because they can be had from `/state` again.
 LATENCIES_NS = 1_000_000_000
 _encode = msgspec.msgpack.Encoder().encode
-#: The stream's own batcher never acts: this writer sends whole columns and flushes them.
-_BATCHER = rr.ChunkBatcherConfig(flush_tick=3600.0, flush_num_bytes=1 << 30)
 
 
 class RrdWriter:
@@ -42,9 +41,8 @@ class RrdWriter:
 
     def __init__(self, path: str | Path, recording_id: str) -> None:
         self.path = str(path)
-        self.chunks = 0
-        self._rec = rr.RecordingStream(paths.APPLICATION, recording_id=recording_id, batcher_config=_BATCHER)
-        self._rec.set_sinks(rr.FileSink(self.path))
+        self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
+        self._rec = self._stream.recording
         self._rec.send_blueprint(_blueprint())
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
@@ -52,7 +50,6 @@ class RrdWriter:
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
         self._last_poses: NDArray[np.float64] | None = None
-        self._marked = 0  # bytes of the file that marks cover
         self._newest_row = (-1, b"")
         self._clock = (0, 0)  # tick and sim_time [ns] of the newest state, for what has neither
         self._applied: dict[str, Applied] = {}
@@ -108,41 +105,41 @@ class RrdWriter:
             self._denials(batch.denials)
             self._metrics(batch.metrics)
             self._raw_samples(samples)
-            self._rec.flush(timeout_sec=timeout_s)
+            self._stream.write(timeout_s)
             if batch.keyframes:
                 self._mark()
         except (RuntimeError, ValueError, OSError) as error:
-            raise WriteError(f"{self.path} cannot be written: {' '.join(str(error).split())}") from error
+            raise self._fault(error) from error
 
-    def close(self, continues_in: int = 0) -> None:
-        """Writes the rest and the end mark, and closes the file. `continues_in`: the part that follows, 0 for none."""
+    def close(self) -> None:
+        """Writes the rest and the end mark, and closes the file. Raises `WriteError`."""
         self._write_latencies()
         self.flush()
         self._mark()
-        mark = EndMark(*self._newest_row, continues_in)
+        mark = EndMark(*self._newest_row)
         self._static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
         self.flush()
-        self._rec.disconnect()
+        try:
+            self._stream.close()
+        except OSError as error:
+            raise self._fault(error) from error
+
+    def _fault(self, error: Exception) -> WriteError:
+        said = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
+        return WriteError(f"{self.path} cannot be written: {said}")
 
     def abandon(self) -> None:
         """Removes the file, in which nothing is."""
         Path(self.path).unlink(missing_ok=True)
 
     def _mark(self) -> None:
-        """Notes the CRC of all bytes since the last mark, so that any later change of the file is found."""
-        with open(self.path, "rb") as file:
-            file.seek(self._marked)
-            data = file.read()
-        mark = (self._marked, self._marked + len(data), zlib.crc32(data))
-        self._marked = mark[1]
         times = [sequence(paths.STEP, [self._newest_row[0]])]
-        self._send(paths.MARKS, times, [blobs("mark", [_encode(mark)])])
+        self._send(paths.MARKS, times, [blobs("mark", [_encode(self._stream.mark())])])
 
     def _static(self, entity: str, *values: Any) -> None:
         self._rec.log(entity, *values, static=True, strict=True)
 
     def _send(self, entity: str, times: Sequence[Any], columns: Sequence[Any]) -> None:
-        self.chunks += 1
         rr.send_columns(entity, times, columns, recording=self._rec, strict=True)
 
     def _rows(self, batch: Batch) -> None:

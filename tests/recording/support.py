@@ -29,7 +29,7 @@ from iris_session.recording import (
     pack_model,
 )
 from iris_session.recording.journal import seal
-from iris_session.recording.messages import PART_CHUNKS, Batch
+from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000
@@ -152,9 +152,9 @@ class SmallSession:
 
 
 @contextmanager
-def recorder(path: Path, part_chunks: int = PART_CHUNKS) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
+def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
     """A started recorder process with a feed; ended in any case."""
-    process = RecorderProcess(path, time.monotonic_ns(), part_chunks)
+    process = RecorderProcess(path, time.monotonic_ns())
     feed: RecorderFeed | None = None
     try:
         process.start()
@@ -202,7 +202,7 @@ def journal(steps: int, recording_class: str = CLOSED, keyframe_steps: int = 50)
     return header, batch
 
 
-def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20, continues_in: int = 0) -> Path:
+def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int = 20) -> Path:
     """A finished file with this content."""
     writer = RrdWriter(path, "id")
     writer.header(header)
@@ -212,5 +212,5 @@ def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int =
         batch.keyframes = [k for k in batch.keyframes if k not in keyframes]
         writer.add(Batch(rows=batch.rows[i : i + rows_per_chunk], keyframes=keyframes))
         writer.flush()
-    writer.close(continues_in)
+    writer.close()
     return path

@@ -47,30 +47,15 @@ def test_everything_comes_back_exactly(tmp_path: Path) -> None:
     assert (report.steps, report.keyframes) == (300, 4)
 
 
-def test_a_long_recording_goes_on_in_parts(tmp_path: Path) -> None:
-    path = tmp_path / "session.rrd"
-    with recorder(path, part_chunks=30) as (process, feed):
-        session = SmallSession(feed)
-        while process.part_path == str(path) or session.step_count < 400:
-            session.take(10, pause_s=0.002)
-        assert feed.close(20.0)
-        assert process.close()
-    report = verify(path, SmallCore)
-    assert report.ok, report.line()
-    assert report.parts >= 2
-    assert report.steps == session.step_count
-    with Recording.open(path) as recording:
-        assert len(list(recording.states())) == len(session.poses)
-    Path(part_path(str(path), report.parts)).unlink()
-    report = verify(path, SmallCore)
-    assert (report.ok, report.finished, len(report.missing)) == (False, False, 1), report.line()
-
-
-def test_rerun_itself_takes_the_file(tmp_path: Path) -> None:
+def test_rerun_itself_takes_the_file_and_adds_an_index(tmp_path: Path) -> None:
     record(tmp_path / "session.rrd", 100)
-    command = [Path(sys.executable).parent / "rerun", "rrd", "verify", tmp_path / "session.rrd"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 0, done.stderr
+    rerun = Path(sys.executable).parent / "rerun"
+    for arguments in (["optimize", "session.rrd", "-o", "indexed.rrd"], ["verify", "indexed.rrd"]):
+        command = [rerun, "rrd", *arguments]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+        assert done.returncode == 0, done.stderr
+    report = verify(tmp_path / "indexed.rrd", SmallCore)
+    assert report.ok, report.line()
 
 
 def test_raw_samples_of_the_front(tmp_path: Path) -> None:

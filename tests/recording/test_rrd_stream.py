@@ -1,0 +1,73 @@
+"""The file as Rerun and we write it together: memory that does not grow, and a disk that does not take everything."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from iris_session.recording import Recording
+from iris_session.recording.errors import WriteError
+from iris_session.recording.messages import Batch, MetricRecord
+from iris_session.recording.rrd_file import scan
+from iris_session.recording.writer import RrdWriter
+from tests.recording.support import journal
+
+
+def metrics(i: int) -> Batch:
+    return Batch(metrics=[MetricRecord(i, i, f"m{k}", 1.0) for k in range(40)])
+
+
+def test_memory_does_not_grow_with_chunks(tmp_path: Path) -> None:
+    """Rerun's own file sink would keep some 3 KB of every one of these 5,000 chunks."""
+    writer = RrdWriter(tmp_path / "w.rrd", "id")
+    writer.header(journal(0)[0])
+    process, after = psutil.Process(), 0
+    for i in range(175):
+        writer.add(metrics(i))
+        writer.flush()
+        if i == 50:
+            after = process.memory_info().rss
+    grown = process.memory_info().rss - after
+    writer.close()
+    assert grown < 3 << 20, f"{grown >> 10} KiB for 5,000 chunks"
+
+
+def test_a_write_that_fails_leaves_no_half_message(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header, batch = journal(50)
+    writer.header(header)
+    writer.add(batch)
+    writer.flush()
+    size = path.stat().st_size
+    writer._stream._file = _FullDisk(writer._stream._file)
+    writer.add(metrics(1))
+    with pytest.raises(WriteError, match=r"w\.rrd cannot be written: No space left on device$"):
+        writer.flush()
+    assert path.stat().st_size == size
+    assert not scan(path).cut
+    with Recording.open(path) as recording:
+        assert (len(list(recording.rows())), recording.finished, recording.damage) == (50, False, [])
+
+
+class _FullDisk:
+    """Takes ten bytes more."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._left = 10
+
+    def write(self, data: memoryview) -> int:
+        if not self._left:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        took = int(self._file.write(data[: self._left]))
+        self._left -= took
+        return took
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
