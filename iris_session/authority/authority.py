@@ -287,7 +287,7 @@ class Authority:
         elif isinstance(m, em.Audit):
             ctx.emit(Audited(m.kind, m.subject, m.name, m.address, m.detail, m.count))
         elif isinstance(m, em.SessionResumed):
-            roster.lose_everyone(ctx, "session_resumed")
+            roster.lose_everyone_for_a_while(ctx, "session_resumed")
             stops.gap(ctx, m.gap_ns, "resumed")
             roster.begin_grace_anew(ctx)
         elif isinstance(m, em.StalledGap) and not self._gap_seen:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from iris_session.authority import engagement
 from iris_session.authority.context import Context, find_grant, some
-from iris_session.authority.state import Grant, LeaseState, Participant, Pending
+from iris_session.authority.state import KEPT, Grant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Release
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, HoldReason, LeaseMode, TargetKind
@@ -124,7 +124,7 @@ def forget_requests(ctx: Context, p: Participant, why: str) -> None:
     for pending in (*ctx.state.queue, *ctx.state.consents):
         if pending.participant == p.id:
             drop_request(ctx, pending)
-            if why:
+            if why and pending.request_id != KEPT:
                 text = f"no longer waiting: {why}"
                 ctx.deny(p, pending.request_id, Denial(DenialReason.NOT_HOLDER, text, "acquire again to wait again"))
 

@@ -11,7 +11,7 @@ from typing import Final
 from iris_session.authority import assignment, engagement, leases
 from iris_session.authority.context import HUMAN, Context, find_grant, some
 from iris_session.authority.leases import held_by_other
-from iris_session.authority.state import LeaseState, Participant, Pending
+from iris_session.authority.state import KEPT, NO_CONNECTION, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, Device, HoldReason, LeaseMode, Role
@@ -127,7 +127,8 @@ def _fulfil(ctx: Context, p: Participant, pending: Pending, cause: str) -> None:
     for name in pending.objects:
         leases.grant(ctx, ctx.state.objects[name], p, "acquired")
         granted.append(ctx.state.objects[name])
-    ctx.accept(p, pending.request_id, granted)
+    if pending.request_id != KEPT:
+        ctx.accept(p, pending.request_id, granted)
     if pending.robots:
         leases.forget_requests(ctx, p, "you hold a robot now")
 
@@ -141,6 +142,8 @@ def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None
             DenialReason.HELD, text, "release it and acquire all robots in one request", held[0], p.id, p.name
         )
         return ctx.deny(p, pending.request_id, denial)
+    if _takes_kept_place(ctx, pending):
+        return None
     if any(w.participant == p.id for w in state.queue) or len(state.queue) >= ctx.config.max_queue:
         full = Denial(DenialReason.QUEUE_FULL, "you wait already, or the queue is full", "release to leave the queue")
         return ctx.deny(p, pending.request_id, full)
@@ -149,8 +152,27 @@ def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None
     return None
 
 
+def _takes_kept_place(ctx: Context, pending: Pending) -> bool:
+    """Whether this is asked again by somebody whose place was kept; who asks for something else gives it up."""
+    kept = next((w for w in ctx.state.queue if w.participant == pending.participant and w.request_id == KEPT), None)
+    if kept is None:
+        return False
+    if _wish(kept) == _wish(pending):
+        kept.request_id, kept.weight = pending.request_id, pending.weight
+        return True
+    leases.drop_request(ctx, kept)
+    return False
+
+
+def _wish(pending: Pending) -> tuple[object, ...]:
+    return (pending.any_robot, () if pending.any_robot else pending.robots, pending.objects)
+
+
 def advance(ctx: Context) -> None:
-    """Grants what has become free, in the order of the requests, and ends consents that nobody answered."""
+    """Grants what has become free, in the order of the requests, and ends consents that nobody answered.
+
+    Who keeps a place and is not back yet is waited for.
+    """
     for pending in tuple(ctx.state.consents):
         if not any(pending is other for other in ctx.state.consents):
             continue  # answered meanwhile: granting one request ends the others of its participant
@@ -177,7 +199,7 @@ def advance(ctx: Context) -> None:
         else:
             denial, consent = _obstacles(ctx, p, pending, ahead)
             ready = denial is None and not consent
-        if ready:
+        if ready and p.connection != NO_CONNECTION:
             leases.drop_request(ctx, pending)
             _fulfil(ctx, p, pending, "acquired")
         else:

@@ -6,7 +6,7 @@ from typing import Final
 
 from iris_session.authority import assignment, engagement, leases
 from iris_session.authority.context import Context
-from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
+from iris_session.authority.state import HOST_ID, KEPT, NO_CONNECTION, Participant
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
@@ -186,8 +186,18 @@ def lose_everyone(ctx: Context, reason: str) -> None:
         lose(ctx, p, reason)
 
 
+def lose_everyone_for_a_while(ctx: Context, reason: str) -> None:
+    """The session goes on after it was down: that time counts against nobody, grace begins anew, and who waited for a
+    robot keeps the place, as nobody could choose to leave it."""
+    places, ctx.state.queue = ctx.state.queue, []
+    lose_everyone(ctx, reason)
+    ctx.state.queue = places
+    for pending in places:
+        pending.request_id = KEPT
+
+
 def begin_grace_anew(ctx: Context) -> None:
-    """The session goes on after it was down: that time counts against nobody who is away."""
+    """After `lose_everyone_for_a_while`, and for those who were away before."""
     for p in ctx.state.participants.values():
         if p.connection == NO_CONNECTION:
             p.spared = False

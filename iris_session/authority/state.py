@@ -137,6 +137,10 @@ class LeaseState(msgspec.Struct):
     T_world_object: Pose = IDENTITY
 
 
+#: `Pending.request_id` of a place in the queue that outlived its connection: nobody waits for the answer.
+KEPT: Final = -1
+
+
 class Pending(msgspec.Struct):
     """An `acquire` that has not been answered yet: it waits in the queue, or for consents.
 

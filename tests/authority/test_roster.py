@@ -116,6 +116,45 @@ def test_grace_begins_anew_when_the_session_was_down_also_for_who_was_lost_befor
     assert t.last(LeaseChanged).lease.holder == ""
 
 
+def test_who_waited_keeps_the_place_while_the_session_was_down() -> None:
+    """Bert is first, comes back last and need not ask again; Carl asks again and keeps his place; Dora never comes."""
+    t = Table()
+    ann, bert, carl, dora = t.operator("left"), t.join(), t.join(), t.join()
+    for waiting in (bert, carl, dora):
+        waiting.does(Acquire(7, ("left",), wait=True))
+    t.step(t.host(SessionResumed(SECOND)), dt_ns=SECOND)
+    assert t.last(LeaseChanged).lease.queue == (bert.id, carl.id, dora.id)
+    ann, carl = rejoin(t, ann), rejoin(t, carl)
+    carl.does(Acquire(3, ("left",), wait=True))
+    assert carl.replies() == []
+    ann.does(Release())
+    t.wait(SECOND)
+    assert t.last(LeaseChanged).lease.queue == (bert.id, carl.id, dora.id), "nobody overtakes who is not back yet"
+    bert = rejoin(t, bert)
+    t.step()
+    lease = t.last(LeaseChanged).lease
+    assert (lease.holder, lease.queue) == (bert.id, (carl.id, dora.id))
+    assert bert.replies() == [], "nobody asked over this connection"
+    bert.does(Release())
+    t.step()
+    assert t.last(LeaseChanged).lease.holder == carl.id
+    t.wait(t.config.grace_ns)
+    assert t.last(LeaseChanged).lease.queue == ()
+
+
+def test_who_wants_something_else_gives_up_a_kept_place() -> None:
+    t = Table()
+    ann, bert = t.operator("left", "right"), t.join()
+    bert.does(Acquire(7, ("left",), wait=True))
+    t.step(t.host(SessionResumed(SECOND)), dt_ns=SECOND)
+    ann, bert = rejoin(t, ann), rejoin(t, bert)
+    bert.does(Acquire(1, ("right",), wait=True))
+    assert {event.lease.target: event.lease.queue for event in t.since(LeaseChanged)} == {
+        "left": (),
+        "right": (bert.id,),
+    }
+
+
 def test_grace_goes_on_while_physics_is_paused() -> None:
     t = Table()
     anna = t.operator("left")
