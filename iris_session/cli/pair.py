@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
+#: By the reason why nobody has paired.
+TEXTS: Final = {
+    "void": "void after five wrong attempts: make another code",
+    "expired": "expired: nobody used it",
+    "not_listed": "used, but the key is not on the list: see the session's terminal, and make another code",
+}
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -159,7 +165,8 @@ def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
     while True:
         if home.codes.signature != seen:
             seen = home.codes.signature
-            now = home.codes.find(made.id)
+            with home.folder.locked():  # held from the use of a code until the key is on the list
+                now = home.codes.find(made.id)
             if now is None or now.paired or not now.open(time.time()):
                 break
         if time.time() >= made.expires:
@@ -167,15 +174,24 @@ def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
             break
         time.sleep(POLL_S)
     entry = None if now is None else now.paired
-    if entry is not None:
+    listed = entry is not None and entry.fingerprint in home.clients.read()
+    if entry is not None and listed:
         told: dict[str, Any] = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": list(entry.roles)}
         text = f"paired: {entry.name} ({entry.fingerprint})"
     else:
-        void = now is not None and now.attempts_left == 0
-        told = {"paired": None, "reason": "void" if void else "expired"}
-        text = "void after five wrong attempts: make another code" if void else "expired: nobody used it"
+        reason = _reason(now)
+        told = {"paired": None, "reason": reason}
+        text = TEXTS[reason]
     if arguments.json:
         print_json(told)
     else:
         print(text, flush=True)
-    return 0 if entry is not None else 1
+    return 0 if listed else 1
+
+
+def _reason(code: JoinCode | None) -> str:
+    """Why nobody has paired."""
+    if code is not None and code.attempts_left == 0:
+        return "void"
+    used = code is not None and (code.paired is not None or (not code.secret and time.time() < code.expires))
+    return "not_listed" if used else "expired"

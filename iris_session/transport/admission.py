@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from iris_session.keys import DEFAULT_ROLES, fingerprint
+from iris_session.keys import fingerprint
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.limits import RateLimiter
@@ -13,9 +13,10 @@ from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer, Route
 from iris_session.transport.config import FrontConfig, Ports
 from iris_session.transport.doors import Doors
-from iris_session.transport.keyring import Keyring
-from iris_session.transport.limiter import Drops, TokenBucket
+from iris_session.transport.keyring import Keyring, roles_behind
+from iris_session.transport.limiter import Drops
 from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.shares import HelloShares, connections_of_one
 from iris_session.transport.sockets import peer_of
 
 SECRET_BYTES = 16  # 128 bits, made by the client
@@ -106,7 +107,13 @@ class Admission:
             knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
             if not knocks.allow(Hello, now_ns):
                 return False
-        return self._hellos.take(now_ns)
+        return self._hellos.take(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+
+    def _held_by(self, key_id: str) -> int:
+        """Connections of one key, people behind it included."""
+        connections = self._clients.by_number
+        gateways = {number for number, one in connections.items() if one.key_id == key_id}
+        return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
 
     def forget_peer(self, descriptor: int) -> None:
         """A TCP connection was closed: its descriptor may become another's."""
@@ -156,17 +163,14 @@ class Admission:
         return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
     def _roles(self, key_id: str, gateway: Connection | None) -> tuple[str, ...]:
-        """What the key may join as, empty for any role. People behind a gateway get the other roles of its key; when it
-        has no other, those that a new key gets."""
+        """What the key may join as, empty for any role."""
         entry = self._keyring.find(gateway.key_id if gateway else key_id)
         if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
             raise _RefusedError(
                 RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
             )
         roles = () if entry is None else entry.roles
-        if gateway is None or not roles:
-            return roles
-        return tuple(role for role in roles if role != Role.GATEWAY) or DEFAULT_ROLES
+        return roles if gateway is None else roles_behind(roles)
 
     def _resume(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         if not hello.resume_token:
@@ -187,7 +191,9 @@ class Admission:
         if connection is None:
             return
         config = self._config
-        token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token)
+        gateway = self._clients.by_number.get(connection.gateway)
+        behind = gateway.key_id if gateway is not None else ""
+        token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
         connection.admitted = True
         self._keyring.welcomed(connection.key_id)
         connection.participant_id = admitted.participant_id

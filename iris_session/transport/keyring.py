@@ -7,9 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from iris_session.keys import AllowedKey, KeyHome, KeyPair, KeysError, fingerprint, load_public, load_secret, raw_key
+from iris_session.keys import (
+    DEFAULT_ROLES,
+    AllowedKey,
+    KeyHome,
+    KeyPair,
+    KeysError,
+    fingerprint,
+    load_public,
+    load_secret,
+    raw_key,
+)
 from iris_session.keys.allow_list import utc_now
+from iris_session.protocol.names import Role
 from iris_session.transport.config import FrontConfig, FrontError
+from iris_session.transport.file_worker import FileWorker
 from iris_session.transport.limiter import Drops
 
 #: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
@@ -21,11 +33,19 @@ def stranger_key(user_id: str) -> str:
     return user_id.removeprefix(STRANGER) if user_id.startswith(STRANGER) else ""
 
 
+def roles_behind(roles: tuple[str, ...]) -> tuple[str, ...]:
+    """What people may join as behind a gateway whose key has `roles` (empty: any): the others of them; where there is
+    no other, what a new key may."""
+    return tuple(role for role in roles if role != Role.GATEWAY) or (DEFAULT_ROLES if roles else ())
+
+
 class Keyring:
-    """`key`: the server's, `None` on plain loopback. `home`: where unknown keys may pair, else `None`.
+    """A `Service`. `key`: the server's, `None` on plain loopback. `home`: where unknown keys may pair, else `None`;
+    its files are changed by `files` only.
 
     Since somebody emptied them: `gone`: keys that were taken off the list, or got other roles; `come`: keys that were
-    put on it; `seen`: keys that joined, with the time in UTC.
+    put on it; `seen`: keys that joined, with the time in UTC. `revoking`: keys that a director revoked and that are
+    still in the file. `watching`: keys that were let in to the state socket since it was opened.
     """
 
     def __init__(
@@ -41,11 +61,22 @@ class Keyring:
         self._read = read
         self._signature = signature
         self._drops = drops or Drops()
-        self._seen = signature()
+        self._seen: object = signature()
         self._keys = read()
         self.gone: dict[str, AllowedKey] = {}
         self.come: dict[str, AllowedKey] = {}
         self.seen: dict[str, str] = {}
+        self.revoking: dict[str, None] = {}
+        self.watching: set[str] = set()
+        self.files = FileWorker()
+
+    def turn(self, now_ns: int) -> None:
+        """Tells those who had files changed."""
+        self.files.turn(now_ns)
+
+    def close(self) -> None:
+        """What was asked for is still written."""
+        self.files.close()
 
     def find(self, mark: str) -> AllowedKey | None:
         """The allowed key with that fingerprint."""
@@ -55,6 +86,16 @@ class Keyring:
         """A key has joined."""
         if self.home is not None and mark in self._keys:
             self.seen[mark] = utc_now()
+
+    def paired(self, mark: str) -> bool:
+        """A key was put on the list by the session itself. True: it still is, and may join whatever it was before."""
+        self._seen = object()  # read it in any case: somebody may have taken the key off again since
+        self.look()
+        entry = self._keys.get(mark)
+        if entry is None:
+            return False
+        self.come[mark] = entry
+        return True
 
     def look(self) -> None:
         """Reads the list again if its file has changed. One that is damaged changes nothing, and is said."""

@@ -1,4 +1,4 @@
-"""The one loop of the front process, all sockets wired. No thread of ours.
+"""The one loop of the front process, all sockets wired. Of our threads there is only the one of `FileWorker`.
 
 It drains the link to the authority first (state goes out before anything else), then the control socket in small
 rounds with a look at the link in between. It never waits for a client, nor for the authority.
@@ -91,7 +91,7 @@ class Front:
         raw = RawFeed(sockets.context, config.recorder_endpoint, self._drops)
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
         memory = MemoryWatch(config.limits.memory_bytes, doors.shed, self._shed)
-        self._services += [self._status, doors, memory]
+        self._services += [self._keyring, self._status, doors, memory]
         self._intake = Intake(
             config,
             self._clients,
@@ -168,7 +168,7 @@ class Front:
         facts = Facts(key.public if key else "", lambda: self._pairing.open, lambda: len(self._clients))
         services: list[Service] = []
         if self._keyring.home is not None:
-            services.append(NoteKeeper(self._keyring.home, config, sockets.ports))
+            services.append(NoteKeeper(self._keyring.home, self._keyring.files, config, sockets.ports))
         return services + announce(config, sockets.ports, sockets.listeners, self._drops, facts)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:

@@ -1,7 +1,7 @@
 """Pairing: an unknown key shows that it knows a join code, and is put on the allow-list.
 
-A code has few attempts, and so has an address. The files of the home of keys are changed in the front's turns, one
-attempt each, and never waited for.
+A code has few attempts, and so has an address. One attempt after the other goes to `FileWorker`, which changes the
+files of the home of keys; the answer is sent when that is done, and nothing else waits for it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import ipaddress
 import sys
 import time
 from collections import deque
+from functools import partial
 from typing import Final, NamedTuple
 
 from iris_session.keys import KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
@@ -21,19 +22,27 @@ from iris_session.protocol.server_messages import Refused
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import Outbox, Peer, Route
 from iris_session.transport.config import SECOND
+from iris_session.transport.file_worker import PATIENCE_S
 from iris_session.transport.keyring import Keyring, stranger_key
 from iris_session.transport.limiter import Drops, TokenBucket
 from iris_session.transport.sockets import peer_of
 
-#: Of everybody together; so at most `BURST` wait.
+#: Of everybody together.
 PER_SECOND: Final = 10.0
 BURST: Final = 16
-#: How long another process may keep us from the files.
+#: Of one address, before it counts against everybody.
+ADDRESS_PER_SECOND: Final = 2.0
+ADDRESS_BURST: Final = 12
+#: How long an attempt may wait for its turn, and how many may: a client waits 5 s for the answer.
 PATIENCE_NS: Final = 2 * SECOND
+MAX_WAITING: Final = 32
 #: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
 MAX_ADDRESSES: Final = 1024
+REVOKED: Final = "this key was revoked just now"
+BUSY: Final = "the list of keys is busy"
+SHUT_OUT: Final = "too many wrong codes from this address"
 
 
 class _Waiting(NamedTuple):
@@ -54,7 +63,9 @@ class PairingDesk:
         self._drops = drops
         self._pairs = TokenBucket(PER_SECOND, BURST)
         self._complaints = TokenBucket(PER_SECOND, BURST)
-        self._waiting: deque[_Waiting] = deque(maxlen=4 * BURST)
+        self._waiting: deque[_Waiting] = deque()
+        self._trying = False
+        self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
         self._codes: tuple[float, ...] = ()  # when the open codes expire, UTC seconds
@@ -81,7 +92,13 @@ class PairingDesk:
         known = self._keyring.find(peer.user_id)
         if known is not None:
             key = known.key
-        if not self._pairs.take(now_ns):
+        taken = self._rate(address, now_ns)
+        if self._exhausted(address, now_ns):  # before all that others have a share in
+            self._audit.note(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
+            self._drops.count("pair_shut_out")
+            if taken:
+                self._refuse(route, SHUT_OUT, "wait ten minutes")
+        elif not taken or not self._pairs.take(now_ns) or len(self._waiting) >= MAX_WAITING:
             self._drops.count("pair_rate")
             if self._complaints.take(now_ns):
                 advice = "try again in a second"
@@ -94,9 +111,8 @@ class PairingDesk:
             self._refuse(route, "a key pairs for itself", "leave on_behalf_of empty")
         elif self._keyring.home is None:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
-        elif self._exhausted(address, now_ns):
-            self._audit.note(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
-            self._refuse(route, "too many wrong codes from this address", "wait ten minutes")
+        elif fingerprint(raw_key(key)) in self._keyring.revoking:
+            self._refuse(route, REVOKED, "ask for another join code")
         elif not self.open:
             mark = fingerprint(raw_key(key))
             self._audit.note(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
@@ -105,34 +121,44 @@ class PairingDesk:
             self._waiting.append(_Waiting(route, address, key, pair, now_ns))
 
     def turn(self, now_ns: int) -> None:
-        """Takes one attempt."""
-        if not self._waiting:
+        """Begins the next attempt when the one before is done."""
+        waiting, self._waiting = self._waiting, deque()
+        for one in waiting:
+            self._sort(one, now_ns)
+        if self._trying or not self._waiting:
             return
-        waiting = self._waiting.popleft()
         home, key = self._keyring.home, self._keyring.key
         assert home is not None
         assert key is not None
-        try:
-            attempt = self._attempt(home, key, waiting)
-        except KeysBusyError:
-            if now_ns - waiting.since_ns < PATIENCE_NS:
-                self._waiting.append(waiting)
-            else:
-                self._refuse(waiting.route, "the list of keys is busy", "try again")
-        except KeysError as error:
-            self._say(error)
+        first = self._waiting[0]
+        self._trying = self._keyring.files.submit(partial(_attempt, home, key, first), partial(self._tried, first, key))
+        if self._trying:
+            self._waiting.popleft()
+
+    def _sort(self, one: _Waiting, now_ns: int) -> None:
+        """Lets an attempt wait on, or ends it: much may have happened since it came."""
+        if now_ns - one.since_ns > PATIENCE_NS:
+            self._refuse(one.route, BUSY, "try again")
+        elif fingerprint(raw_key(one.key)) in self._keyring.revoking:
+            self._refuse(one.route, REVOKED, "ask for another join code")
+        elif self._exhausted(one.address, now_ns):
+            self._refuse(one.route, SHUT_OUT, "wait ten minutes")
+        else:
+            self._waiting.append(one)
+
+    def _tried(self, waiting: _Waiting, key: KeyPair, outcome: Attempt | KeysError, now_ns: int) -> None:
+        self._trying = False
+        if isinstance(outcome, Attempt):
+            self._answer(waiting, outcome, key, now_ns)
+        elif isinstance(outcome, KeysBusyError):
+            self._refuse(waiting.route, BUSY, "try again")
+        else:
+            self._say(outcome)
             advice = "whoever runs the session finds more at its terminal"
             self._refuse(waiting.route, "the session cannot change its list of keys", advice)
-        else:
-            self._answer(waiting, attempt, key, now_ns)
 
     def close(self) -> None:
         """Nothing was opened."""
-
-    def _attempt(self, home: KeyHome, key: KeyPair, waiting: _Waiting) -> Attempt:
-        pair = waiting.pair
-        name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
-        return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, patience_s=0.0)
 
     def _answer(self, waiting: _Waiting, attempt: Attempt, key: KeyPair, now_ns: int) -> None:
         client = raw_key(waiting.key)
@@ -140,7 +166,11 @@ class PairingDesk:
         entry = attempt.entry
         if entry is not None:
             self._wrong.pop(_network(waiting.address), None)
-            self._keyring.look()
+            if mark in self._keyring.revoking or not self._keyring.paired(
+                mark
+            ):  # since it asked: the later word counts
+                self._refuse(waiting.route, REVOKED, "ask for another join code")
+                return
             roles = ", ".join(entry.roles) or "any role"
             self._audit.note(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=waiting.address, detail=roles
@@ -158,6 +188,15 @@ class PairingDesk:
         self._drops.count("pair_refused")
         self._outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
 
+    def _rate(self, address: str, now_ns: int) -> bool:
+        """Whether this address may ask now."""
+        network = _network(address)
+        bucket = self._rates.pop(network, None) or TokenBucket(ADDRESS_PER_SECOND, ADDRESS_BURST, now_ns)
+        while len(self._rates) >= MAX_ADDRESSES:
+            del self._rates[next(iter(self._rates))]
+        self._rates[network] = bucket
+        return bucket.take(now_ns)
+
     def _exhausted(self, address: str, now_ns: int) -> bool:
         wrong, since_ns = self._wrong.get(_network(address), (0, now_ns))
         return wrong >= ADDRESS_ATTEMPTS and now_ns - since_ns < WINDOW_NS
@@ -174,6 +213,12 @@ class PairingDesk:
     @staticmethod
     def _say(error: KeysError) -> None:
         print(f"iris-session: pairing does not work: {error}", file=sys.stderr, flush=True)
+
+
+def _attempt(home: KeyHome, key: KeyPair, waiting: _Waiting) -> Attempt:
+    pair = waiting.pair
+    name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
+    return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, PATIENCE_S)
 
 
 def _network(address: str) -> str:

@@ -17,6 +17,7 @@ class _Record(msgspec.Struct, array_like=True):
     digest: bytes
     key_id: str
     participant_id: str
+    behind: str = ""  # key of the gateway that speaks for the participant
 
 
 class _Handback(msgspec.Struct, array_like=True):
@@ -63,8 +64,9 @@ class ResumeTokens:
         self.changed = True
         return number
 
-    def issue(self, key_id: str, participant_id: str, came_with: bytes = b"") -> bytes:
-        """A fresh token for `participant_id`, which has at most two: the one it `came_with`, and this.
+    def issue(self, key_id: str, participant_id: str, came_with: bytes = b"", behind: str = "") -> bytes:
+        """A fresh token for `participant_id`, which has at most two: the one it `came_with`, and this. `behind`: key of
+        the gateway that speaks for it.
 
         The oldest token is forgotten when the table is full: that of who lost the connection longest ago, since those
         who are gone for good have none (`left`).
@@ -78,7 +80,7 @@ class ResumeTokens:
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
         self.changed = True
-        self._records[digest] = _Record(digest, key_id, participant_id)
+        self._records[digest] = _Record(digest, key_id, participant_id, behind)
         return token
 
     def find(self, token: bytes, key_id: str) -> str | None:
@@ -97,8 +99,9 @@ class ResumeTokens:
             self.changed = True
 
     def revoke(self, key_id: str) -> list[str]:
-        """Uses up every token of a key. The participants that they stand for, each once."""
-        theirs = [record for record in self._records.values() if record.key_id == key_id]
+        """Uses up every token of a key, and of those behind it if it is a gateway's. The participants that they stand
+        for, each once."""
+        theirs = [record for record in self._records.values() if key_id in (record.key_id, record.behind)]
         for record in theirs:
             del self._records[record.digest]
         self._revoked.pop(key_id, None)

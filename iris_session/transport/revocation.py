@@ -1,18 +1,19 @@
-"""Revoked keys: their connections end at once, their participants are removed, the state socket is opened anew.
+"""Revoked keys: their connections end at once, and those behind them; their participants are removed.
 
-libzmq cannot drop one subscriber. So the state socket is closed and opened again on the same port: everyone else
-connects again within a fraction of a second, the revoked key is not let in.
+libzmq cannot drop one subscriber. So, if the key may have one, the state socket is closed and opened again on the same
+port: everyone else connects again within a fraction of a second, the revoked key is not let in.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import zmq
 
-from iris_session.keys import KeysBusyError, KeysError
+from iris_session.keys import AllowList, KeysBusyError, KeysError
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.security import RemoveParticipant
@@ -20,7 +21,8 @@ from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Outbox
 from iris_session.transport.config import MILLISECOND, SECOND, FrontError
-from iris_session.transport.keyring import Keyring
+from iris_session.transport.file_worker import PATIENCE_S
+from iris_session.transport.keyring import Keyring, roles_behind
 from iris_session.transport.resume_tokens import ResumeTokens
 from iris_session.transport.sockets import close_tcp
 from iris_session.transport.state_publisher import StatePublisher
@@ -32,6 +34,8 @@ FAREWELL_NS: Final = 100 * MILLISECOND
 PORT_FREE_NS: Final = 5 * SECOND
 SEEN_NS: Final = 60 * SECOND
 REVOKED: Final = "this key was taken off the session's list"
+GATEWAY_REVOKED: Final = "the gateway's key was taken off the session's list"
+ROLE_TAKEN: Final = "its key lost the role"
 
 
 class Revocation:
@@ -60,14 +64,14 @@ class Revocation:
         self._lose = lose
         self._open_state = open_state
         self._leaving: list[tuple[int, Connection]] = []
-        self._to_revoke: dict[str, None] = {}
+        self._writing = False
         self._said = ""  # what went wrong with the list last
         self._state_due_ns = 0  # while the state socket is closed: when its port should have been free
         self._next_look_ns = self._next_seen_ns = 0
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """A director's word: ends the key here, and takes it off the list."""
-        self._to_revoke[key_id] = None
+        self._keyring.revoking[key_id] = None
         self._end(key_id, now_ns, "a director revoked this key")
 
     def remove(self, connection: Connection, text: str, now_ns: int, reason: str = "revoked") -> None:
@@ -95,7 +99,7 @@ class Revocation:
                     self._audit.note(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
                     self._end(mark, now_ns, REVOKED)
                 else:
-                    self._narrow(mark, now.roles)
+                    self._narrow(mark, now.roles, now_ns)
         while self._keyring.come:
             self._tokens.forgive(self._keyring.come.popitem()[0])
         if self._state_due_ns:
@@ -107,21 +111,48 @@ class Revocation:
             close_tcp(gone.peer.descriptor, gone.address)
 
     def _end(self, key_id: str, now_ns: int, text: str) -> None:
-        for connection in [c for c in self._clients.by_number.values() if c.key_id == key_id]:
+        for connection in self._of(key_id):
+            for one in self._clients.behind(connection):
+                self.remove(one, GATEWAY_REVOKED, now_ns)
             self.remove(connection, text, now_ns)
-            self._lose(connection, "revoked")
+            self._lose(connection, "revoked")  # and those behind it
         for participant in self._tokens.revoke(key_id):
-            self._offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason="key revoked")))
-        if self._keyring.key is not None and not self._state_due_ns:
+            self._expel(participant, "key revoked", now_ns)
+        if key_id in self._keyring.watching and not self._state_due_ns:
             self._publisher.use_socket(None)
+            self._keyring.watching.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
-    def _narrow(self, key_id: str, roles: tuple[str, ...]) -> None:
-        """A key has other roles now: connections in a role that it lost are closed, and refused when they come back."""
-        for connection in [c for c in self._clients.by_number.values() if c.key_id == key_id]:
+    def _narrow(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
+        """A key has other roles now: whoever is here in a role that it lost, itself or behind it, is removed, and
+        refused when it comes back."""
+        for connection in self._of(key_id):
+            behind = self._clients.behind(connection)
             if roles and connection.hello.role not in roles:
-                self._lose(connection, "role")
-                close_tcp(connection.peer.descriptor, connection.address)
+                lost = [*behind, connection]
+            else:
+                left = roles_behind(roles)
+                lost = [one for one in behind if left and one.hello.role not in left]
+            for one in lost:
+                self._end_role(one, now_ns)
+
+    def _end_role(self, connection: Connection, now_ns: int) -> None:
+        participant, role = connection.participant_id, connection.hello.role
+        if connection.gateway:
+            text = f"the session let this connection go: its gateway may speak for no {role} any more"
+            self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
+        self._lose(connection, "role")
+        if not connection.gateway:
+            close_tcp(connection.peer.descriptor, connection.address)
+        if participant:
+            self._tokens.left(participant)
+            self._expel(participant, ROLE_TAKEN, now_ns)
+
+    def _of(self, key_id: str) -> list[Connection]:
+        return [c for c in self._clients.by_number.values() if c.key_id == key_id]
+
+    def _expel(self, participant: str, reason: str, now_ns: int) -> None:
+        self._offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
 
     def _reopen(self, now_ns: int) -> None:
         try:
@@ -134,22 +165,36 @@ class Revocation:
         self._state_due_ns = 0
 
     def _write(self, now_ns: int) -> None:
-        """Changes the list, without waiting for others who change it."""
-        home = self._keyring.home
-        if home is None:
-            self._to_revoke.clear()
+        """Has the list changed. What it says is decided already: nobody waits for the file."""
+        keyring = self._keyring
+        if keyring.home is None:
+            keyring.revoking.clear()
             return
-        try:
-            for key_id in tuple(self._to_revoke):
-                home.clients.revoke(key_id, patience_s=0.0)
-                del self._to_revoke[key_id]
-            if self._keyring.seen and now_ns >= self._next_seen_ns:
-                self._next_seen_ns = now_ns + SEEN_NS
-                home.clients.seen(self._keyring.seen, patience_s=0.0)
-                self._keyring.seen = {}
-        except KeysBusyError:
+        due = bool(keyring.seen) and now_ns >= self._next_seen_ns
+        if self._writing or not (keyring.revoking or due):
             return
-        except KeysError as error:
-            if str(error) != self._said:  # the key stays out of this session; its file is tried again
-                self._said = str(error)
-                print(f"iris-session: the allow-list cannot be changed: {error}", file=sys.stderr, flush=True)
+        marks, seen = tuple(keyring.revoking), keyring.seen if due else {}
+        job = partial(_change, keyring.home.clients, marks, seen)
+        self._writing = keyring.files.submit(job, partial(self._written, marks, seen))
+        if self._writing and due:
+            self._next_seen_ns = now_ns + SEEN_NS
+            keyring.seen = {}
+
+    def _written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
+        self._writing = False
+        keyring = self._keyring
+        if outcome is None:
+            for mark in marks:
+                keyring.revoking.pop(mark, None)
+            return
+        keyring.seen = {**seen, **keyring.seen}
+        if not isinstance(outcome, KeysBusyError) and str(outcome) != self._said:
+            self._said = str(outcome)  # the key stays out of this session; its file is tried again
+            print(f"iris-session: the allow-list cannot be changed: {outcome}", file=sys.stderr, flush=True)
+
+
+def _change(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
+    for mark in marks:
+        clients.revoke(mark, PATIENCE_S)
+    if seen:
+        clients.seen(seen, PATIENCE_S)

@@ -66,6 +66,8 @@ class Authenticator:
             return ""
         mark = fingerprint(request[6])
         if self._keyring.find(mark) is not None and (request[2] == ZAP_CONTROL or not self.banned(mark)):
+            if request[2] != ZAP_CONTROL:
+                self._keyring.watching.add(mark)
             return mark  # a revoked one is told why it may not join, and gets no state
         self._drops.count("unknown_key")
         if self._keyring.home is not None and request[2] == ZAP_CONTROL:

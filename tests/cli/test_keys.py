@@ -6,6 +6,7 @@ import json
 import os
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from zmq.auth import create_certificates
 
 from iris_session.cli.main import main
 from iris_session.client.address import Address
-from iris_session.keys import KeyHome, KeyPair, SessionNote
+from iris_session.keys import KeyHome, KeyPair, KeysError, SessionNote
 from iris_session.protocol import pairing
 
 Capture = pytest.CaptureFixture[str]
@@ -142,19 +143,29 @@ def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
     assert lab.codes.expiries(lab.server_key().fingerprint) == ()
 
 
-def test_pair_waits_and_says_who_came(lab: KeyHome, capsys: Capture) -> None:
+@pytest.mark.parametrize("full", [False, True])
+def test_pair_waits_and_says_who_came(
+    lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
     ann = KeyPair.new()
 
+    def full_disk(_entries: object) -> None:
+        raise KeysError("No space left on device")
+
     def use() -> None:
+        if full:
+            monkeypatch.setattr(lab.clients, "replace", full_disk)
         server = lab.server_key()
         while not lab.codes.expiries(server.fingerprint):
             time.sleep(0.01)
         (made,) = [one for one in lab.codes.read() if one.secret]
         proof = pairing.client_proof(made.secret, server.raw_public, ann.raw_public)
-        lab.codes.attempt(server.raw_public, ann.public, proof, "ann", lab.clients)
+        with nullcontext() if not full else pytest.raises(KeysError):
+            lab.codes.attempt(server.raw_public, ann.public, proof, "ann", lab.clients)
 
     user = threading.Thread(target=use)
     user.start()
-    assert main(["pair", "--role", "observer"]) == 0
+    assert main(["pair", "--role", "observer"]) == full
     user.join()
-    assert f"paired: ann ({ann.fingerprint})" in capsys.readouterr().out
+    said = "used, but the key is not on the list" if full else f"paired: ann ({ann.fingerprint})"
+    assert said in capsys.readouterr().out

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,7 @@ import pytest
 from zmq.auth import create_certificates
 
 from iris_session.keys import (
+    AllowedKey,
     KeyHome,
     KeyPair,
     KeysBusyError,
@@ -169,6 +171,56 @@ def test_a_proof_of_one_key_is_no_good_for_another(home: KeyHome) -> None:
     assert home.clients.read() == {}
 
 
+def test_a_code_is_used_up_before_anybody_is_let_in(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power cut between the two writes must not leave a code that lets a second key in."""
+    server, ann = home.server_key(), KeyPair.new()
+    code, made = home.codes.make(server)
+    proof = proof_of(code, server, ann)
+
+    def power_cut(_entries: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(home.clients, "replace", power_cut)
+        with pytest.raises(KeyboardInterrupt):
+            home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients)
+    assert home.clients.read() == {}
+    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
+
+    def full_disk(_entries: object) -> None:
+        raise KeysError("clients.json cannot be written: No space left on device")
+
+    code, made = home.codes.make(server)
+    with monkeypatch.context() as patch:
+        patch.setattr(home.clients, "replace", full_disk)
+        with pytest.raises(KeysError, match="No space left"):
+            home.codes.attempt(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+    kept = home.codes.find(made.id)
+    assert kept is not None
+    assert (kept.secret, kept.paired) == (b"", None), "nobody is said to have paired"
+
+
+def test_two_codes_and_two_devices_at_once(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two people run `pair` together, and three devices use their codes: everybody but the third gets in, as meant."""
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
+    server = home.server_key()
+    with ThreadPoolExecutor(3) as pool:
+        (code, _), (other, _) = pool.map(lambda role: home.codes.make(server, roles=(role,)), ("operator", "observer"))
+        people = {"ann": code, "bob": other, "eve": code}
+
+        def pairs(name: str) -> AllowedKey | None:
+            own = KeyPair.new()
+            proof = proof_of(people[name], server, own)
+            return home.codes.attempt(server.raw_public, own.public, proof, name, home.clients).entry
+
+        entries = dict(zip(people, pool.map(pairs, people), strict=True))
+    assert {entry.name: entry.roles for entry in entries.values() if entry} in (
+        {"ann": ("operator",), "bob": ("observer",)},
+        {"eve": ("operator",), "bob": ("observer",)},
+    )
+    assert len(home.clients.read()) == 2
+
+
 def test_five_wrong_attempts_make_every_open_code_void(home: KeyHome) -> None:
     server, ann = home.server_key(), KeyPair.new()
     codes = [home.codes.make(server)[0] for _ in range(2)]
@@ -203,7 +255,8 @@ def test_a_cancelled_code_is_void(home: KeyHome) -> None:
     assert (late.entry, home.codes.find(made.id)) == (None, None)
 
 
-def test_codes_are_bounded(home: KeyHome) -> None:
+def test_codes_are_bounded(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server = home.server_key()
     for _ in range(32):
         home.codes.make(server)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.transport.harness import FrontSession
+from tests.transport.lab import Lab, Open
 
 
 @pytest.fixture
@@ -27,3 +29,9 @@ def open_session() -> Iterator[Callable[..., FrontSession]]:
 def session(open_session: Callable[..., FrontSession]) -> FrontSession:
     """A front process on free ports with a minimal authority."""
     return open_session()
+
+
+@pytest.fixture
+def lab(open_session: Open, tmp_path: Path) -> Lab:
+    """An encrypted session with a home of keys of its own."""
+    return Lab(open_session, tmp_path / "home")

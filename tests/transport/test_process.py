@@ -384,7 +384,7 @@ def test_curve_lets_in_listed_keys_only_and_names_clients_by_key(open_session: O
 
 def _certificate(folder: Path, name: str) -> tuple[bytes, bytes]:
     zmq.auth.create_certificates(folder, name)
+    (folder / f"{name}.key_secret").chmod(0o600)
     public, secret = zmq.auth.load_certificate(folder / f"{name}.key_secret")
     assert secret is not None
     return public, secret
-    (folder / f"{name}.key_secret").chmod(0o600)

@@ -32,6 +32,17 @@ def test_the_next_front_goes_on_with_tokens_and_numbers() -> None:
     assert successor.new_connection() == 3
 
 
+def test_with_a_gateways_key_go_the_tokens_of_those_behind_it_also_in_the_next_front() -> None:
+    tokens = ResumeTokens(8)
+    tokens.issue("gateway", "p1")
+    tab = tokens.issue("key of a tab", "p2", behind="gateway")
+    other = tokens.issue("key of a tab", "p3", behind="another gateway")
+    successor = ResumeTokens(8, tokens.blob())
+    assert successor.revoke("gateway") == ["p1", "p2"]
+    assert successor.find(tab, "key of a tab") is None
+    assert successor.find(other, "key of a tab") == "p3"
+
+
 def test_changed_tells_when_to_hand_back() -> None:
     tokens = ResumeTokens(4)
     assert not tokens.changed

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 import zmq
 from zmq.auth import create_certificates
 
-from iris_session.keys import KeyHome, KeyPair, load_public, load_secret
+from iris_session.keys import KeyPair, load_public, load_secret
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker
 from iris_session.protocol.entries import Audit, Join, Lost
@@ -20,56 +19,8 @@ from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode
 from iris_session.protocol.security import Pair, Paired, RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault, Refused
 from iris_session.protocol.steps import Decision, Dropped
-from tests.transport.harness import FrontSession, RawClient
-
-Open = Callable[..., FrontSession]
-Curve = tuple[bytes, bytes, bytes]
-
-
-class Lab:
-    """An encrypted session on loopback and its home of keys."""
-
-    def __init__(self, open_session: Open, folder: Path) -> None:
-        self.home = KeyHome(folder)
-        self.server = self.home.server_key()
-        self.session = open_session(curve=True, key_home=str(folder))
-
-    def curve(self, pair: KeyPair) -> Curve:
-        return self.server.public.encode(), pair.public.encode(), pair.secret.encode()
-
-    def client(self, pair: KeyPair) -> RawClient:
-        return self.session.client(curve=self.curve(pair))
-
-    def allowed(self, name: str, *roles: str) -> tuple[KeyPair, RawClient]:
-        """A key on the list, and a client with it that has joined."""
-        pair = KeyPair.new()
-        self.home.clients.allow(name, pair.public, roles)
-        client = self.client(pair)
-        client.join(name=name)
-        return pair, client
-
-    def proof(self, code: str, pair: KeyPair) -> bytes:
-        secret = pairing.stretch(code, self.server.raw_public)
-        return pairing.client_proof(secret, self.server.raw_public, pair.raw_public)
-
-    def refused(self, client: RawClient, message: Hello | Pair | EStop | Marker, n: int = 1) -> Refused:
-        client.send(message)
-        return client.wait_for(Refused, n)
-
-    def audits(self, kind: str, n: int = 1) -> list[Audit]:
-        """What was reported to the authority, at least `n` in all."""
-
-        def found() -> list[Audit]:
-            messages = [e.message for e in self.session.entries]
-            return [m for m in messages if isinstance(m, Audit) and m.kind == kind]
-
-        self.session.pump(lambda: sum(a.count for a in found()) >= n, f"audit {kind}")
-        return found()
-
-
-@pytest.fixture
-def lab(open_session: Open, tmp_path: Path) -> Lab:
-    return Lab(open_session, tmp_path / "home")
+from tests.transport.harness import FrontSession
+from tests.transport.lab import Lab, Open
 
 
 def test_an_unknown_key_can_only_pair(lab: Lab) -> None:
@@ -278,9 +229,9 @@ def test_a_director_revokes_even_where_the_list_cannot_be_changed(open_session: 
     folder = tmp_path / "clients"
     folder.mkdir()
     server_file, _ = create_certificates(tmp_path, "server")
+    ann_file, _ = create_certificates(folder, "ann")
     for path in (*tmp_path.glob("*.key_secret"), *folder.glob("*.key_secret")):
         path.chmod(0o600)
-    ann_file, _ = create_certificates(folder, "ann")
     secret = server_file.replace(".key", ".key_secret")
     session = open_session(curve_secret_file=secret, curve_clients_dir=str(folder))
     pair = load_secret(ann_file.replace(".key", ".key_secret"))
@@ -393,6 +344,24 @@ def test_the_list_that_was_damaged_while_running_stays_as_it_was(lab: Lab) -> No
     path.write_bytes(good)
     lab.home.clients.revoke("ann")
     client.wait_for(ProtocolFault)
+
+
+def test_the_list_may_be_edited_by_hand_while_the_session_runs(lab: Lab) -> None:
+    _, ann = lab.allowed("ann")
+    _, bob = lab.allowed("bob")
+    path = lab.home.path / "clients.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(rows[1:]))  # in place
+    assert ann.wait_for(ProtocolFault).code == FaultCode.REVOKED
+    new = path.with_name("new")  # as editors do
+    new.write_text("[]")
+    new.chmod(0o644)
+    new.replace(path)
+    assert lab.session.wait_drops("allow_list_unreadable") >= 1
+    bob.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+    path.chmod(0o600)  # as the session said
+    assert bob.wait_for(ProtocolFault).code == FaultCode.REVOKED
 
 
 def test_strangers_that_never_finish_a_handshake_hold_nothing(lab: Lab) -> None:

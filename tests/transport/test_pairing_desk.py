@@ -1,0 +1,224 @@
+"""The pairing desk and revocation without sockets: shares of an attacker, a slow disk, words that cross."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from iris_session.keys import KeyHome, KeyPair
+from iris_session.protocol import pairing
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.security import Pair, Paired
+from iris_session.transport import pairing_desk
+from iris_session.transport.audit import AuditTrail
+from iris_session.transport.clients import ClientTable, Peer, Route
+from iris_session.transport.config import SECOND
+from iris_session.transport.keyring import STRANGER, Keyring
+from iris_session.transport.limiter import Drops
+from iris_session.transport.pairing_desk import BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
+from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.revocation import LOOK_NS, Revocation
+from tests.transport.slow_disk import slow_disk, turns
+
+
+class Outbox:
+    """Keeps what is sent, by routing id."""
+
+    def __init__(self) -> None:
+        self.sent: dict[bytes, list[Any]] = {}
+
+    def send_to_route(self, route: Route, message: object) -> None:
+        self.sent.setdefault(route.routing_id, []).append(message)
+
+
+class Publisher:
+    """Stands for the state socket."""
+
+    def use_socket(self, state: object) -> None:
+        pass
+
+
+class Desk:
+    """Keyring, desk and revocation of a front, in turns that the test takes. Addresses are made of descriptors."""
+
+    def __init__(self, folder: Path) -> None:
+        self.home = KeyHome(folder)
+        self.server = self.home.server_key()
+        self.drops = Drops()
+        self.outbox: Any = Outbox()
+        clients = self.home.clients
+        self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature, self.drops)
+        self.tokens = ResumeTokens(16)
+        audit = AuditTrail(lambda _entry: True)
+        self.desk = PairingDesk(self.keyring, self.outbox, audit, self.drops)
+        publisher: Any = Publisher()
+        self.revocation = Revocation(
+            self.keyring,
+            ClientTable(),
+            self.outbox,
+            self.tokens,
+            audit,
+            publisher,
+            lambda _entry: True,
+            lambda _connection, _reason: None,
+            lambda: publisher,
+        )
+        self.now_ns = 0
+
+    def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
+        peer = Peer(descriptor, STRANGER + own.public)
+        self.desk.take(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
+
+    def proof(self, code: str, own: KeyPair) -> bytes:
+        secret = pairing.stretch(code, self.server.raw_public)
+        return pairing.client_proof(secret, self.server.raw_public, own.raw_public)
+
+    def turn(self, _now_ns: int = 0) -> None:
+        self.now_ns += LOOK_NS
+        for service in (self.keyring, self.desk, self.revocation):
+            service.turn(self.now_ns)
+
+    def answers(self, own: KeyPair) -> list[Any]:
+        return list(self.outbox.sent.get(own.public.encode(), []))
+
+    def answer(self, own: KeyPair) -> Any:
+        """The one answer that comes."""
+        turns(self.turn, lambda: bool(self.answers(own)))
+        (message,) = self.answers(own)
+        return message
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
+    monkeypatch.setattr(pairing_desk, "peer_of", lambda descriptor: (f"10.0.0.{descriptor}", 5))
+    desk = Desk(tmp_path / "home")
+    yield desk
+    desk.keyring.close()
+
+
+def test_a_disk_that_takes_its_time_keeps_the_loop_from_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = KeyPair.new()
+    code, _ = desk.home.codes.make(desk.server)
+    desk.asks(own, desk.proof(code, own))
+    with slow_disk(monkeypatch) as disk:
+        turns(desk.turn, disk.waits.is_set)
+        for _ in range(5):
+            desk.turn()
+        assert desk.answers(own) == [], "the answer comes after the write"
+        assert desk.keyring.find(own.fingerprint) is None
+    assert isinstance(desk.answer(own), Paired)
+    assert desk.keyring.find(own.fingerprint) is not None
+    assert list(desk.home.clients.read()) == [own.fingerprint]
+
+
+def test_a_director_revokes_at_once_whatever_the_disk_does(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = KeyPair.new()
+    desk.home.clients.allow("ann", own.public)
+    desk.turn()
+    with slow_disk(monkeypatch) as disk:
+        desk.revocation.revoke(own.fingerprint, desk.now_ns)
+        assert desk.tokens.revoked(own.fingerprint)
+        turns(desk.turn, disk.waits.is_set)
+        desk.asks(own)
+        assert desk.answer(own).message == "this key was revoked just now", "not let in again by the way"
+        assert own.fingerprint in desk.home.clients.read()
+    turns(desk.turn, lambda: own.fingerprint not in desk.keyring.revoking)
+    assert desk.home.clients.read() == {}
+    assert desk.tokens.revoked(own.fingerprint)
+
+
+@pytest.mark.parametrize("when", ["waiting", "writing", "written"])
+def test_a_directors_word_while_the_key_pairs_counts(desk: Desk, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    own = KeyPair.new()
+    code, _ = desk.home.codes.make(desk.server)
+    desk.asks(own, desk.proof(code, own))
+    with slow_disk(monkeypatch) as disk:
+        if when != "waiting":
+            turns(desk.turn, disk.waits.is_set)
+        if when == "written":
+            disk.go_on()
+            turns(lambda _: None, lambda: bool(desk.home.clients.read()))
+        desk.revocation.revoke(own.fingerprint, desk.now_ns)
+    answer = desk.answer(own)
+    assert (answer.code, answer.message) == (RefusalCode.CODE, "this key was revoked just now")
+    turns(desk.turn, lambda: not desk.keyring.revoking)
+    desk.turn()
+    assert desk.home.clients.read() == {}
+    assert desk.keyring.find(own.fingerprint) is None
+    assert desk.tokens.revoked(own.fingerprint)
+
+
+def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(desk: Desk) -> None:
+    own = KeyPair.new()
+    code, _ = desk.home.codes.make(desk.server)
+    desk.asks(own, desk.proof(code, own))
+    desk.turn()
+    turns(lambda _: None, lambda: bool(desk.home.clients.read()))  # written, and not told yet
+    assert desk.home.clients.revoke("ann") is not None
+    desk.keyring.look()
+    assert desk.answer(own).message == "this key was revoked just now"
+    assert desk.keyring.find(own.fingerprint) is None
+
+
+def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(desk: Desk) -> None:
+    own = KeyPair.new()
+    desk.home.clients.allow("ann", own.public)
+    desk.turn()
+    desk.revocation.revoke(own.fingerprint, desk.now_ns)
+    turns(desk.turn, lambda: not desk.keyring.revoking)
+    code, _ = desk.home.codes.make(desk.server)
+    desk.asks(own, desk.proof(code, own))
+    assert isinstance(desk.answer(own), Paired)
+    desk.turn()
+    assert not desk.tokens.revoked(own.fingerprint)
+
+
+def test_who_has_no_attempts_left_takes_nothing_from_others(desk: Desk) -> None:
+    eve, ann = KeyPair.new(), KeyPair.new()
+    for _ in range(2):
+        desk.home.codes.make(desk.server)
+        for _ in range(5):
+            before = len(desk.answers(eve))
+            desk.asks(eve)
+            turns(desk.turn, lambda before=before: len(desk.answers(eve)) > before)
+    assert [m.message for m in desk.answers(eve)] == ["this join code is wrong, used or expired"] * 10
+    code, _ = desk.home.codes.make(desk.server)
+    for _ in range(200):
+        desk.asks(eve)
+    assert desk.drops.by_reason["pair_shut_out"] == 200
+    assert len(desk.answers(eve)) < 30, "and few are answered"
+    desk.asks(ann, desk.proof(code, ann), descriptor=2)
+    assert isinstance(desk.answer(ann), Paired)
+
+
+def test_one_address_cannot_use_up_what_all_may_ask(desk: Desk) -> None:
+    """Not even while there is no code that it could be wrong about."""
+    eve, ann = KeyPair.new(), KeyPair.new()
+    for _ in range(200):
+        desk.asks(eve)
+    desk.asks(ann, descriptor=2)
+    assert desk.answer(ann).message == "no join code can be used now"
+    assert desk.drops.by_reason["pair_rate"] >= 180
+
+
+def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, _ = desk.home.codes.make(desk.server)
+    first, *others = [KeyPair.new() for _ in range(MAX_WAITING + 3)]
+    desk.asks(first, desk.proof(code, first), descriptor=0)
+    with slow_disk(monkeypatch) as disk:
+        turns(desk.turn, disk.waits.is_set)
+        since_ns = desk.now_ns
+        for n, own in enumerate(others, 1):
+            desk.now_ns = since_ns + max(0, n - BURST) * SECOND // 10  # as fast as all together may ask
+            desk.asks(own, descriptor=n)
+        assert desk.now_ns - since_ns < PATIENCE_NS
+        *waiting, late, last = others
+        assert [desk.answer(own).code for own in (late, last)] == [RefusalCode.RATE] * 2
+        desk.now_ns += PATIENCE_NS
+        desk.turn()
+        assert {desk.answer(own).message for own in waiting} == {"the list of keys is busy"}
+    assert isinstance(desk.answer(first), Paired)
