@@ -14,9 +14,8 @@ from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer
 from iris_session.transport.config import FrontConfig, Ports
 from iris_session.transport.doors import Doors
 from iris_session.transport.keyring import Keyring, roles_behind
-from iris_session.transport.limiter import Drops
+from iris_session.transport.limiter import Drops, TokenBucket
 from iris_session.transport.resume_tokens import ResumeTokens
-from iris_session.transport.shares import HelloShares, connections_of_one
 from iris_session.transport.sockets import peer_of
 
 SECRET_BYTES = 16  # 128 bits, made by the client
@@ -107,13 +106,7 @@ class Admission:
             knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
             if not knocks.allow(Hello, now_ns):
                 return False
-        return self._hellos.take(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
-
-    def _held_by(self, key_id: str) -> int:
-        """Connections of one key, people behind it included."""
-        connections = self._clients.by_number
-        gateways = {number for number, one in connections.items() if one.key_id == key_id}
-        return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
+        return self._hellos.take(now_ns)
 
     def forget_peer(self, descriptor: int) -> None:
         """A TCP connection was closed: its descriptor may become another's."""
