@@ -1,5 +1,7 @@
-"""Geometry of anchors: rigid transforms (`pose`), and the alignment of a headset by anchors of known pose (`alignment`,
-`robust`).
+"""Headsets on the same spot of the room: geometry, detection and estimation around physical references.
 
-Pure, usable without the server; imports nothing of iris_session.
+Geometry: `pose` (plain tuples, hot paths), `lie` (arrays), `noise` and `uncertainty` (what is known, what is stated).
+Alignment of one headset: `alignment`, with `groups`, `robust`, `solve` behind it; `touch` and `controller` by a motion
+controller. Over time: `drift` (alarms), `smooth` (corrections), `crosscheck` (between headsets). Several sheets:
+`constellation`. Pure, usable without the server; imports nothing of iris_session. Mathematics: docs/anchors.md.
 """

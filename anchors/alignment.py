@@ -1,16 +1,17 @@
 """Estimates `T_world_tracking` of one headset from observations of anchors whose world pose is known.
 
-First useful form: 4 degrees of freedom (yaw and translation; headset frames and the world are gravity-aligned to about
-0.2 deg), robust against wrong detections, with a covariance that counts what is systematic within one viewpoint once.
-Pure: time and observations are passed in, nothing is read. How observations are merged and solved: `anchors.robust`.
+Yaw and translation are free; the tilt is held near zero by gravity, which headsets and worlds share to about 0.2 deg,
+and gives way only as far as rotations or the baselines between several anchors measure it better (`dof` 6: no gravity).
+Robust against wrong detections, mirrored poses and moved sheets; the covariance counts what is common to a viewpoint
+once. Pure: time and observations are passed in. Mathematics and sources: docs/anchors.md.
 
-Noise models are optimistic, so both stages check them against what is left over: residuals larger than stated widen
-the covariance (Birge ratio: chi-square per degree of freedom). Where no majority agrees there is no result: fewer than
-`min_agreeing` of one viewpoint's observations, or two viewpoints that chi-square tells apart at 99.9 %.
+Noise models are optimistic, so every stage checks them against what is left over: residuals larger than stated widen
+the covariance (Birge ratio: chi-square per degree of freedom). Where no majority agrees there is no result.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,38 +19,60 @@ from typing import Final
 
 import numpy as np
 
-from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_yaw, quat_rotate
-from anchors.robust import Array, Merged, merge, solve, wrap_angle
+from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, upright
+from anchors.groups import Key, Memory, Sighting
+from anchors.lie import Array, swing
+from anchors.noise import NoiseModel, isotropic
+from anchors.pose import PoseTuple, Quat, Vec3, compose, inverse, quat_mul, quat_normalize, quat_rotate
+from anchors.robust import Merged
+from anchors.solve import Prior, Problem, Solution, agreeing_anchors, in_world, inverted, problem, solve
+from anchors.uncertainty import Z99, at_point, chi2_quantile, position_error_p95, rotation_error_p95
 
-_CHI2_4_999: Final = 18.467  # 99.9 % quantile of chi-square with 4 degrees of freedom
-_CONTRADICT: Final = (
-    "observations contradict each other: did the sheet move, or the headset lose tracking? hold still, look at the "
-    "sheet again"
-)
+__all__ = [
+    "AlignmentConfig",
+    "AlignmentEstimate",
+    "AlignmentEstimator",
+    "mirrored",
+    "position_error_p95",
+]
+
+_NOWHERE: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
 class AlignmentConfig:
     """Bounds and noise model of the estimator.
 
-    `position_sigma_m` and `rotation_sigma_rad` are used per axis when an observation carries no covariance.
-    `tilt_sigma_rad`: how far a headset's vertical may be off. `max_error_m`: the stated p95 at the anchor above which
-    the estimate is refused. `max_observations`: the oldest are forgotten (counted in `forgotten`), as are those older
-    than the newest by more than `max_age_ns` (`outdated`): tracking drifts. `min_agreeing`: share of one viewpoint's
+    `noise` is used where it is known from where an anchor was seen, `position_sigma_m` and `rotation_sigma_rad` (per
+    axis) where nothing is. `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
+    vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong. `drift_m_per_s`, `walk_m_per_sqrt_s`:
+    how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the anchors above which the
+    estimate is refused. `max_observations`, `max_groups`: the oldest are forgotten (counted in `forgotten`), as are
+    those older than the newest by more than `max_age_ns` (`outdated`). `min_agreeing`: share of one viewpoint's
     observations that must agree. `size_tolerance`: by what share a sheet may measure otherwise than it should.
     """
 
     position_sigma_m: float = 0.005
     rotation_sigma_rad: float = math.radians(0.6)
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    dof: int = 4
     tilt_sigma_rad: float = math.radians(0.2)
     tilt_warning_rad: float = math.radians(1.0)
+    max_tilt_rad: float = math.radians(15.0)
+    drift_m_per_s: float = 0.003 / 60.0 / math.sqrt(3.0)
+    walk_m_per_sqrt_s: float = 0.0005 / math.sqrt(60.0)
     max_error_m: float = 0.03
     min_observations: int = 5
     max_observations: int = 600
+    max_groups: int = 48
     max_age_ns: int = 600 * 1_000_000_000
-    max_iterations: int = 20
     min_agreeing: float = 0.6
     size_tolerance: float = 0.03
+
+    @property
+    def prior(self) -> Prior:
+        tilt = self.tilt_sigma_rad if self.dof == 4 else math.inf
+        return Prior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
 
 
 @dataclass(frozen=True)
@@ -57,6 +80,7 @@ class AlignmentEstimate:
     """Result, or the reason why there is none (`refused`, with `advice` for the person who wears the headset).
 
     `covariance`: 36 values, 6x6 row-major, order (x, y, z [m], rx, ry, rz [rad]), world frame, at `pivot_world`.
+    `residual_tilt_rad`: tilt of the frame as the anchors alone show it. `moved`: anchors that all others outvote.
     """
 
     T_world_tracking: PoseTuple
@@ -69,53 +93,28 @@ class AlignmentEstimate:
     n_viewpoints: int
     refused: bool
     advice: str
+    moved: tuple[str, ...] = ()
 
+    def covariance_at(self, point_world: Vec3) -> Array:
+        """Covariance (3, 3) [m^2] of the position error at a point of the world."""
+        return at_point(self.covariance, self.pivot_world, point_world)
 
-@dataclass(frozen=True)
-class _Observation:
-    anchor_id: str
-    viewpoint_id: int
-    capture_ns: int
-    size_m: float
-    p_tracking_anchor: Array  # (3,)
-    T_world_tracking_yaw: float
-    tilt_rad: float
-    position_var: float  # per axis [m^2]
-    yaw_var: float  # [rad^2]
+    def error_at(self, point_world: Vec3) -> float:
+        """Stated p95 [m] at a point of the world, infinite when refused."""
+        return math.inf if self.refused else position_error_p95(self.covariance, self.pivot_world, point_world)
 
-
-def position_error_p95(covariance: tuple[float, ...], pivot_world: Vec3, point_world: Vec3) -> float:
-    """Stated 95 % bound [m] of the position error at `point_world`, lever arm from `pivot_world` included.
-
-    The squared length of a Gaussian error is approximated by a scaled chi-square with the same mean and variance
-    (Satterthwaite), its quantile by Wilson and Hilferty.
-    """
-    cov = np.asarray(covariance, dtype=np.float64).reshape(6, 6)
-    rx, ry, rz = (point_world[i] - pivot_world[i] for i in range(3))
-    # d(point) = d(pivot) + rot x r  =>  J = [I, -[r]x]
-    J = np.array(
-        [
-            [1.0, 0.0, 0.0, 0.0, rz, -ry],
-            [0.0, 1.0, 0.0, -rz, 0.0, rx],
-            [0.0, 0.0, 1.0, ry, -rx, 0.0],
-        ]
-    )
-    S = J @ cov @ J.T
-    mean = float(np.trace(S))
-    if mean <= 0.0:
-        return 0.0
-    variance = 2.0 * float(np.sum(S * S))
-    scale = variance / (2.0 * mean)
-    dof = 2.0 * mean * mean / variance
-    chi2 = dof * (1.0 - 2.0 / (9.0 * dof) + 1.6449 * math.sqrt(2.0 / (9.0 * dof))) ** 3
-    return math.sqrt(scale * chi2)
+    @property
+    def rotation_error_rad(self) -> float:
+        """Stated p95 [rad] of the rotation, infinite when refused."""
+        return math.inf if self.refused else rotation_error_p95(self.covariance)
 
 
 @dataclass
 class AlignmentEstimator:
     """Collects observations of one headset; `estimate()` solves what is there. A new `tracking_epoch` starts anew.
 
-    `anchors`: `T_world_anchor`. `sizes`: edge of the printed sheets [m], of those whose size is known.
+    `anchors`: `T_world_anchor`. `sizes`: edge of the printed sheets [m], of those whose size is known. Counters say
+    what became of observations that were not used as they came; `unmirrored` ones were used the other way round.
     """
 
     anchors: Mapping[str, PoseTuple]
@@ -125,11 +124,24 @@ class AlignmentEstimator:
     unknown_anchors: int = 0
     stale_epochs: int = 0
     invalid: int = 0
-    forgotten: int = 0
-    outdated: int = 0
     wrong_size: int = 0
+    against_gravity: int = 0
+    unmirrored: int = 0
     _misprint: str = ""
-    _observations: list[_Observation] = field(default_factory=list)
+    _memory: Memory = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.config.dof not in (4, 6):
+            raise ValueError(f"dof {self.config.dof}: it is 4 (level headset) or 6 (tilt is measured)")
+        self._memory = Memory(self.config.max_observations, self.config.max_groups, self.config.max_age_ns)
+
+    @property
+    def forgotten(self) -> int:
+        return self._memory.forgotten
+
+    @property
+    def outdated(self) -> int:
+        return self._memory.outdated
 
     def add(
         self,
@@ -141,9 +153,16 @@ class AlignmentEstimator:
         quality: float = 1.0,
         size_m: float = 0.0,
         covariance: tuple[float, ...] = (),
+        p_tracking_head: Vec3 | None = None,
+        alternative: PoseTuple | None = None,
     ) -> bool:
-        """Takes one observation. False when it is not used: unknown anchor, older epoch, not a rigid transform, or a
-        sheet of another size than it should have. `size_m` 0: not measured."""
+        """Takes one observation. False when it is not used: unknown anchor, older epoch, not a rigid transform, a sheet
+        of another size than it should have, or one that gravity contradicts.
+
+        `size_m` 0: not measured. `covariance`: 6x6 row-major, tracking axes, else that of the noise model as seen from
+        `p_tracking_head`. `alternative`: the other pose that explains the same image; without it the pose mirrored
+        along the line of sight is tried, where that is known.
+        """
         T_world_anchor = self.anchors.get(anchor_id)
         if T_world_anchor is None:
             self.unknown_anchors += 1
@@ -151,27 +170,40 @@ class AlignmentEstimator:
         if tracking_epoch < self.tracking_epoch:
             self.stale_epochs += 1
             return False
-        p, q = T_tracking_anchor
-        norm = math.sqrt(sum(c * c for c in q))
-        if not all(map(math.isfinite, (*p, *q, quality))) or abs(norm - 1.0) > 1e-2 or max(map(abs, p)) > 1e3:
+        if not _is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not _is_place(p_tracking_head):
             self.invalid += 1
             return False
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
-            self._observations.clear()
+            self._memory.clear()
             self._misprint = ""
         if not self._is_of_size(anchor_id, size_m):
             return False
-        self._forget_outdated(capture_ns)
-        yaw, tilt = _yaw_and_tilt(T_world_anchor, (p, (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)))
-        position_var, yaw_var = self._variances(covariance, quality)
-        if len(self._observations) >= self.config.max_observations:
-            del self._observations[0]
-            self.forgotten += 1
-        self._observations.append(
-            _Observation(anchor_id, viewpoint_id, capture_ns, size_m, np.array(p), yaw, tilt, position_var, yaw_var)
+        pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
+        if pose is None:
+            self.against_gravity += 1
+            return False
+        self._memory.add(
+            (anchor_id, viewpoint_id),
+            Sighting(capture_ns, pose[0], pose[1], p_tracking_head, tuple(covariance), quality, size_m),
         )
         return True
+
+    def _upright(
+        self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
+    ) -> PoseTuple | None:
+        """The pose, or its mirrored one when only that agrees with gravity."""
+        pose = (seen[0], quat_normalize(seen[1]))
+        if self.config.dof == 6 or _tilt(T_world_anchor, pose) <= self.config.max_tilt_rad:
+            return pose
+        if alternative is not None:
+            other = (alternative[0], quat_normalize(alternative[1])) if _is_rigid(alternative) else None
+        else:
+            other = mirrored(pose, p_head) if p_head is not None else None
+        if other is None or _tilt(T_world_anchor, other) > self.config.max_tilt_rad:
+            return None
+        self.unmirrored += 1
+        return other
 
     def _is_of_size(self, anchor_id: str, size_m: float) -> bool:
         """A sheet printed too large is seen too near: its pose is off by the same share."""
@@ -184,128 +216,156 @@ class AlignmentEstimator:
         )
         return False
 
-    def _forget_outdated(self, capture_ns: int) -> None:
-        """What comes last counts, also when the sender's clock was set in between."""
-        kept = [o for o in self._observations if abs(capture_ns - o.capture_ns) <= self.config.max_age_ns]
-        self.outdated += len(self._observations) - len(kept)
-        self._observations = kept
-
-    def _variances(self, covariance: tuple[float, ...], quality: float) -> tuple[float, float]:
-        default = (self.config.position_sigma_m**2, self.config.rotation_sigma_rad**2)
-        if len(covariance) == 36 and all(map(math.isfinite, covariance)):
-            position = (covariance[0] + covariance[7] + covariance[14]) / 3.0
-            rotation = (covariance[21] + covariance[28] + covariance[35]) / 3.0
-            if position > 0.0 and rotation > 0.0:
-                # Nobody is better than this: printing and mounting of a sheet alone.
-                return max(position, 1e-8), max(rotation, 1e-7)
-        weight = min(max(quality, 0.05), 1.0)
-        return default[0] / weight, default[1] / weight
-
     def estimate(self) -> AlignmentEstimate:
-        """Solves all observations of the current epoch. Cost grows with their number, bounded by the configuration."""
-        if len(self._observations) < self.config.min_observations:
-            return self._refusal(
-                self._misprint or "look at the anchor sheet for a few seconds, from about half a metre"
-            )
-        merged, dropped = self._merge()
-        yaw, t_world, weights, H, chi2 = solve(merged, self.config.max_iterations)
-        used = [m for m, w in zip(merged, weights, strict=True) if w > 0.05]
-        n_groups = len(merged) + dropped
-        if 2 * len(used) <= n_groups or sum(m.n for m in used) < self.config.min_observations:
-            return self._refusal(_CONTRADICT)
-        if len(merged) == 2 and chi2 > _CHI2_4_999:  # with two there is no majority to trust
-            return self._refusal(_CONTRADICT)
-        # Never narrower: that so few residuals happen to be small proves nothing.
-        freedom = 4.0 * float(np.sum(weights)) - 4.0
-        H = H / max(1.0, chi2 / freedom if freedom > 0.0 else 1.0)
-        T_world_tracking: PoseTuple = (
-            (float(t_world[0]), float(t_world[1]), float(t_world[2])),
-            quat_from_yaw(yaw),
+        """Solves what was observed in the current epoch. Groups that did not change are not merged again."""
+        if len(self._memory) < self.config.min_observations:
+            return self._refusal(self._misprint or upright(self.against_gravity, len(self._memory)) or LOOK)
+        keys, merged = self._merge()
+        if not merged:
+            return self._refusal(CONTRADICT)
+        prior = self.config.prior
+        b = self._problem(keys, merged, prior)
+        s = solve(b, prior)
+        if not s.inside.any():
+            return self._refusal(disagreement(sorted(set(b.anchor))))
+        tilt = _common_tilt(b, s)
+        if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
+            prior = Prior(tilt, prior.drift_m_per_s, prior.walk_m_per_sqrt_s)
+            s = solve(b, prior)
+        agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
+        moved = outvoted(b.anchor, s)
+        if agreeing < self.config.min_observations or not self._is_majority(b, s, len(self._memory.groups)):
+            return self._refusal(disagreement(sorted(set(b.anchor))))
+        return self._result(b, s, tilt, moved)
+
+    def _merge(self) -> tuple[list[Key], list[Merged]]:
+        """One merged observation per anchor and viewpoint, of those whose observations agree."""
+        fallback = isotropic(self.config.position_sigma_m, self.config.rotation_sigma_rad)
+        keys, merged = [], []
+        for key, group in self._memory.groups.items():
+            one = group.solve(self.config.noise, fallback, self.config.min_agreeing)
+            if one is not None:
+                keys.append(key)
+                merged.append(one)
+        return keys, merged
+
+    def _problem(self, keys: list[Key], merged: list[Merged], prior: Prior) -> Problem:
+        times = np.array([self._memory.groups[key].capture_ns for key in keys], dtype=np.int64)
+        newest = max(group.sightings[-1].capture_ns for group in self._memory.groups.values())
+        poses = [self.anchors[anchor_id] for anchor_id, _ in keys]
+        return problem(
+            [anchor_id for anchor_id, _ in keys],
+            np.array([p for p, _ in poses]),
+            np.array([q for _, q in poses]),
+            merged,
+            np.minimum(times - newest, 0) * 1e-9,
+            prior,
         )
-        pivot = np.mean([m.p_world_anchor for m in used], axis=0)
+
+    def _is_majority(self, b: Problem, s: Solution, n_groups: int) -> bool:
+        """Of three or more anchors most must agree (one that was moved may have been looked at most often), else of the
+        viewpoints; those whose own observations do not agree count against it."""
+        anchors = set(b.anchor)
+        if len(anchors) > 2:
+            return 2 * agreeing_anchors(b.anchor, s.inside) > len(anchors)
+        return 2 * int(np.count_nonzero(s.inside)) > n_groups
+
+    def _result(self, b: Problem, s: Solution, tilt: float, moved: tuple[str, ...]) -> AlignmentEstimate:
+        wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
+        pivot = b.p_world[s.inside].mean(axis=0)
         pivot_world = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
-        covariance = self._covariance(H, pivot, t_world)
+        covariance = tuple(float(v) for v in (in_world(s.q, s.covariance, pivot) * wider).ravel())
         error = position_error_p95(covariance, pivot_world, pivot_world)
-        tilt = float(np.median([o.tilt_rad for o in self._observations]))
-        advice, refused = "", False
-        if error > self.config.max_error_m:
-            refused, advice = True, f"the error would be {error * 1e3:.0f} mm: step closer to the sheet"
+        refused = not error <= self.config.max_error_m
+        if refused:
+            advice = f"the error would be {error * 1e3:.0f} mm: step closer to the sheet, look at it from several sides"
+        elif moved:
+            advice = f"moved since it was measured: sheet {' and '.join(map(repr, moved))}; it is not used"
         elif tilt > self.config.tilt_warning_rad:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
-            advice = self._size_advice()
+            advice = size_advice(self._memory.sightings(), self.config.size_tolerance) or self._misprint
         return AlignmentEstimate(
-            T_world_tracking,
+            inverted(s.t, s.q),
             self.tracking_epoch,
             covariance,
             pivot_world,
             error,
             tilt,
-            len(self._observations),
-            len({o.viewpoint_id for o in self._observations}),
+            len(self._memory),
+            len({viewpoint for _, viewpoint in self._memory.groups}),
             refused,
             advice,
+            moved,
         )
-
-    def _size_advice(self) -> str:
-        """Warns about a sheet that is seen in several sizes; single measurements that are off do not count."""
-        sizes: dict[str, list[float]] = {}
-        for o in self._observations:
-            if o.size_m > 0.0 and math.isfinite(o.size_m):
-                sizes.setdefault(o.anchor_id, []).append(o.size_m)
-        for anchor_id, seen in sizes.items():
-            low, high = np.quantile(seen, (0.1, 0.9))
-            if high - low > self.config.size_tolerance * low:
-                return (
-                    f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"
-                )
-        return self._misprint
-
-    def _merge(self) -> tuple[list[Merged], int]:
-        """One merged observation per anchor and viewpoint, and the number of those whose observations do not agree."""
-        groups: dict[tuple[str, int], list[_Observation]] = {}
-        for o in self._observations:
-            groups.setdefault((o.anchor_id, o.viewpoint_id), []).append(o)
-        merged = []
-        for (anchor_id, _), group in groups.items():
-            one = merge(
-                np.array(self.anchors[anchor_id][0]),
-                np.array([o.p_tracking_anchor for o in group]),
-                np.array([o.T_world_tracking_yaw for o in group]),
-                float(np.mean([o.position_var for o in group])),
-                float(np.mean([o.yaw_var for o in group])),
-                self.config.min_agreeing,
-            )
-            if one is not None:
-                merged.append(one)
-        return merged, len(groups) - len(merged)
-
-    def _covariance(self, H: Array, pivot: Array, t_world: Array) -> tuple[float, ...]:
-        """6x6 at the pivot from the 4x4 information `H` over (yaw about the origin of tracking, x, y, z)."""
-        S4 = np.linalg.inv(H)
-        rx, ry = float(pivot[0] - t_world[0]), float(pivot[1] - t_world[1])
-        J = np.array([[-ry, 1.0, 0.0, 0.0], [rx, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]])
-        S = J @ S4 @ J.T  # order x, y, z, yaw at the pivot
-        cov = np.zeros((6, 6))
-        index = [0, 1, 2, 5]
-        cov[np.ix_(index, index)] = S
-        cov[3, 3] = cov[4, 4] = self.config.tilt_sigma_rad**2
-        return tuple(float(v) for v in cov.ravel())
 
     def _refusal(self, advice: str) -> AlignmentEstimate:
-        identity: PoseTuple = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        viewpoints = len({o.viewpoint_id for o in self._observations})
-        n = len(self._observations)
+        viewpoints = len({viewpoint for _, viewpoint in self._memory.groups})
+        zero = (0.0, 0.0, 0.0)
+        n = len(self._memory)
         return AlignmentEstimate(
-            identity, self.tracking_epoch, (0.0,) * 36, (0.0, 0.0, 0.0), math.inf, 0.0, n, viewpoints, True, advice
+            _NOWHERE, self.tracking_epoch, (0.0,) * 36, zero, math.inf, 0.0, n, viewpoints, True, advice
         )
 
+    def snapshot(self) -> bytes:
+        """Everything that `estimate` and `add` depend on but anchors, sizes and configuration."""
+        counters = [getattr(self, name) for name in _COUNTERS]
+        return json.dumps({"counters": counters, "misprint": self._misprint, **self._memory.snapshot()}).encode()
 
-def _yaw_and_tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> tuple[float, float]:
-    """Yaw of `T_world_tracking` as this one observation has it, and the tilt [rad] that yaw does not explain."""
+    def restore(self, snapshot: bytes) -> None:
+        """Takes up a snapshot: from here on results are the same as those of the estimator that wrote it."""
+        data = json.loads(snapshot)
+        for name, value in zip(_COUNTERS, data["counters"], strict=True):
+            setattr(self, name, int(value))
+        self._misprint = str(data["misprint"])
+        self._memory.restore(data)
+
+
+_COUNTERS: Final = (
+    *("tracking_epoch", "unknown_anchors", "stale_epochs", "invalid", "wrong_size", "against_gravity", "unmirrored"),
+)
+
+
+def outvoted(anchor: tuple[str, ...], s: Solution) -> tuple[str, ...]:
+    """Anchors of which no viewpoint agrees with the rest."""
+    agreeing = {name for name, ok in zip(anchor, s.inside.tolist(), strict=True) if ok}
+    return tuple(sorted(set(anchor) - agreeing))
+
+
+def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
+    """The other pose of a flat sheet that gives nearly the same image: its plane reflected along the line of sight.
+
+    Under weak perspective an image does not change when depth is negated: R' = (I - 2 v v^T) R diag(1, 1, -1)
+    (Oberkampf, DeMenthon and Davis 1996; Collins and Bartoli 2014). As quaternions: q' = v * q * z.
+    """
+    p, q = T_tracking_anchor
+    x, y, z = (p[i] - p_tracking_head[i] for i in range(3))
+    n = math.sqrt(x * x + y * y + z * z)
+    if n < 1e-9:
+        return T_tracking_anchor
+    view: Quat = (0.0, x / n, y / n, z / n)
+    return p, quat_normalize(quat_mul(quat_mul(view, q), (0.0, 0.0, 0.0, 1.0)))
+
+
+def _is_rigid(T: PoseTuple) -> bool:
+    p, q = T
+    norm = math.sqrt(sum(c * c for c in q))
+    return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= 1e3
+
+
+def _is_place(p: Vec3 | None) -> bool:
+    return p is None or (all(map(math.isfinite, p)) and max(map(abs, p)) <= 1e3)
+
+
+def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:
+    """Angle [rad] between the vertical and that of the tracking frame as this one observation has it."""
     _, q = compose(T_world_anchor, inverse(T_tracking_anchor))
-    # Swing-twist about Z: the twist is (w, 0, 0, z) normalised; what is left over is the swing (tilt).
-    yaw = 2.0 * math.atan2(q[3], q[0])
     up = quat_rotate(q, (0.0, 0.0, 1.0))
-    tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
-    return wrap_angle(yaw), tilt
+    return math.atan2(math.hypot(up[0], up[1]), up[2])
+
+
+def _common_tilt(b: Problem, s: Solution) -> float:
+    """Tilt [rad] that the agreeing groups show together, gravity left out."""
+    weight = s.inside / np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    tilt = weight @ swing(b.q) / float(np.sum(weight))
+    return float(math.hypot(tilt[0], tilt[1]))

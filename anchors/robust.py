@@ -1,9 +1,8 @@
-"""Robust estimation of yaw and translation, the two stages behind `anchors.alignment`.
+"""Robust mean of the observations of one anchor from one viewpoint: the first stage behind `anchors.alignment`.
 
-(1) Observations of one anchor from one viewpoint share half of their variance, so they are merged into one by a robust
-mean with covariance `S * (1/2 + 1/(2 n))`. (2) Merged observations are solved together by iteratively reweighted
-Gauss-Newton over (yaw, x, y, z): the position of each anchor and its yaw are the residuals, weights are those of
-Tukey's biweight (a redescending loss: mirrored poses get weight zero; Huber 2009, section 4.8).
+Wrong detections are a minority and far off: what lies outside the 99.9 % ellipsoid about the median is left out, the
+rest counts in full (trimming keeps Gaussian noise efficient). Where the observations scatter more than stated, the
+ellipsoid grows with their median distance, and the covariance with what is left over.
 """
 
 from __future__ import annotations
@@ -15,107 +14,78 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply
+from anchors.uncertainty import Z99, chi2_quantile
 
-_TUKEY: Final = 4.685  # 95 % efficiency for Gaussian noise
-_MAX_SCATTER: Final = 10.0
+_CHI2_3_MEDIAN: Final = 2.366
+_CHI2_3_999: Final = 16.266
+_MAX_SCATTER: Final = 100.0  # variance ratio beyond which it is no longer noise
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Observations of one anchor from one viewpoint as one. Variances per axis [m^2], [rad^2]; `n`: how many agree."""
+    """Observations of one anchor from one viewpoint as one: mean `T_tracking_anchor` (`p`, `q`), its covariance (6, 6)
+    in tracking axes, how many agree (`n`) and how many there were (`of`)."""
 
-    p_world_anchor: Array
-    p_tracking_anchor: Array
-    yaw: float
-    position_var: float
-    yaw_var: float
+    p: Array
+    q: Array
+    covariance: Array
     n: int
+    of: int
 
 
-def wrap_angle(a: float) -> float:
-    """The same angle within [-pi, pi]."""
-    return math.remainder(a, 2.0 * math.pi)
+def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -> Merged | None:
+    """Robust mean of poses `T_tracking_anchor`, positions (n, 3) and quaternions (n, 4).
 
-
-def merge(
-    p_world_anchor: Array, p: Array, yaws: Array, position_var: float, yaw_var: float, min_agreeing: float
-) -> Merged | None:
-    """Robust mean of positions `p_tracking_anchor` (n, 3) and `yaws` (n,) of one viewpoint.
-
-    `None` when less than the share `min_agreeing` of them agree. They scatter more than stated: the variance grows.
+    `common`, `each`: covariance (6, 6) of the error that all share, and of the one that is new in each. `None` when
+    less than the share `min_agreeing` of them agree.
     """
-    centre = np.median(p, axis=0)
-    yaw0 = circular_median(yaws)
-    dy = np.array([wrap_angle(float(y) - yaw0) for y in yaws])
-    w = _tukey(_unscattered(np.linalg.norm(p - centre, axis=1) / math.sqrt(3.0 * position_var), 0.888))
-    w = w * _tukey(_unscattered(np.abs(dy) / math.sqrt(yaw_var), 0.674))
-    total, n = float(np.sum(w)), int(np.count_nonzero(w > 0.05))
-    if total < 1.0 or n < min_agreeing * len(p):
+    count = len(p)
+    centre = np.where((q @ q[0])[:, None] < 0.0, -q, q)
+    centre_q = np.median(centre, axis=0)
+    norm = math.sqrt(float(centre_q @ centre_q))
+    if norm < 0.1:
+        return None  # orientations all over the sphere
+    centre_q = centre_q / norm
+    turns = quat_log(quat_multiply(q, quat_conjugate(centre_q)))
+    keep = _within(p, each[:3, :3]) & _within(turns, each[3:, 3:])
+    n = int(np.count_nonzero(keep))
+    if n == 0 or n < min_agreeing * count:
         return None
-    p_mean, dy_mean = (w @ p) / total, float(w @ dy) / total
-    chi2 = float(w @ np.sum((p - p_mean) ** 2, axis=1)) / position_var + float(w @ (dy - dy_mean) ** 2) / yaw_var
-    wider = max(1.0, chi2 / (4.0 * total - 4.0)) if total > 2.0 else 1.0
-    share = wider * (0.5 + 0.5 / total)  # half of each variance is common to the viewpoint
-    return Merged(p_world_anchor, p_mean, yaw0 + dy_mean, position_var * share, yaw_var * share, n)
+    p_kept, turns_kept = p[keep], turns[keep]
+    p_mean, turn_mean = p_kept.mean(axis=0), turns_kept.mean(axis=0)
+    covariance = common + each / n
+    wider = np.ones(6)
+    wider[:3] = math.sqrt(_excess(p_kept - p_mean, each[:3, :3]))
+    wider[3:] = math.sqrt(_excess(turns_kept - turn_mean, each[3:, 3:]))
+    covariance = covariance * wider[:, None] * wider
+    return Merged(p_mean, quat_multiply(quat_exp(turn_mean), centre_q), covariance, n, count)
 
 
-def _unscattered(standardized: Array, expected: float) -> Array:
-    """Residuals in units of the scatter there is, if that is larger than stated: the median shows it, `expected` is
-    that of Gaussian noise as stated. Beyond ten times as large it is no longer noise."""
-    return standardized / min(max(1.0, float(np.median(standardized)) / expected), _MAX_SCATTER)
+def _within(x: Array, cov: Array) -> NDArray[np.bool_]:
+    """Which of `x` (n, 3) lie within the 99.9 % ellipsoid of their scatter, at least that of `cov`, about the
+    median."""
+    d2 = _distance2(x - np.median(x, axis=0), cov)
+    scatter = min(max(1.0, float(np.median(d2)) / _CHI2_3_MEDIAN), _MAX_SCATTER)
+    return np.asarray(d2 <= _CHI2_3_999 * scatter)
+
+
+def _excess(residuals: Array, cov: Array) -> float:
+    """By what factor the variance is larger than stated; 1 unless chi-square says so at 99 %: never narrower, that so
+    few residuals happen to be small proves nothing."""
+    freedom = 3.0 * (len(residuals) - 1)
+    if freedom < 1.0:
+        return 1.0
+    chi2 = float(np.sum(_distance2(residuals, cov)))
+    return chi2 / freedom if chi2 > chi2_quantile(freedom, Z99) else 1.0
+
+
+def _distance2(x: Array, cov: Array) -> Array:
+    """Squared Mahalanobis distances of rows (n, 3)."""
+    return np.asarray(np.sum((x @ np.linalg.inv(cov)) * x, axis=1))
 
 
 def circular_median(angles: Array) -> float:
     """The angle among `angles` with the least sum of absolute differences: unharmed by a minority of outliers."""
-    candidates = angles if len(angles) <= 64 else angles[:: len(angles) // 64]
-    differences = np.abs((candidates[:, None] - angles[None, :] + math.pi) % (2.0 * math.pi) - math.pi)
-    return float(candidates[int(np.argmin(np.sum(differences, axis=1)))])
-
-
-def _tukey(standardized: Array) -> Array:
-    """Tukey's biweight of residuals in units of their sigma."""
-    u = np.minimum(np.abs(standardized) / _TUKEY, 1.0)
-    return np.asarray((1.0 - u * u) ** 2, dtype=np.float64)
-
-
-def solve(merged: list[Merged], max_iterations: int) -> tuple[float, Array, Array, Array, float]:
-    """Robust Gauss-Newton over (yaw, t). Returns yaw, t_world (3,), weights (m,), information H (4, 4), chi-square."""
-    if not merged:
-        return 0.0, np.zeros(3), np.zeros(0), np.eye(4), 0.0
-    p_w = np.array([m.p_world_anchor for m in merged])
-    p_t = np.array([m.p_tracking_anchor for m in merged])
-    yaws = np.array([m.yaw for m in merged])
-    ip = 1.0 / np.array([m.position_var for m in merged])
-    iy = 1.0 / np.array([m.yaw_var for m in merged])
-    yaw = circular_median(yaws)
-    t = np.median(p_w - _rotate_z(yaw, p_t), axis=0)
-    weights = np.ones(len(merged))
-    H, distance2 = np.eye(4), np.zeros(len(merged))
-    for _ in range(max_iterations):
-        turned = _rotate_z(yaw, p_t)
-        r_p = p_w - turned - t
-        r_y = np.array([wrap_angle(float(y) - yaw) for y in yaws])
-        distance2 = np.sum(r_p * r_p, axis=1) * ip + r_y * r_y * iy
-        if len(merged) > 2:  # with two there is no majority to trust
-            weights = _tukey(np.sqrt(distance2 / 4.0))
-        d = np.stack([-turned[:, 1], turned[:, 0], np.zeros(len(merged))], axis=1)  # d(turned)/d(yaw)
-        wp, wy = weights * ip, weights * iy
-        H = np.zeros((4, 4))
-        H[0, 0] = np.sum(wp * np.sum(d * d, axis=1)) + np.sum(wy)
-        H[0, 1:] = H[1:, 0] = wp @ d
-        H[1:, 1:] = np.eye(3) * np.sum(wp)
-        H += np.eye(4) * 1e-9
-        g = np.concatenate([[np.sum(wp * np.sum(d * r_p, axis=1)) + np.sum(wy * r_y)], wp @ r_p])
-        step = np.linalg.solve(H, g)
-        yaw = wrap_angle(yaw + float(step[0]))
-        t = t + step[1:]
-        if float(np.max(np.abs(step))) < 1e-10:
-            break
-    return yaw, t, weights, H, float(weights @ distance2)
-
-
-def _rotate_z(yaw: float, points: Array) -> Array:
-    """Points (n, 3) turned about Z by `yaw`."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], axis=1)
+    differences = np.abs((angles[:, None] - angles[None, :] + math.pi) % (2.0 * math.pi) - math.pi)
+    return float(angles[int(np.argmin(np.sum(differences, axis=1)))])

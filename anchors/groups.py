@@ -1,0 +1,157 @@
+"""Observations as they are kept: in groups of one anchor from one viewpoint, whose errors are correlated, and bounded.
+
+Each group is merged (`anchors.robust`) at most once per change; everything can be written down and taken up again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from anchors.lie import Array
+from anchors.noise import NoiseModel, stated
+from anchors.pose import Quat, Vec3
+from anchors.robust import Merged, merge
+
+Key = tuple[str, int]
+
+
+class Sighting(NamedTuple):
+    """One observation `T_tracking_anchor` (`p`, unit `q`). `p_head`: where the observer was, tracking frame."""
+
+    capture_ns: int
+    p: Vec3
+    q: Quat
+    p_head: Vec3 | None
+    covariance: tuple[float, ...]
+    quality: float
+    size_m: float
+
+
+@dataclass
+class Group:
+    """Sightings of one anchor from one viewpoint, oldest first."""
+
+    sightings: deque[Sighting] = field(default_factory=deque)
+    merged: Merged | None = None
+    dirty: bool = True
+
+    def solve(self, noise: NoiseModel, fallback: Array, min_agreeing: float) -> Merged | None:
+        """The robust mean; computed again only after a change."""
+        if self.dirty:
+            p = np.array([s.p for s in self.sightings])
+            q = np.array([s.q for s in self.sightings])
+            common, each = self._noise(p, noise, fallback)
+            self.merged, self.dirty = merge(p, q, common, each, min_agreeing), False
+        return self.merged
+
+    def _noise(self, p: Array, noise: NoiseModel, fallback: Array) -> tuple[Array, Array]:
+        """What the observers state comes first, then the model from where they stood, then the configured default."""
+        given = [C for s in self.sightings if s.covariance and (C := stated(s.covariance)) is not None]
+        if given:
+            return noise.split(np.mean(given, axis=0))
+        heads = [s.p_head for s in self.sightings if s.p_head is not None]
+        if heads:
+            return noise.seen_from(np.median(heads, axis=0), np.median(p, axis=0))
+        quality = float(np.mean([min(max(s.quality, 0.05), 1.0) for s in self.sightings]))
+        return noise.split(fallback / quality)
+
+    @property
+    def capture_ns(self) -> int:
+        """Middle of the time in which it was seen."""
+        return (self.sightings[0].capture_ns + self.sightings[-1].capture_ns) // 2
+
+
+@dataclass
+class Memory:
+    """Groups of one tracking epoch; the oldest observations go first."""
+
+    max_observations: int
+    max_groups: int
+    max_age_ns: int
+    forgotten: int = 0
+    outdated: int = 0
+    groups: dict[Key, Group] = field(default_factory=dict)
+    _order: deque[Key] = field(default_factory=deque)
+    _last_ns: int = 0
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def add(self, key: Key, sighting: Sighting) -> None:
+        """Takes one more and forgets what is too old or too much."""
+        self._forget_outdated(sighting.capture_ns)
+        while len(self._order) >= self.max_observations:
+            self._pop()
+            self.forgotten += 1
+        group = self.groups.setdefault(key, Group())
+        group.sightings.append(sighting)
+        group.dirty = True
+        self._order.append(key)
+        while len(self.groups) > self.max_groups:
+            self._pop()
+            self.forgotten += 1
+
+    def clear(self) -> None:
+        self.groups.clear()
+        self._order.clear()
+
+    def sightings(self) -> Iterator[tuple[str, Sighting]]:
+        for (anchor_id, _), group in self.groups.items():
+            for sighting in group.sightings:
+                yield anchor_id, sighting
+
+    def _pop(self) -> None:
+        key = self._order.popleft()
+        group = self.groups[key]
+        group.sightings.popleft()
+        group.dirty = True
+        if not group.sightings:
+            del self.groups[key]
+
+    def _forget_outdated(self, now_ns: int) -> None:
+        """What comes last counts, also when the sender's clock was set in between."""
+        jumped = abs(now_ns - self._last_ns) > self.max_age_ns
+        self._last_ns = now_ns
+        if jumped:
+            self._keep_only(now_ns)
+        while self._order and abs(now_ns - self.groups[self._order[0]].sightings[0].capture_ns) > self.max_age_ns:
+            self._pop()
+            self.outdated += 1
+
+    def _keep_only(self, now_ns: int) -> None:
+        kept = Memory(self.max_observations, self.max_groups, self.max_age_ns)
+        kept._last_ns = now_ns
+        old = {key: deque(group.sightings) for key, group in self.groups.items()}
+        for key in self._order:
+            sighting = old[key].popleft()
+            if abs(now_ns - sighting.capture_ns) <= self.max_age_ns:
+                kept.add(key, sighting)
+            else:
+                self.outdated += 1
+        self.groups, self._order = kept.groups, kept._order
+
+    def snapshot(self) -> dict[str, Any]:
+        """Plain data; floats survive JSON exactly."""
+        return {
+            "counts": [self.forgotten, self.outdated, self._last_ns],
+            "order": [list(key) for key in self._order],
+            "groups": [[*key, [list(s) for s in group.sightings]] for key, group in self.groups.items()],
+        }
+
+    def restore(self, data: dict[str, Any]) -> None:
+        self.forgotten, self.outdated, self._last_ns = data["counts"]
+        self._order = deque((str(a), int(v)) for a, v in data["order"])
+        self.groups = {}
+        for anchor_id, viewpoint_id, rows in data["groups"]:
+            group = Group()
+            for capture_ns, p, q, p_head, covariance, quality, size_m in rows:
+                head = None if p_head is None else (p_head[0], p_head[1], p_head[2])
+                group.sightings.append(
+                    Sighting(capture_ns, tuple(p), tuple(q), head, tuple(covariance), quality, size_m)
+                )
+            self.groups[anchor_id, viewpoint_id] = group

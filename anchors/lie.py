@@ -1,0 +1,126 @@
+"""Rotations and rigid transforms as numpy arrays, many at once: the group operations behind solvers.
+
+Quaternions are `(..., 4)` with w first, rotation vectors `(..., 3)` [rad], poses a pair of positions `(..., 3)` [m] and
+quaternions. Perturbations are on the left: `exp(r) * q`. Single poses on hot paths: `anchors.pose`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL: Final = 1e-7  # [rad] below it the series of sine and cosine are exact to double precision
+_CONJUGATE: Final = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quat_multiply(a: Array, b: Array) -> Array:
+    """Hamilton product of quaternions `(..., 4)`: the rotation `b` followed by `a`."""
+    aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: Array) -> Array:
+    """Inverse of unit quaternions `(..., 4)`."""
+    return np.asarray(q * _CONJUGATE)
+
+
+def quat_exp(r: Array) -> Array:
+    """Rotation vectors `(..., 3)` to unit quaternions `(..., 4)`, smooth at zero."""
+    angle = np.linalg.norm(r, axis=-1, keepdims=True)
+    safe = np.maximum(angle, _SMALL)
+    scale = np.where(angle < _SMALL, 0.5, np.sin(0.5 * safe) / safe)
+    return np.concatenate((np.cos(0.5 * angle), scale * r), axis=-1)
+
+
+def quat_log(q: Array) -> Array:
+    """Unit quaternions `(..., 4)` to their shortest rotation vectors `(..., 3)`, length at most pi, smooth at zero."""
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    v = q[..., 1:]
+    n = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+    safe = np.maximum(n, 1e-12)
+    scale = np.where(n < 1e-12, 2.0, 2.0 * np.arctan2(n, q[..., :1]) / safe)
+    return np.asarray(scale * v)
+
+
+def quat_matrix(q: Array) -> Array:
+    """Rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_quat(R: Array) -> Array:
+    """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3): the greatest of four forms (Shepperd 1978)."""
+    t = float(np.trace(R))
+    candidates = (t, float(R[0, 0]), float(R[1, 1]), float(R[2, 2]))
+    k = candidates.index(max(candidates))
+    if k == 0:
+        q = np.array([1.0 + t, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    else:
+        i, j, m = k - 1, k % 3, (k + 1) % 3
+        q = np.zeros(4)
+        q[0] = R[m, j] - R[j, m]
+        q[1 + i] = 1.0 + R[i, i] - R[j, j] - R[m, m]
+        q[1 + j] = R[j, i] + R[i, j]
+        q[1 + m] = R[m, i] + R[i, m]
+    q = q / np.linalg.norm(q)
+    return np.asarray(-q if q[0] < 0.0 else q)
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices `(..., 3, 3)`: `skew(a) @ b == cross(a, b)`."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def left_jacobian(r: Array) -> Array:
+    """Left Jacobian (3, 3) of SO(3) at rotation vector `r`: exp(r + d) ~ exp(J d) exp(r) (Barfoot 2017, eq. 7.77)."""
+    angle = float(np.linalg.norm(r))
+    K = skew(r)
+    if angle < 1e-4:  # series: the closed forms cancel
+        return np.asarray(np.eye(3) + 0.5 * K + K @ K / 6.0)
+    return np.asarray(np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * (K @ K))
+
+
+def se3_exp(xi: Array) -> tuple[Array, Array]:
+    """Twist (6,), position part first, to a pose: position (3,) and quaternion (4,)."""
+    return left_jacobian(xi[3:]) @ xi[:3], quat_exp(xi[3:])
+
+
+def se3_log(p: Array, q: Array) -> Array:
+    """Twist (6,) of a pose; the inverse of `se3_exp` for rotations below pi."""
+    r = quat_log(q)
+    return np.concatenate((np.linalg.solve(left_jacobian(r), p), r))
+
+
+def swing(q: Array) -> Array:
+    """Tilt of rotations `(..., 4)`: the rotation vector `(..., 2)` (x, y) [rad] that is left when the turn about Z is
+    taken off on the right, `q = swing * twist` (Dobrowolski 2015)."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    n = np.sqrt(w * w + z * z)
+    safe = np.maximum(n, 1e-12)
+    # swing = q * conj(twist), twist = (w, 0, 0, z) / n: its vector part is (xw - yz, yw + xz, 0) / n, its scalar n.
+    sx, sy = (x * w - y * z) / safe, (y * w + x * z) / safe
+    s = np.sqrt(sx * sx + sy * sy)
+    scale = np.where(s < 1e-12, 2.0, 2.0 * np.arctan2(s, n) / np.maximum(s, 1e-12))
+    return np.stack((scale * sx, scale * sy), axis=-1)

@@ -1,0 +1,235 @@
+"""Most probable `T_tracking_world` of one headset, given merged observations of anchors of known pose: the second stage
+behind `anchors.alignment`.
+
+Unknown are translation (3), rotation (3) and the velocity of the tracking frame's drift (3). Gravity is an observation
+too: the tilt of the frame is zero with the stated sigma; so is the drift. Gauss-Newton on whitened residuals; where a
+group does not fit, the largest set of groups that agree with one of them is solved instead, and what then lies outside
+its 99.9 % ellipsoid is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, skew, swing
+from anchors.pose import PoseTuple, quat_normalize
+from anchors.robust import Merged, circular_median
+
+_CHI2_6_999: Final = 22.458
+_CHI2_3_999: Final = 16.266
+_ITERATIONS: Final = 6
+_CONVERGED: Final = 1e-8  # [m], [rad]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before any observation. `tilt_sigma_rad` is infinite where the tilt is to be measured too;
+    `drift_m_per_s`: speed of the tracking frame, `walk_m_per_sqrt_s`: its wandering, standard deviations per axis."""
+
+    tilt_sigma_rad: float
+    drift_m_per_s: float
+    walk_m_per_sqrt_s: float
+
+    @property
+    def gravity(self) -> bool:
+        return math.isfinite(self.tilt_sigma_rad)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Groups as arrays: anchors in the world, how each was seen, how long ago [s] (at most 0)."""
+
+    anchor: tuple[str, ...]
+    p_world: Array  # (G, 3)
+    p: Array  # (G, 3) tracking
+    q: Array  # (G, 4) T_tracking_world as each group alone has it
+    covariance: Array  # (G, 6, 6)
+    whitening: Array  # (G, 6, 6)
+    age_s: Array  # (G,)
+
+    @property
+    def size(self) -> int:
+        return len(self.age_s)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """`T_tracking_world` at the time of the newest observation. `covariance` (6, 6) of translation and rotation
+    (tracking axes, rotation on the left), `inside` (G,): which groups agree, `chi2` of those, `freedom` of that."""
+
+    t: Array
+    q: Array
+    covariance: Array
+    inside: Mask
+    chi2: float
+    freedom: float
+    drift: Array
+    distance2: Array
+
+
+def problem(
+    anchor: Sequence[str], p_world: Array, q_world: Array, merged: Sequence[Merged], age_s: Array, prior: Prior
+) -> Problem:
+    """Groups as arrays. Older ones are less certain: the tracking frame wanders."""
+    p = np.array([m.p for m in merged])
+    q = quat_multiply(np.array([m.q for m in merged]), quat_conjugate(q_world))
+    covariance = np.array([m.covariance for m in merged])
+    walked = prior.walk_m_per_sqrt_s**2 * np.abs(age_s)
+    covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
+    whitening = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
+    return Problem(tuple(anchor), p_world, p, q, covariance, whitening, age_s)
+
+
+def solve(b: Problem, prior: Prior) -> Solution:
+    """Robust solution; `inside` is all false where two groups are all there is and they disagree."""
+    everyone = np.ones(b.size, dtype=bool)
+    solution = _fit(b, everyone, _start(b, prior), prior)
+    if bool(np.all(solution.distance2 <= _CHI2_6_999)) and (b.size != 2 or solution.chi2 <= _CHI2_6_999):
+        return solution
+    if b.size == 1:
+        return solution
+    if b.size == 2:
+        return _without(solution)
+    inside, start = _consensus(b, prior)
+    for _ in range(3):
+        solution = _fit(b, inside, start, prior)
+        now = solution.distance2 <= _CHI2_6_999
+        if not now.any():
+            return _without(solution)
+        if bool(np.all(now == inside)):
+            break
+        inside, start = now, (solution.q, solution.t)
+    return solution
+
+
+def _without(s: Solution) -> Solution:
+    return Solution(
+        s.t, s.q, s.covariance, np.zeros(len(s.inside), dtype=bool), s.chi2, s.freedom, s.drift, s.distance2
+    )
+
+
+def _level(q: Array) -> Array:
+    """The turn about Z in quaternions `(..., 4)`."""
+    out = q * np.array([1.0, 0.0, 0.0, 1.0])
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12))
+
+
+def _start(b: Problem, prior: Prior) -> tuple[Array, Array]:
+    """First guess by medians, which a minority cannot spoil."""
+    yaws = 2.0 * np.arctan2(b.q[:, 3], b.q[:, 0])
+    k = int(np.argmin(np.abs(yaws - circular_median(yaws))))
+    q = _level(b.q[k]) if prior.gravity else b.q[k]
+    return q, np.median(b.p - b.p_world @ quat_matrix(q).T, axis=0)
+
+
+def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
+    """Gauss-Newton over (t, rotation on the left, drift); distances of all groups to the result."""
+    q, t = start
+    drift = np.zeros(3)
+    J = np.zeros((b.size, 6, 9))
+    J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = J[:, 3, 3] = J[:, 4, 4] = J[:, 5, 5] = 1.0
+    J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
+    weights = inside.astype(np.float64)[:, None]
+    tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
+    diagonal = np.zeros(9)
+    diagonal[3:5] = tilt_information
+    diagonal[6:] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
+    H = np.eye(9)
+    for _ in range(_ITERATIONS):
+        r, turned = _residuals(b, q, t, drift)
+        J[:, :3, 3:6] = -skew(turned)
+        A = (b.whitening @ J * weights[:, :, None]).reshape(-1, 9)
+        g = A.T @ ((b.whitening @ r[:, :, None])[:, :, 0] * weights).ravel()
+        H = A.T @ A
+        H[range(9), range(9)] += diagonal
+        if prior.gravity:
+            g[3:5] -= tilt_information * swing(q)
+        g[6:] -= diagonal[6:] * drift
+        step = np.linalg.solve(H, g)
+        t, drift = t + step[:3], drift + step[6:]
+        q = quat_multiply(quat_exp(np.asarray(step[3:6], dtype=np.float64)), q)
+        if float(np.max(np.abs(step[:6]))) < _CONVERGED:
+            break
+    r, _ = _residuals(b, q, t, drift)
+    whitened = (b.whitening @ r[:, :, None])[:, :, 0]
+    distance2 = np.sum(whitened * whitened, axis=1)
+    chi2 = float(np.sum(distance2[inside])) + float(drift @ (diagonal[6:] * drift))
+    freedom = 6.0 * float(np.count_nonzero(inside)) - 6.0
+    if prior.gravity:
+        chi2 += tilt_information * float(np.sum(swing(q) ** 2))
+        freedom += 2.0
+    return Solution(
+        t, q, np.asarray(np.linalg.inv(H)[:6, :6], dtype=np.float64), inside, chi2, freedom, drift, distance2
+    )
+
+
+def _residuals(b: Problem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
+    """Observed minus predicted, positions then rotation vectors (G, 6); and the turned anchor positions (G, 3)."""
+    turned = b.p_world @ quat_matrix(q).T
+    r = np.empty((b.size, 6))
+    r[:, :3] = b.p - turned - t - b.age_s[:, None] * drift
+    r[:, 3:] = quat_log(quat_multiply(b.q, quat_conjugate(q)))
+    return r, turned
+
+
+def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
+    """The largest set of groups that agree with one of them: first counted in anchors, then in groups. Every group is
+    tried, so nothing is left to chance."""
+    q = _level(b.q) if prior.gravity else b.q  # (H, 4)
+    t = b.p - np.einsum("hij,hj->hi", quat_matrix(q), b.p_world)
+    predicted = np.einsum("hij,gj->hgi", quat_matrix(q), b.p_world) + t[:, None, :]
+    r = b.p[None, :, :] - predicted
+    turn_var = np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0
+    tilt_var = prior.tilt_sigma_rad**2 if prior.gravity else 0.0
+    lever2 = np.sum((b.p_world[None, :, :] - b.p_world[:, None, :]) ** 2, axis=2)
+    C = b.covariance[:, None, :3, :3] + b.covariance[None, :, :3, :3]
+    spread = (
+        lever2 * (turn_var[:, None] + tilt_var) + (prior.drift_m_per_s * (b.age_s[:, None] - b.age_s[None, :])) ** 2
+    )
+    C = C + spread[:, :, None, None] * np.eye(3)
+    d2 = np.einsum("hgi,hgi->hg", r, np.linalg.solve(C, r[:, :, :, None])[:, :, :, 0])
+    turns = quat_log(quat_multiply(b.q[None, :, :], quat_conjugate(q)[:, None, :]))
+    turn_d2 = np.sum(turns * turns, axis=2) / (turn_var[:, None] + turn_var[None, :] + 2.0 * tilt_var)
+    agree = (d2 <= _CHI2_3_999) & (turn_d2 <= _CHI2_3_999)
+    best = max(range(b.size), key=lambda h: _votes(b, agree[h], float(np.sum(d2[h][agree[h]]))))
+    return agree[best], (q[best], t[best])
+
+
+def _votes(b: Problem, agree: Mask, misfit: float) -> tuple[int, int, float]:
+    return agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
+
+
+def agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
+    """Of how many anchors most groups agree."""
+    balance: dict[str, int] = {}
+    for name, ok in zip(anchor, agree.tolist(), strict=True):
+        balance[name] = balance.get(name, 0) + (1 if ok else -1)
+    return sum(1 for votes in balance.values() if votes > 0)
+
+
+def in_world(q: Array, covariance: Array, pivot_world: Array) -> Array:
+    """Covariance (6, 6) of `T_world_tracking` at the pivot, world axes, from that of `T_tracking_world` (t, q).
+
+    A tracking frame off by (d, w) shows the point X of the world off by R^T d + (R^T w) x X.
+    """
+    R_world_tracking = quat_matrix(q).T
+    J = np.zeros((6, 6))
+    J[:3, :3] = J[3:, 3:] = R_world_tracking
+    J[:3, 3:] = -skew(pivot_world) @ R_world_tracking
+    S = J @ covariance @ J.T
+    return np.asarray(0.5 * (S + S.T))
+
+
+def inverted(t: Array, q: Array) -> PoseTuple:
+    """`T_b_a` as plain numbers from `T_a_b`."""
+    q_inv = quat_conjugate(q)
+    p = -(quat_matrix(q_inv) @ t)
+    unit = quat_normalize((float(q_inv[0]), float(q_inv[1]), float(q_inv[2]), float(q_inv[3])))
+    return (float(p[0]), float(p[1]), float(p[2])), unit

@@ -1,0 +1,264 @@
+"""Alignment by touching marked points with the calibrated tip of a controller, with residuals that name what is wrong.
+
+Points on one line fix nothing, and points touched in the wrong order fit nowhere; both are told by name. Which order
+was touched is found by trying the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import Final
+
+import numpy as np
+
+from anchors.alignment import AlignmentConfig, AlignmentEstimate
+from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply, skew, swing
+from anchors.pose import PoseTuple, Vec3
+from anchors.solve import in_world, inverted
+from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
+
+_CHI2_3_999: Final = 16.266
+_MAX_PERMUTED: Final = 6  # of more points only pairs are tried in exchange
+_MIN_WIDTH_M: Final = 0.05  # how far a point must lie beside the line through the others
+_NOWHERE: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Touch:
+    """The tip rested on a marked point: `p_tracking_tip` averaged over that time."""
+
+    point: str
+    p_tracking_tip: Vec3
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The alignment, and by how much each touched point misses its mark [m]. `suspects`: points to blame for a
+    refusal."""
+
+    estimate: AlignmentEstimate
+    residuals_m: dict[str, float]
+    suspects: tuple[str, ...] = ()
+
+
+def register(
+    points_world: Mapping[str, Vec3],
+    touches: Sequence[Touch],
+    tracking_epoch: int = 0,
+    sigma_m: float = 0.0015,
+    config: AlignmentConfig | None = None,
+) -> Registration:
+    """`T_world_tracking` from at least three touched points. `sigma_m`: noise of one touch per axis."""
+    config = config or AlignmentConfig()
+    wrong = [t for t in touches if t.point not in points_world or not all(map(math.isfinite, t.p_tracking_tip))]
+    if wrong:
+        known = ", ".join(sorted(points_world))
+        return _refused(tracking_epoch, f"point '{wrong[0].point}' is not marked, or was not read; marked are {known}")
+    names = sorted({t.point for t in touches})
+    if len(names) < 3:
+        left = ", ".join(sorted(set(points_world) - set(names)))
+        return _refused(tracking_epoch, f"{len(names)} points touched, 3 are needed; not yet touched: {left}")
+    world = np.array([points_world[name] for name in names])
+    in_line = _in_line(names, world)
+    if in_line:
+        return _refused(tracking_epoch, in_line, names)
+    by_name = [np.array([t.p_tracking_tip for t in touches if t.point == name]) for name in names]
+    torn = [
+        name
+        for name, p in zip(names, by_name, strict=True)
+        if float(np.max(np.linalg.norm(p - p.mean(axis=0), axis=1))) > 4.0 * sigma_m * math.sqrt(2.0)
+    ]
+    if torn:
+        return _refused(tracking_epoch, f"point '{torn[0]}' was touched in two places: touch it again", torn)
+    tip = np.array([p.mean(axis=0) for p in by_name])
+    sigma = sigma_m / np.sqrt([len(p) for p in by_name])
+    fit = _fit(world, tip, sigma, config)
+    residuals = {name: float(r) for name, r in zip(names, np.linalg.norm(fit.residuals, axis=1), strict=True)}
+    if not fit.good:
+        advice, suspects = _blame(names, world, tip, sigma, config)
+        return Registration(_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
+    alike = _alike(names, world, sigma_m)
+    return Registration(_estimate(fit, world, tracking_epoch, len(touches), config, alike), residuals)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    q: Array  # T_tracking_world
+    t: Array
+    covariance: Array  # (6, 6) tracking axes
+    residuals: Array  # (n, 3)
+    chi2: float
+    freedom: float
+    good: bool
+
+
+def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fit:
+    """Least squares of `tip = R world + t` with gravity as in `anchors.solve`; the first guess is level (4) or Kabsch's
+    (6), after which Gauss-Newton has a few small steps to go."""
+    gravity = 1.0 / config.tilt_sigma_rad**2 if config.dof == 4 else 0.0
+    q = _level(world, tip, sigma) if gravity else _kabsch(world, tip, sigma)
+    w = 1.0 / sigma**2
+    centre = w @ world / np.sum(w)
+    t = w @ tip / np.sum(w) - quat_matrix(q) @ centre
+    H = np.eye(6)
+    for _ in range(8):
+        turned = world @ quat_matrix(q).T
+        r = tip - turned - t
+        J = np.concatenate([np.broadcast_to(np.eye(3), (len(world), 3, 3)), -skew(turned)], axis=2)
+        H = np.einsum("nij,n,nik->jk", J, w, J)
+        g = np.einsum("nij,n,ni->j", J, w, r)
+        H[3, 3] += gravity
+        H[4, 4] += gravity
+        g[3:5] -= gravity * swing(q)
+        step = np.linalg.solve(H, g)
+        t = t + step[:3]
+        q = quat_multiply(quat_exp(step[3:]), q)
+        if float(np.max(np.abs(step))) < 1e-10:
+            break
+    r = tip - world @ quat_matrix(q).T - t
+    d2 = np.sum(r * r, axis=1) * w
+    tilt2 = float(np.sum(swing(q) ** 2)) * gravity
+    freedom = 3.0 * len(world) - (4.0 if gravity else 6.0)
+    chi2 = float(np.sum(d2)) + tilt2
+    good = bool(np.all(d2 <= _CHI2_3_999)) and tilt2 <= _CHI2_3_999 and chi2 <= 2.0 * chi2_quantile(freedom, Z99)
+    return _Fit(q, t, np.asarray(np.linalg.inv(H), dtype=np.float64), r, chi2, freedom, good)
+
+
+def _level(world: Array, tip: Array, sigma: Array) -> Array:
+    """The turn about Z that fits best: planar Procrustes."""
+    w = 1.0 / sigma**2
+    a, b = world - w @ world / np.sum(w), tip - w @ tip / np.sum(w)
+    cross = float(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+    dot = float(w @ (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    return quat_exp(np.array([0.0, 0.0, math.atan2(cross, dot)]))
+
+
+def _kabsch(world: Array, tip: Array, sigma: Array) -> Array:
+    """Best rotation of centred points (Kabsch 1976), as a quaternion by Horn's eigenvector (1987)."""
+    w = 1.0 / sigma**2
+    a, b = world - w @ world / np.sum(w), tip - w @ tip / np.sum(w)
+    S = (a * w[:, None]).T @ b
+    D = np.array([S[1, 2] - S[2, 1], S[2, 0] - S[0, 2], S[0, 1] - S[1, 0]])
+    N = np.zeros((4, 4))
+    N[0, 0] = np.trace(S)
+    N[0, 1:] = N[1:, 0] = D
+    N[1:, 1:] = S + S.T - np.trace(S) * np.eye(3)
+    return np.asarray(np.linalg.eigh(N)[1][:, -1])
+
+
+def _in_line(names: Sequence[str], world: Array) -> str:
+    """Which points lie on one line, and how little is missing; empty when one of them is well beside it."""
+    centred = world - world.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred)
+    beside = np.linalg.norm(centred - np.outer(centred @ axes[0], axes[0]), axis=1)
+    spread = float(np.max(beside))
+    if spread >= 0.5 * _MIN_WIDTH_M:
+        return ""
+    most = names[int(np.argmax(beside))]
+    return (
+        f"points {', '.join(names)} lie on one line ('{most}' is {spread * 1e3:.0f} mm beside it): mark and touch one "
+        f"that lies at least {_MIN_WIDTH_M * 1e3:.0f} mm beside the others"
+    )
+
+
+def _blame(
+    names: Sequence[str], world: Array, tip: Array, sigma: Array, config: AlignmentConfig
+) -> tuple[str, tuple[str, ...]]:
+    """What went wrong where the points do not fit: another order, or one of them touched elsewhere."""
+    n = len(names)
+    fits = [(order, _fit(world[list(order)], tip, sigma, config)) for order in _orders(n)]
+    order, best = min(fits, key=lambda one: one[1].chi2)
+    if best.good:
+        mixed = [i for i in range(n) if order[i] != i]
+        told = ", ".join(f"'{names[i]}' was touched at '{names[order[i]]}'" for i in mixed)
+        return f"points are mixed up: {told}; touch them again by their names", tuple(names[i] for i in mixed)
+    if n > 3:
+        alone = []
+        for i in range(n):
+            rest = [k for k in range(n) if k != i]
+            if not _in_line([names[k] for k in rest], world[rest]):
+                fit = _fit(world[rest], tip[rest], sigma[rest], config)
+                if fit.good:
+                    off = float(np.linalg.norm(tip[i] - quat_matrix(fit.q) @ world[i] - fit.t))
+                    alone.append((fit.chi2, i, off))
+        if alone:
+            _, i, off = min(alone)
+            return f"point '{names[i]}' is {off * 1e3:.0f} mm off: touch it again", (names[i],)
+    return _blame_distances(names, world, tip, float(np.max(sigma)))
+
+
+def _alike(names: Sequence[str], world: Array, sigma_m: float) -> str:
+    """A layout that looks the same in another order when turned about the vertical: that order would not be noticed."""
+    fine = np.full(len(names), sigma_m)
+    for order in _orders(len(names)):
+        moved = world[list(order)]
+        sides = np.linalg.norm(world - world.mean(axis=0), axis=1) - np.linalg.norm(moved - world.mean(axis=0), axis=1)
+        if float(np.max(np.abs(sides))) < 4.0 * sigma_m and _fit(world, moved, fine, AlignmentConfig()).good:
+            mixed = ", ".join(f"'{names[i]}'" for i in range(len(names)) if order[i] != i)
+            return f"the marks {mixed} look the same in another order: move one by 50 mm, else a mix-up goes unnoticed"
+    return ""
+
+
+def _orders(n: int) -> list[tuple[int, ...]]:
+    """Orders other than the given one: all of few points, exchanged pairs of many."""
+    identity = tuple(range(n))
+    if n <= _MAX_PERMUTED:
+        return [p for p in permutations(identity) if p != identity]
+    out = []
+    for i, j in combinations(range(n), 2):
+        order = list(identity)
+        order[i], order[j] = j, i
+        out.append(tuple(order))
+    return out
+
+
+def _blame_distances(names: Sequence[str], world: Array, tip: Array, sigma: float) -> tuple[str, tuple[str, ...]]:
+    """With three points no majority fits; a point is to blame when both of its distances are wrong and the third is
+    not."""
+    bad = []
+    for i, j in combinations(range(len(names)), 2):
+        off = float(np.linalg.norm(tip[i] - tip[j])) - float(np.linalg.norm(world[i] - world[j]))
+        if abs(off) > 3.3 * math.sqrt(2.0) * sigma:
+            bad.append((i, j, off))
+    shared = [k for k in range(len(names)) if bad and all(k in (i, j) for i, j, _ in bad)]
+    if len(bad) > 1 and len(shared) == 1:
+        return f"point '{names[shared[0]]}' does not fit the others: touch it again", (names[shared[0]],)
+    told = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in bad)
+    return (
+        f"distances between points are wrong ({told or 'not any: the order is turned round'}): touch all of them again",
+        tuple(names),
+    )
+
+
+def _estimate(fit: _Fit, world: Array, epoch: int, n: int, config: AlignmentConfig, alike: str) -> AlignmentEstimate:
+    """The same form as the estimate by sheets."""
+    pivot = world.mean(axis=0)
+    wider = fit.chi2 / fit.freedom if fit.chi2 > chi2_quantile(fit.freedom, Z99) else 1.0
+    covariance = tuple(float(v) for v in (wider * in_world(fit.q, fit.covariance, pivot)).ravel())
+    at: Vec3 = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
+    error = position_error_p95(covariance, at, at)
+    tilt = float(np.linalg.norm(swing(fit.q)))
+    refused = not error <= config.max_error_m
+    return AlignmentEstimate(
+        inverted(fit.t, fit.q),
+        epoch,
+        covariance,
+        at,
+        error,
+        tilt,
+        n,
+        1,
+        refused,
+        f"the error would be {error * 1e3:.0f} mm: touch more points, further apart" if refused else alike,
+    )
+
+
+def _refusal(epoch: int, advice: str, n: int = 0) -> AlignmentEstimate:
+    return AlignmentEstimate(_NOWHERE, epoch, (0.0,) * 36, (0.0, 0.0, 0.0), math.inf, 0.0, n, 0, True, advice)
+
+
+def _refused(epoch: int, advice: str, suspects: Sequence[str] = ()) -> Registration:
+    return Registration(_refusal(epoch, advice), {}, tuple(suspects))

@@ -1,0 +1,129 @@
+"""Group operations as arrays: laws by hypothesis, golden cases against scipy and OpenCV, care near zero and pi."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from anchors import lie
+from anchors.lie import Array
+from anchors.pose import quat_mul, quat_rotate, quat_to_rotvec
+
+vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
+axes = vectors.filter(lambda v: bool(np.linalg.norm(v) > 1e-3)).map(lambda v: v / np.linalg.norm(v))
+#: Where series, square roots and signs go wrong.
+angles = st.one_of(
+    st.floats(0.0, math.pi),
+    st.sampled_from([0.0, 1e-300, 1e-12, 1e-8, 1e-7, 1e-4, math.pi - 1e-4, math.pi - 1e-8, math.pi]),
+)
+
+
+def _scipy(q: Array) -> Rotation:
+    return Rotation.from_quat(np.roll(q, -1, axis=-1))
+
+
+def _turned_alike(a: Array, b: Array) -> bool:
+    return bool(abs(abs(float(a @ b)) - 1.0) < 1e-12)
+
+
+@given(axes, angles)
+def test_log_is_the_inverse_of_exp(axis: Array, angle: float) -> None:
+    q = lie.quat_exp(axis * angle)
+    assert math.isclose(float(np.linalg.norm(q)), 1.0, abs_tol=1e-12)
+    back = lie.quat_log(q)
+    assert np.linalg.norm(back) <= math.pi + 1e-12
+    if angle < math.pi - 1e-7:
+        assert np.allclose(back, axis * angle, rtol=1e-9, atol=1e-12)
+    else:  # half a turn to either side is the same
+        assert _turned_alike(lie.quat_exp(back), q)
+
+
+@given(axes, angles)
+def test_exp_agrees_with_scipy_and_opencv(axis: Array, angle: float) -> None:
+    R = lie.quat_matrix(lie.quat_exp(axis * angle))
+    assert np.allclose(R, Rotation.from_rotvec(axis * angle).as_matrix(), atol=1e-9)
+    assert np.allclose(R, cv2.Rodrigues(axis * angle)[0], atol=1e-9)
+
+
+@given(axes, angles)
+def test_log_agrees_with_opencv(axis: Array, angle: float) -> None:
+    R = Rotation.from_rotvec(axis * angle).as_matrix()
+    ours = lie.quat_log(lie.matrix_quat(R))
+    theirs = cv2.Rodrigues(R)[0].ravel()
+    assert np.allclose(lie.quat_matrix(lie.quat_exp(ours)), cv2.Rodrigues(theirs)[0], atol=1e-6)
+    if angle < math.pi - 1e-3:
+        assert np.allclose(ours, theirs, atol=1e-6)
+
+
+@given(vectors, vectors, vectors)
+def test_product_is_application_in_turn(a: Array, b: Array, v: Array) -> None:
+    qa, qb = lie.quat_exp(a), lie.quat_exp(b)
+    both = lie.quat_multiply(qa, qb)
+    assert np.allclose(lie.quat_matrix(both) @ v, lie.quat_matrix(qa) @ (lie.quat_matrix(qb) @ v), atol=1e-9)
+    assert np.allclose(lie.quat_multiply(both, lie.quat_conjugate(both)), [1.0, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+@given(arrays(np.float64, (5, 3), elements=st.floats(-3.0, 3.0)))
+def test_many_at_once_are_as_one_by_one_and_as_plain_tuples(r: Array) -> None:
+    q = lie.quat_exp(r)
+    product = lie.quat_multiply(q, q[::-1])
+    turned = lie.quat_matrix(q) @ np.array([1.0, -2.0, 0.5])
+    for i in range(5):
+        a, b = tuple(q[i].tolist()), tuple(q[4 - i].tolist())
+        assert np.allclose(product[i], quat_mul(a, b), atol=1e-12)
+        assert np.allclose(turned[i], quat_rotate(a, (1.0, -2.0, 0.5)), atol=1e-9)
+        assert _turned_alike(lie.quat_exp(lie.quat_log(q[i])), lie.quat_exp(np.array(quat_to_rotvec(a))))
+
+
+@given(vectors)
+def test_matrix_and_back(r: Array) -> None:
+    q = lie.quat_exp(r)
+    assert _turned_alike(lie.matrix_quat(lie.quat_matrix(q)), q)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
+def test_matrix_to_quaternion_at_half_a_turn(axis: tuple[float, float, float]) -> None:
+    q = np.array([0.0, *axis])
+    assert _turned_alike(lie.matrix_quat(lie.quat_matrix(q)), q)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(a: Array, b: Array) -> None:
+    assert np.allclose(lie.skew(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+@given(axes, st.floats(0.0, 3.0), axes)
+def test_left_jacobian_is_the_derivative_of_exp(axis: Array, angle: float, way: Array) -> None:
+    r, h = axis * angle, 1e-6
+    ahead, behind = lie.quat_exp(r + h * way), lie.quat_exp(r - h * way)
+    change = lie.quat_log(lie.quat_multiply(ahead, lie.quat_conjugate(behind))) / (2.0 * h)
+    assert np.allclose(lie.left_jacobian(r) @ way, change, atol=1e-6)
+
+
+@settings(max_examples=30)
+@given(vectors, axes, st.floats(0.0, 3.0))
+def test_se3_exp_agrees_with_the_matrix_exponential_and_log_undoes_it(v: Array, axis: Array, angle: float) -> None:
+    xi = np.concatenate([v, axis * angle])
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = lie.skew(xi[3:]), v
+    T = expm(generator)
+    p, q = lie.se3_exp(xi)
+    assert np.allclose(p, T[:3, 3], atol=1e-9)
+    assert np.allclose(lie.quat_matrix(q), T[:3, :3], atol=1e-9)
+    assert np.allclose(lie.se3_log(p, q), xi, atol=1e-7)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_swing_is_what_is_left_of_a_turn_about_the_vertical(x: float, y: float, yaw: float) -> None:
+    tilt = lie.quat_exp(np.array([x, y, 0.0]))
+    q = lie.quat_multiply(tilt, lie.quat_exp(np.array([0.0, 0.0, yaw])))
+    assert np.allclose(lie.swing(q), [x, y], atol=1e-9)
+    assert np.allclose(lie.swing(-q), [x, y], atol=1e-9)

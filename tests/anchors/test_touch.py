@@ -1,0 +1,122 @@
+"""Alignment by touched points: exact, honest, and refusals that name the points to blame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentConfig
+from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from anchors.touch import Touch, register
+
+MARKS: dict[str, Vec3] = {
+    "a": (0.0, 0.0, 0.0),
+    "b": (0.62, 0.03, 0.0),
+    "c": (0.55, 0.45, 0.0),
+    "d": (-0.05, 0.37, 0.0),
+}
+T_WORLD_TRACKING: PoseTuple = ((1.0, -2.0, 0.4), quat_from_yaw(2.2))
+
+
+def _touches(
+    names: str, noise: float = 0.0, seed: int = 0, marks: dict[str, Vec3] = MARKS, T: PoseTuple = T_WORLD_TRACKING
+) -> list[Touch]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for name in names:
+        p = np.array(apply(inverse(T), marks[name])) + rng.normal(0.0, noise, 3)
+        out.append(Touch(name, (float(p[0]), float(p[1]), float(p[2]))))
+    return out
+
+
+@pytest.mark.parametrize("dof", [4, 6])
+@pytest.mark.parametrize("names", ["abc", "abcd", "dbcaabcd"])
+def test_exact_without_noise(names: str, dof: int) -> None:
+    T = T_WORLD_TRACKING if dof == 4 else ((0.3, 1.0, 2.0), quat_from_rotvec((0.9, -1.2, 0.4)))
+    got = register(MARKS, _touches(names, T=T), tracking_epoch=3, config=AlignmentConfig(dof=dof))
+    assert not got.estimate.refused
+    assert got.estimate.tracking_epoch == 3
+    assert distance(got.estimate.T_world_tracking[0], T[0]) < 1e-8
+    assert quat_angle(got.estimate.T_world_tracking[1], T[1]) < 1e-8
+    assert max(got.residuals_m.values()) < 1e-8
+
+
+def test_stated_error_is_honest() -> None:
+    inside = 0
+    for seed in range(100):
+        got = register(MARKS, _touches("abcd", 0.0015, seed))
+        assert not got.estimate.refused
+        at = apply(got.estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), MARKS["c"]))
+        inside += distance(at, MARKS["c"]) <= got.estimate.error_at(MARKS["c"])
+    assert 0.90 <= inside / 100 <= 0.99
+
+
+def test_too_few_points_names_those_left() -> None:
+    got = register(MARKS, _touches("ab"))
+    assert got.estimate.refused
+    assert got.estimate.advice == "2 points touched, 3 are needed; not yet touched: c, d"
+
+
+def test_points_on_a_line_are_refused_by_name() -> None:
+    marks = {"a": (0.0, 0.0, 0.0), "b": (0.3, 0.004, 0.0), "c": (0.6, 0.0, 0.0)}
+    got = register(marks, _touches("abc", marks=marks))
+    assert got.estimate.refused
+    assert got.estimate.advice.startswith("points a, b, c lie on one line ('b' is 3 mm beside it)")
+    assert got.suspects == ("a", "b", "c")
+
+
+def test_mixed_up_points_are_named() -> None:
+    touches = _touches("abcd", 0.001)
+    swapped = [Touch({"b": "c", "c": "b"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
+    got = register(MARKS, swapped)
+    assert got.estimate.refused
+    assert got.suspects == ("b", "c")
+    assert got.estimate.advice.startswith("points are mixed up: 'b' was touched at 'c', 'c' was touched at 'b'")
+
+
+def test_of_eight_points_a_swapped_pair_is_found() -> None:
+    rng = np.random.default_rng(5)
+    marks: dict[str, Vec3] = {name: (*rng.uniform(0.0, 1.0, 2).tolist(), 0.0) for name in "abcdefgh"}
+    touches = _touches("abcdefgh", 0.001, marks=marks)
+    swapped = [Touch({"d": "g", "g": "d"}.get(t.point, t.point), t.p_tracking_tip) for t in touches]
+    assert register(marks, swapped).suspects == ("d", "g")
+
+
+def test_one_point_touched_elsewhere_is_named_with_how_far() -> None:
+    touches = _touches("abcd", 0.0005)
+    x, y, z = touches[2].p_tracking_tip
+    touches[2] = Touch("c", (x, y, z + 0.03))
+    got = register(MARKS, touches)
+    assert got.suspects == ("c",)
+    assert "point 'c' is 30 mm off" in got.estimate.advice
+
+
+def test_of_three_points_the_one_with_two_wrong_distances_is_named() -> None:
+    touches = _touches("abc")
+    x, y, z = touches[0].p_tracking_tip
+    touches[0] = Touch("a", (x + 0.05, y + 0.03, z))
+    got = register(MARKS, touches)
+    assert got.estimate.refused
+    assert "'a'" in got.estimate.advice
+
+
+def test_a_point_touched_in_two_places_is_named() -> None:
+    touches = _touches("abcd")
+    x, y, z = touches[1].p_tracking_tip
+    got = register(MARKS, [*touches, Touch("b", (x + 0.04, y, z))])
+    assert got.suspects == ("b",)
+
+
+def test_unknown_and_unread_points_are_refused() -> None:
+    assert "'x' is not marked" in register(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
+    assert register(MARKS, [*_touches("abc"), Touch("d", (math.nan, 0.0, 0.0))]).estimate.refused
+
+
+def test_marks_that_look_alike_turned_round_are_warned_about() -> None:
+    square: dict[str, Vec3] = {"a": (0.0, 0.0, 0.0), "b": (0.5, 0.0, 0.0), "c": (0.5, 0.5, 0.0), "d": (0.0, 0.5, 0.0)}
+    got = register(square, _touches("abcd", marks=square))
+    assert not got.estimate.refused
+    assert "look the same in another order" in got.estimate.advice
+    assert register(MARKS, _touches("abcd")).estimate.advice == ""
