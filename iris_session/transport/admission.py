@@ -14,8 +14,9 @@ from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer
 from iris_session.transport.config import FrontConfig, Ports
 from iris_session.transport.doors import Doors
 from iris_session.transport.keyring import Keyring, roles_behind
-from iris_session.transport.limiter import Drops, TokenBucket
+from iris_session.transport.limiter import Drops
 from iris_session.transport.resume_tokens import ResumeTokens
+from iris_session.transport.shares import HelloShares, connections_of_one
 from iris_session.transport.sockets import peer_of
 
 SECRET_BYTES = 16  # 128 bits, made by the client
@@ -53,7 +54,7 @@ class Admission:
         self._keyring = keyring
         self._audit = audit
         self._doors = doors
-        self._hellos = TokenBucket(config.limits.hellos_per_second, config.limits.hello_burst)
+        self._hellos = HelloShares(config.limits)
         self._knocks: dict[int, RateLimiter] = {}
 
     def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
@@ -84,6 +85,9 @@ class Admission:
         limit = self._config.limits.connections
         if len(self._clients) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
+        share = connections_of_one(limit)
+        if not resume_of and self._held_by(gateway.key_id if gateway else key_id) >= share:
+            raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
         number = self._tokens.new_connection()
         connection = Connection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
         join = Join(
@@ -101,12 +105,18 @@ class Admission:
         return connection, join
 
     def _may_knock(self, route: Route, peer: Peer, now_ns: int) -> bool:
-        """Bounds the hellos of one TCP connection (a gateway's are those of many people), and of all together."""
+        """Bounds the hellos of one TCP connection (a gateway's are those of many people), of one key, and of all."""
         if not route.on_behalf_of:
             knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
             if not knocks.allow(Hello, now_ns):
                 return False
-        return self._hellos.take(now_ns)
+        return self._hellos.take(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+
+    def _held_by(self, key_id: str) -> int:
+        """Connections of one key, people behind it included."""
+        connections = self._clients.by_number
+        gateways = {number for number, one in connections.items() if one.key_id == key_id}
+        return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
 
     def forget_peer(self, descriptor: int) -> None:
         """A TCP connection was closed: its descriptor may become another's."""

@@ -20,6 +20,7 @@ from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import ServerMessage
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops, TokenBucket
+from iris_session.transport.traffic import Traffic
 
 _encoder = msgspec.msgpack.Encoder()
 #: Connections that were given up and may still stop the session.
@@ -148,10 +149,13 @@ def server_prefix(connection_epoch: int) -> bytes:
 class Outbox:
     """Sends on the control socket. What a socket does not take at once is dropped and counted."""
 
-    def __init__(self, control: zmq.Socket[bytes], limits: FrontLimits, drops: Drops) -> None:
+    def __init__(
+        self, control: zmq.Socket[bytes], limits: FrontLimits, drops: Drops, traffic: Traffic | None = None
+    ) -> None:
         self._control = control
         self._limits = limits
         self._drops = drops
+        self._traffic = traffic or Traffic()
         #: Connections found gone or too slow while sending, with the reason; the loop takes leave of them.
         self.failed: dict[int, str] = {}
 
@@ -161,8 +165,9 @@ class Outbox:
 
     def send_encoded(self, connection: Connection, message: bytes, bulk: Sequence[bytes] = ()) -> bool:
         """Sends an encoded message. A connection that loses `slow_drops` messages in a row is listed as slow."""
-        sent = self._send(connection.route, connection.prefix + message, bulk)
-        if sent:
+        envelope = connection.prefix + message
+        if self._send(connection.route, envelope, bulk):
+            self._traffic.handed(connection.peer.descriptor, (envelope, *bulk))
             connection.drops_in_a_row = 0
             return True
         connection.drops_in_a_row += 1

@@ -9,7 +9,8 @@ own that is emptied first.
 from __future__ import annotations
 
 from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample, TrackingEpoch
-from iris_session.protocol.entries import URGENT, Entry, Join, Lost
+from iris_session.protocol.entries import HOST, URGENT, Audit, Entry, Join, Lost
+from iris_session.protocol.security import RemoveParticipant
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops
 
@@ -73,6 +74,8 @@ class Coalescer:
         message = entry.message
         if isinstance(message, Sample):
             return self._offer_sample(lane, item, message)
+        if entry.connection == HOST and isinstance(message, RemoveParticipant):
+            return self._offer_removal(lane, item, message)
         if isinstance(message, URGENT):
             return self._offer_urgent(lane, item)
         if isinstance(message, Heartbeat):
@@ -82,7 +85,8 @@ class Coalescer:
             lane.tracking = item
             return True
         if len(lane.messages) >= self._limits.pending_messages:
-            self._drops.count("messages_pending", entry.connection)
+            lost = "audit_lost" if isinstance(message, Audit) else "messages_pending"
+            self._drops.count(lost, entry.connection)
             return False
         lane.messages.append(item)
         return True
@@ -125,6 +129,19 @@ class Coalescer:
         if isinstance(message, Lost | Bye):
             lane.samples.clear()
             lane.heartbeat = lane.tracking = None
+        lane.urgent.append(item)
+        self.urgent = True
+        return True
+
+    def _offer_removal(self, lane: _Lane, item: tuple[int, Entry], message: RemoveParticipant) -> bool:
+        """Who lost their key is removed whatever else is to be told: never behind a flood of audits, nor for want of
+        room, but once. There are no more participants than resume tokens."""
+        waiting = [one.message for _, one in lane.urgent]
+        if message in waiting:
+            return True
+        if len(waiting) >= self._limits.resume_tokens:
+            self._drops.count("urgent_pending", item[1].connection)
+            return False
         lane.urgent.append(item)
         self.urgent = True
         return True

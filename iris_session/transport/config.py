@@ -22,19 +22,23 @@ class FrontLimits(msgspec.Struct, frozen=True):
     """Bounds of everything that a client can make the front hold or do. Sizes and rates per message type:
     `protocol.limits`.
 
-    `pending_messages`, `pending_urgent`, `pending_devices`, `pending_samples`: waiting for the authority, per
-    connection (samples: per device). `unacknowledged`: batches on the way to the authority; urgent ones may use as
-    many again. `slow_drops`: messages in a row that a client's socket did not take before it counts as lost.
-    `receive_queue`, `send_queue`: messages in libzmq, per TCP connection. `excess_per_s`,
-    `excess_burst`: messages of one TCP connection that are not taken, before it is cut off. An honest client with a
-    fault in its loop is named by its rate limits long before. `strangers`: TCP connections that have not
-    said hello, for at most `hello_timeout_ns` each. `subscribers`: TCP connections to the state socket.
+    `hellos_per_second`, `hello_burst`: of everybody together, beside `hellos_per_source`, `hello_source_burst` that
+    every key has for itself. `pending_messages`, `pending_urgent`, `pending_devices`, `pending_samples`: waiting for
+    the authority, per connection (samples: per device). `unacknowledged`: batches on the way to the authority; urgent
+    ones may use as many again. `slow_drops`: messages in a row that a client's socket did not take before it counts as
+    lost. `receive_queue`, `send_queue`: messages in libzmq, per TCP connection. `excess_per_s`, `excess_burst`:
+    messages of one TCP connection that are not taken, before it is cut off. An honest client with a fault in its loop
+    is named by its rate limits long before. `strangers`: TCP connections that have not said hello, for at most
+    `hello_timeout_ns` each; as many again to the state socket that have not subscribed. `subscribers`: TCP connections
+    to the state socket that have.
     `memory_bytes`: what all queues together may hold (see `memory.py`).
     """
 
     connections: int = 64
     hellos_per_second: float = 40.0
     hello_burst: int = 80
+    hellos_per_source: float = 1.0
+    hello_source_burst: int = 4
     pending_messages: int = 64
     pending_urgent: int = 8
     pending_devices: int = 16

@@ -37,6 +37,7 @@ from iris_session.transport.session_note import NoteKeeper
 from iris_session.transport.sockets import readable
 from iris_session.transport.state_publisher import StatePublisher
 from iris_session.transport.status_desk import StatusDesk, Telling
+from iris_session.transport.traffic import Traffic
 from iris_session.transport.uplink import Uplink
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
@@ -70,12 +71,13 @@ class Front:
         sockets = self._sockets = FrontSockets(start, self._drops, self._key_refused)
         self._link, self._control = sockets.link, sockets.control.socket
         self._keyring = sockets.keyring
-        self._outbox = Outbox(self._control, config.limits, self._drops)
+        self._traffic = Traffic(curve=self._keyring.key is not None)
+        self._outbox = Outbox(self._control, config.limits, self._drops, self._traffic)
         self._tokens = ResumeTokens(config.limits.resume_tokens, start.handback)
         self._coalescer = Coalescer(config.limits, self._drops)
         self._audit = AuditTrail(self._coalescer.offer)
-        doors = self._doors = Doors(self._clients, self._drops, self._audit, config.limits)
-        doors.watch_state(sockets.state.monitor)
+        doors = self._doors = Doors(self._clients, self._drops, self._audit, config.limits, self._traffic)
+        doors.watch_state(*sockets.state)
         admission = self._admission = Admission(
             config,
             sockets.ports,
@@ -173,7 +175,7 @@ class Front:
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
-        self._doors.watch_state(state.monitor)
+        self._doors.watch_state(*state)
         return state.socket
 
     def _shed(self, whom: str, now_ns: int) -> None:
@@ -252,6 +254,7 @@ class Front:
             except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: libzmq does not tell by which connection
                 self._drops.count("unversioned_peer")
                 continue
+            self._traffic.taken(peer.descriptor, len(frame.buffer))
             self._intake.take(routing_id, peer, frame.buffer, extra)
         return True
 

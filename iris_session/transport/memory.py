@@ -1,7 +1,7 @@
 """The bound of everything that waits in the front: in libzmq's queues, in ours, in those of subscriptions.
 
 What waits in libzmq cannot be asked for, and a sum of worst cases would let nobody in. So the process is measured: when
-it holds more than `bound` above what it had once its sockets were open, connections are closed, the newest first.
+it holds more than `bound` above what it had once its sockets were open, those are closed for whom most waits.
 """
 
 from __future__ import annotations

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import resource
 import socket
+import struct
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import zmq
 from zmq.utils.monitor import parse_monitor_message
@@ -25,6 +29,8 @@ CONTROL_BUFFER_BYTES = 131_072
 #: As plain integers: operations on the enumerations take longer than asking the socket.
 _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
+#: Linux, `struct tcp_info`: `tcpi_bytes_acked`, and `tcpi_bytes_received` after it.
+_COUNTS_AT: Final = 120
 #: Connections that were opened and say nothing take a file descriptor each.
 FILE_DESCRIPTORS = 4096
 
@@ -45,8 +51,9 @@ def open_control(
 
 
 def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
-    """PUB for rigid state and presence."""
-    state = context.socket(zmq.PUB)
+    """XPUB, a PUB that tells who subscribes, for rigid state and presence."""
+    state = context.socket(zmq.XPUB)
+    state.setsockopt(zmq.XPUB_VERBOSER, 1)
     state.setsockopt(zmq.SNDHWM, STATE_HWM)
     state.setsockopt(zmq.SNDBUF, STATE_BUFFER_BYTES)
     # Subscriptions only. libzmq takes all that wait before it sends, in our thread: few may, and small ones.
@@ -90,31 +97,55 @@ def next_tcp_event(monitor: zmq.Socket[bytes]) -> tuple[int, int]:
     return int(event["event"]), int(event["value"])
 
 
+class TcpCounts(NamedTuple):
+    """Bytes of one TCP connection since it was opened: that the other end has acknowledged, and that came from it."""
+
+    acknowledged: int
+    received: int
+
+
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """A descriptor of libzmq as a socket of Python. Not a copy of it: with every descriptor in use there is no room for
+    one. Raises `OSError` when it is none, or not a socket."""
+    borrowed = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, descriptor)
+    try:
+        yield borrowed
+    finally:
+        borrowed.detach()
+
+
 def close_tcp(descriptor: int, peer: tuple[str, int]) -> bool:
     """Closes one peer's TCP connection: libzmq has no call for that. `peer`: its address when it said hello, so that
     a descriptor that was given to somebody else since is left alone."""
     try:
-        twin = socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM)
+        with _borrowed(descriptor) as connection:
+            if connection.getpeername()[:2] != peer:
+                return False
+            connection.shutdown(socket.SHUT_RDWR)
     except OSError:
         return False
-    with twin:
-        try:
-            if twin.getpeername()[:2] != peer:
-                return False
-            twin.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            return False
     return True
 
 
 def peer_of(descriptor: int) -> tuple[str, int]:
     """Address and port of the other end of a TCP connection, ("", 0) when it is gone."""
     try:
-        with socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM) as twin:
-            host, port = twin.getpeername()[:2]
+        with _borrowed(descriptor) as connection:
+            host, port = connection.getpeername()[:2]
             return (host, port)
     except OSError:
         return ("", 0)
+
+
+def tcp_counts(descriptor: int) -> TcpCounts | None:
+    """What the system counts of a TCP connection; `None` where it does not, or the connection is gone."""
+    try:
+        with _borrowed(descriptor) as connection:
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _COUNTS_AT + 16)
+    except (OSError, AttributeError):
+        return None
+    return TcpCounts(*struct.unpack_from("=QQ", info, _COUNTS_AT)) if len(info) >= _COUNTS_AT + 16 else None
 
 
 def raise_descriptor_limit() -> None:

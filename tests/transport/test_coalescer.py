@@ -18,7 +18,8 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import IDENTITY, Target
-from iris_session.protocol.entries import Entry, EntryMessage, Join, Lost
+from iris_session.protocol.entries import HOST, Audit, Entry, EntryMessage, Join, Lost
+from iris_session.protocol.security import RemoveParticipant
 from iris_session.transport.coalescer import Coalescer
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops
@@ -206,3 +207,27 @@ def test_a_tracking_epoch_replaces_the_one_before_and_is_never_dropped_for_want_
         assert waiting.offer(entry(TrackingEpoch(epoch)))
     assert [e.message for e in waiting.take()] == [Marker(1, "x"), TrackingEpoch(99)]
     assert not drops.by_reason
+
+
+def test_a_removal_passes_a_flood_of_audits_and_what_audits_lose_is_counted() -> None:
+    waiting, drops = coalescer(pending_messages=4)
+    audits = [Entry(HOST, HOST, 0, Audit("flood", detail=str(i))) for i in range(10)]
+    assert [waiting.offer(audit) for audit in audits] == [True] * 4 + [False] * 6
+    removals = [Entry(HOST, HOST, 1, RemoveParticipant(0, f"p{i}", reason="key revoked")) for i in range(20)]
+    for removal in removals:
+        assert waiting.offer(removal)
+        assert waiting.offer(removal), "said twice, to be done once"
+    assert waiting.urgent
+    assert waiting.take(urgent_only=True) == removals
+    assert waiting.take() == audits[:4]
+    assert drops.by_reason == {"audit_lost": 6}
+
+
+def test_removals_are_bounded_and_a_directors_word_is_a_request_like_others() -> None:
+    waiting, drops = coalescer(resume_tokens=3)
+    for i in range(5):
+        waiting.offer(Entry(HOST, HOST, 1, RemoveParticipant(0, f"p{i}")))
+    waiting.offer(Entry(7, 7, 1, RemoveParticipant(1, "p9")))
+    assert len(waiting.take(urgent_only=True)) == 3
+    assert drops.by_reason == {"urgent_pending": 2}
+    assert len(waiting.take()) == 1

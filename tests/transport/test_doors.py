@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import socket
 from collections.abc import Iterator
 
 import pytest
-import zmq
 
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Audit, Entry
+from iris_session.transport import visitors
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Peer, Route
 from iris_session.transport.config import SECOND, FrontLimits
-from iris_session.transport.doors import LOOK_NS, MAX_SHOWN, OPENED_PER_S, Doors, bytes_received
+from iris_session.transport.doors import HOG_BYTES, LOOK_NS, MAX_SHOWN, OPENED_PER_S, Doors
 from iris_session.transport.limiter import Drops
 from iris_session.transport.memory import LOOK_NS as MEMORY_LOOK_NS
 from iris_session.transport.memory import PATIENCE_NS, MemoryWatch
-from iris_session.transport.sockets import watch_tcp
+from iris_session.transport.sockets import close_tcp, peer_of, tcp_counts
+from iris_session.transport.traffic import Traffic
+from iris_session.transport.visitors import Visitor, crowd
 
 LIMITS = FrontLimits(strangers=3, hello_timeout_ns=10 * SECOND)
 
@@ -29,7 +33,8 @@ class Hall:
         self.now_ns = SECOND
         self.clients, self.drops = ClientTable(), Drops()
         self.told: list[Entry] = []
-        self.doors = Doors(self.clients, self.drops, AuditTrail(self._tell), LIMITS)
+        self.traffic = Traffic()
+        self.doors = Doors(self.clients, self.drops, AuditTrail(self._tell), LIMITS, self.traffic)
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.held: list[socket.socket] = [self.listener]
 
@@ -151,30 +156,6 @@ def test_strangers_who_come_back_at_once_are_borne_less_and_less(hall: Hall) -> 
     assert not any(hall.doors.excess(peer, None, "before hello", hall.now_ns) for _ in range(borne[0]))
 
 
-def test_a_subscriber_that_talks_is_cut_off(hall: Hall) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    state = context.socket(zmq.PUB)
-    state.linger = 0
-    port = state.bind_to_random_port("tcp://127.0.0.1")
-    hall.doors.watch_state(watch_tcp(state, "state"))
-    quiet, talker = context.socket(zmq.SUB), context.socket(zmq.SUB)
-    for one in (quiet, talker):
-        one.linger = 0
-        one.connect(f"tcp://127.0.0.1:{port}")
-        one.subscribe(b"rigid")
-    number = 0
-    while "flood_cut" not in hall.drops.by_reason:
-        number += 1
-        assert number < 100_000
-        talker.subscribe(b"%900d" % number)
-        state.get(zmq.EVENTS)
-        hall.look(SECOND // 100)
-    assert [audit.detail for audit in hall.audits] == ["subscriptions"]
-    assert hall.drops.by_reason["flood_cut"] == 1
-    hall.doors.close()
-    context.destroy(linger=0)
-
-
 def test_what_is_not_taken_slowly_is_never_cut_off(hall: Hall) -> None:
     peer, theirs = hall.open()
     for _ in range(3 * LIMITS.excess_burst):
@@ -199,7 +180,7 @@ def test_what_is_remembered_of_floods_is_bounded(hall: Hall) -> None:
     assert len(hall.doors.warnings(hall.now_ns)) == MAX_SHOWN
 
 
-def test_room_is_made_by_the_newest_strangers_then_the_newest_clients(hall: Hall) -> None:
+def test_room_is_made_by_the_newest_strangers_when_nobody_stands_out_then_by_the_newest_client(hall: Hall) -> None:
     crowd = [hall.open() for _ in range(4)]
     hall.hello(crowd[0][0], 1)
     hall.hello(crowd[3][0], 2)
@@ -211,16 +192,76 @@ def test_room_is_made_by_the_newest_strangers_then_the_newest_clients(hall: Hall
     assert hall.drops.by_reason == {"memory": 3}
 
 
-def test_the_system_counts_what_came(hall: Hall) -> None:
+def test_room_is_made_by_the_client_for_whom_most_waits_not_by_the_newest(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(4)]
+    for number in range(3):
+        hall.hello(crowd[number][0], number)
+    hall.traffic.handed(crowd[0][0].descriptor, [b"x" * 3 * HOG_BYTES])
+    hall.traffic.handed(crowd[1][0].descriptor, [b"x" * HOG_BYTES] * 4)
+    hall.doors.shed()
+    assert [is_closed(theirs) for _, theirs in crowd] == [False, True, False, False]
+    assert hall.doors.barred("key1", hall.clients.by_number[1].last_heard_ns)
+
+
+def test_room_is_made_by_strangers_who_hold_more_than_any_client(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(3)]
+    hall.hello(crowd[0][0])
+    hall.traffic.handed(crowd[0][0].descriptor, [b"x" * HOG_BYTES])
+    for stranger, _ in crowd[1:]:
+        hall.traffic.handed(stranger.descriptor, [b"x" * (HOG_BYTES // 2 + 1)])
+    assert hall.doors.shed() == "connections without hello"
+    assert not is_closed(crowd[0][1])
+
+
+def test_a_close_that_fails_is_tried_again(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, theirs = hall.open()
+    with monkeypatch.context() as patch:
+        patch.setattr(visitors, "close_tcp", lambda *_: False)
+        hall.look(11 * SECOND)
+    assert not is_closed(theirs)
+    hall.look()
+    assert is_closed(theirs)
+    assert hall.drops.by_reason == {"close_failed": 1, "no_hello": 1}
+
+
+def test_a_close_needs_no_descriptor_of_its_own(hall: Hall) -> None:
     peer, theirs = hall.open()
-    before = bytes_received(peer.descriptor)
-    theirs.sendall(b"x" * 1000)
-    ours = next(one for one in hall.held[1:] if one.fileno() == peer.descriptor)
-    got = 0
-    while got < 1000:
-        got += len(ours.recv(1000))
-    assert bytes_received(peer.descriptor) - before == 1000
-    assert bytes_received(10_000) == 0
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        with pytest.raises(OSError, match="Too many open files"):
+            os.dup(0)
+        assert peer_of(peer.descriptor) == theirs.getsockname()
+        assert tcp_counts(peer.descriptor) is not None
+        assert close_tcp(peer.descriptor, theirs.getsockname())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert is_closed(theirs)
+
+
+def test_what_is_no_tcp_connection_is_left_alone() -> None:
+    read, write = os.pipe()
+    for descriptor in (read, 10_000):
+        assert peer_of(descriptor) == ("", 0)
+        assert tcp_counts(descriptor) is None
+        assert not close_tcp(descriptor, ("", 0))
+    os.write(write, b"x")
+    assert os.read(read, 1) == b"x"
+    os.close(read)
+    os.close(write)
+
+
+def test_who_has_most_makes_room_in_the_given_order() -> None:
+    def visitor(who: str) -> Visitor:
+        one = Visitor(("", 0), 0)
+        one.who = who
+        return one
+
+    door = list(enumerate(map(visitor, "baaabcab")))
+    assert crowd(door, 8) == crowd(door, 100) == []
+    assert crowd(door, 7) == [1]
+    assert crowd(door, 3) == [1, 0, 2, 3, 4]
+    assert sorted(crowd(door, 0)) == list(range(8))
 
 
 class Machine:
@@ -248,7 +289,7 @@ class Machine:
         self.watch.turn(self.now_ns)
 
 
-def test_memory_above_the_bound_costs_the_newest_their_connection() -> None:
+def test_memory_above_the_bound_costs_somebody_their_connection() -> None:
     machine = Machine()
     machine.look()
     machine.held = 150

@@ -90,7 +90,10 @@ def test_three_hundred_connections_without_hello_leave_room(session: FrontSessio
 
 
 def test_a_full_house_and_hellos_too_fast_are_refused_with_advice(open_session: OpenSession) -> None:
-    session = open_session(limits=FrontLimits(connections=2, hellos_per_second=0.001, hello_burst=4))
+    limits = FrontLimits(
+        connections=2, hellos_per_second=0.001, hello_burst=3, hellos_per_source=0.001, hello_source_burst=1
+    )
+    session = open_session(limits=limits)
     for name in ("Ann", "Bob"):
         session.client().join(name=name)
     third = session.client()
@@ -108,6 +111,34 @@ def test_hellos_of_one_peer_use_up_nobody_elses(session: FrontSession) -> None:
     session.pump(lambda: any(r.code == "rate" for r in knocking.got(Refused)), "refusal by rate")
     knocking.wait_for(Refused, 200)
     session.client().join()
+
+
+def test_one_key_leaves_connections_to_others(open_session: OpenSession) -> None:
+    session = open_session(limits=FrontLimits(connections=4))
+    hog, ann = session.client(), session.client()
+    clients = [hog]
+    for _ in range(3):
+        clients[-1].secret = hog.secret
+        clients[-1].join(name="Hog")
+        clients.append(session.client())
+    clients[-1].send(Hello("operator", "Hog", secret=hog.secret))
+    refused = clients[-1].wait_for(Refused)
+    assert (refused.code, refused.message) == ("full", "this key has 3 connections already")
+    ann.join()
+
+
+def test_connections_that_never_subscribe_keep_no_subscriber_out(open_session: OpenSession) -> None:
+    session = open_session(limits=FrontLimits(subscribers=5))
+    crowd = [sockets.create_connection(("127.0.0.1", session.ports.state)) for _ in range(20)]
+    sub = session.subscriber()
+
+    def state_comes() -> bool:
+        session.send_state(np.zeros((3, 7)))
+        return bool(sub.poll(0))
+
+    session.pump(state_comes, "state")
+    for tcp in crowd:
+        tcp.close()
 
 
 def test_a_flood_of_one_does_not_delay_the_estop_of_another(session: FrontSession) -> None:
@@ -192,26 +223,27 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
 def test_what_waits_for_a_client_that_reads_nothing_is_bounded_in_memory(open_session: OpenSession) -> None:
     limits = FrontLimits(send_queue=100_000, slow_drops=10**9, memory_bytes=24 << 20)
     session = open_session(limits=limits, silence_ns=60_000_000_000, bodies=BODIES)
-    honest, slow = session.client(), session.client()
-    honest.join(name="Ann")
+    slow, honest, waiting = session.client(), session.client(), session.client()
     slow.join(name="Bob")
+    honest.join(name="Ann")
+    waiting.join(name="Eve")  # neither is the newest at fault, nor a stranger
     session.clients.remove(slow)  # it reads no more
     slow.socket.rcvhwm = 1
     front = psutil.Process(session.process.pid)
     base = front.memory_info().rss
 
     def lost() -> bool:
-        session.once(Decision((), outgoing=(Outgoing(2, session.snapshot(1)),) * 2))
+        session.once(Decision((), outgoing=(Outgoing(1, session.snapshot(1)),) * 2))
         assert front.memory_info().rss - base < 3 * limits.memory_bytes
         return any(isinstance(e.message, Lost) for e in session.entries)
 
     session.pump(lost, "the end of who reads nothing", timeout_s=60.0)
     (loss,) = [e for e in session.entries if isinstance(e.message, Lost)]
-    assert loss.connection == 2
+    assert loss.connection == 1
     assert session.wait_drops("memory") == 1
     session.pump(lambda: any("memory" in getattr(e.message, "detail", "") for e in session.entries), "its name")
     honest.send(EStop())
-    session.wait_entries(EStop, connection=1)
+    session.wait_entries(EStop, connection=2)
     slow.close()
 
 
