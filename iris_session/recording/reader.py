@@ -37,6 +37,8 @@ _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
 _decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
 
 
+#: What decoding of bytes that mean something else may raise.
+_UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
 _T = TypeVar("_T")
 #: A new part repeats at most what the feed's window held: minutes of rows.
 REPEATED_ITEMS: Final = 200_000
@@ -83,7 +85,7 @@ class Recording:
             for path in files:
                 self._add_part(path, prober)
         self.header = self._header(files[0])
-        ends = {part: _decode_end(_values(batch, "end")[0]) for part, batch in self._batches(paths.END)}
+        ends = dict(self._items(paths.END, lambda batch: map(_decode_end, _values(batch, "end"))))
         self._find_missing(files)
         self.end = ends.get(len(self.files) - 1)
 
@@ -155,10 +157,7 @@ class Recording:
 
     def samples(self) -> Iterator[RawSample]:
         """Raw messages of clients, in the order of receipt."""
-        for _, batch in self._batches(paths.SAMPLES):
-            times = _index(batch, paths.SESSION_TIME)
-            for row in zip(_values(batch, "connection"), times, _values(batch, "data"), strict=True):
-                yield RawSample(*row)
+        return (sample for _, sample in self._items(paths.SAMPLES, _samples))
 
     def metrics(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Per name: session times [ns] and values."""
@@ -172,8 +171,8 @@ class Recording:
     def changed_spans(self) -> list[str]:
         """Spans of bytes that were changed since the recorder wrote them, wherever in the file; a line each."""
         marks: dict[int, list[rrd_file.Mark]] = {}
-        for part, batch in self._batches(paths.MARKS):
-            marks.setdefault(part, []).extend(map(_decode_mark, _values(batch, "mark")))
+        for part, mark in self._items(paths.MARKS, lambda batch: map(_decode_mark, _values(batch, "mark"))):
+            marks.setdefault(part, []).append(mark)
         return [
             f"{os.path.basename(self.files[part])}: {line}"
             for part, noted in marks.items()
@@ -201,14 +200,24 @@ class Recording:
         before: frozenset[Hashable] = frozenset()
         tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
         part = 0
-        for i, batch in self._batches(entity):
+        for i, item in self._items(entity, decode):
             if i != part:
                 part, before = i, frozenset(tail)
-            for item in decode(batch):
-                name = key(item)
-                if name not in before:
-                    tail.append(name)
-                    yield item
+            name = key(item)
+            if name not in before:
+                tail.append(name)
+                yield item
+
+    def _items(self, entity: str, decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:
+        """Part number and item. What does not decode is left out with the rest of its chunk, and said in `damage`."""
+        for i, batch in self._batches(entity):
+            try:
+                yield from ((i, item) for item in decode(batch))
+            except _UNREADABLE as error:
+                place = f"{os.path.basename(self.files[i])}: {entity}"
+                line = f"{place} holds something damaged, which is left out: {_said(error)}"
+                if line not in self.damage:
+                    self.damage.append(line)
 
     def _batches(self, entity: str) -> Iterator[tuple[int, Any]]:
         """Part number (from 0) and record batch of an entity, over all parts in order."""
@@ -252,12 +261,12 @@ class Recording:
 
     def _header(self, path: str) -> SessionHeader:
         for _, batch in self._batches(paths.HEADER):
-            blob, intact = open_blob(_values(batch, "blob")[0])
-            self.root = root_of(blob)
             try:
+                blob, intact = open_blob(_values(batch, "blob")[0])
                 header = decode_header(blob)
-            except msgspec.DecodeError as error:
-                raise NotARecordingError(f"the header of {path} is damaged: {error}") from error
+            except _UNREADABLE as error:
+                raise NotARecordingError(f"the header of {path} is damaged: {_said(error)}") from error
+            self.root = root_of(blob)
             if not intact:
                 self.damage.append("header: its bytes were changed (checksum)")
             return header
@@ -274,11 +283,11 @@ def _rows(batch: Any) -> Iterator[JournalRow]:
         _index(batch, paths.SESSION_TIME),
         _values(batch, "n_ticks"),
         _values(batch, "entries"),
-        map(tuple, batch.column("entry_lengths").to_pylist()),
-        map(tuple, batch.column("entry_crcs").to_pylist()),
+        _lists(batch, "entry_lengths"),
+        _lists(batch, "entry_crcs"),
         _values(batch, "digest"),
         _values(batch, "chain"),
-        map(tuple, batch.column("field_crcs").to_pylist()),
+        _lists(batch, "field_crcs"),
         plant,
         strict=True,
     )
@@ -303,9 +312,31 @@ def _states(batch: Any, n_bodies: int) -> Iterator[State]:
     return (State(*values) for values in columns)
 
 
+def _samples(batch: Any) -> Iterator[RawSample]:
+    columns = (_values(batch, "connection"), _index(batch, paths.SESSION_TIME), _values(batch, "data"))
+    return (RawSample(*values) for values in zip(*columns, strict=True))
+
+
 def _values(batch: Any, column: str) -> list[Any]:
     """One value per row of a component column."""
-    return list(batch.column(column).flatten().to_pylist())
+    return list(_flat(batch, column).to_pylist())
+
+
+def _lists(batch: Any, column: str) -> Iterator[tuple[Any, ...]]:
+    """A tuple per row of a component column."""
+    _flat(batch, column)
+    return map(tuple, batch.column(column).to_pylist())
+
+
+def _flat(batch: Any, column: str) -> Any:
+    flat = batch.column(column).flatten()
+    if flat.null_count:
+        raise ValueError(f"{column} has {flat.null_count} values less than it ought to have")
+    return flat
+
+
+def _said(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _index(batch: Any, timeline: str) -> list[int]:

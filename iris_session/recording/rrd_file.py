@@ -45,7 +45,8 @@ class Message(NamedTuple):
 class Scan(NamedTuple):
     """`holes`: spans between readable messages that are none. `good_bytes`: after the last readable message.
 
-    `cut`: the file ends in the middle of a message, as after a kill or a full disk (and has no footer).
+    `cut`: the file ends in the middle of a message, as after a kill or a full disk. Behind the message that ends a file
+    nothing belongs to it, but the tail that Rerun's own files have.
     """
 
     messages: list[Message]
@@ -84,12 +85,11 @@ def scan(path: str | Path) -> Scan:
             found.append(message)
             at += _HEAD.size + message.length
             if message.kind == KIND_END:
+                file.seek(at)
+                at += FILE_TAIL if FOOT in file.read(FILE_TAIL) else 0
                 break
-        file.seek(max(0, size - FILE_TAIL))
-        has_footer = FOOT in file.read()
-    if has_footer and size - at == FILE_TAIL:
-        return Scan(found, holes, size, size, False)
-    return Scan(found, holes, at, size, at < size and not has_footer)
+    ended = bool(found) and found[-1].kind == KIND_END
+    return Scan(found, holes, min(at, size), size, at < size and not ended)
 
 
 def end_of_messages(data: bytes) -> int:
@@ -139,10 +139,18 @@ def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
     out = []
     with open(path, "rb") as file:
         for mark in marks:
-            file.seek(mark.begin)
-            if zlib.crc32(file.read(mark.end - mark.begin)) != mark.crc:
+            if not 0 <= mark.begin <= mark.end <= found.size or _crc(file, mark) != mark.crc:
                 out.append(f"bytes {mark.begin} to {mark.end} are not as they were written")
     return out
+
+
+def _crc(file: BinaryIO, mark: Mark) -> int:
+    """Of the bytes of `mark` as they are now."""
+    file.seek(mark.begin)
+    crc, left = 0, mark.end - mark.begin
+    while left and (data := file.read(min(left, 1 << 20))):
+        crc, left = zlib.crc32(data, crc), left - len(data)
+    return crc
 
 
 def chunks(path: str | Path, entity: str) -> Iterator[Any]:

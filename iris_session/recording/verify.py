@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -71,16 +72,17 @@ class VerifyReport(msgspec.Struct):
     """`ok`: every step was checked and simulated again with the same result.
 
     `gaps`: `(first, last)` missing steps. `unverified_steps`: rows between a gap or divergence and the next keyframe.
-    `finished`: the recorder closed the file, so nothing can be missing at its end. `files`: names of the parts. `cuts`,
-    `missing`, `notes`: see `Recording`. `crash`: of the last step, when an error in it ended the session.
-    `continues`: what a resumed session goes on from. `keyframes`: how many were met and equal. `seconds`: session time
-    simulated. `problems`: the first ones, in order.
+    `finished`: the recorder closed the file, so nothing can be missing at its end; else `ending` says so. `files`: the
+    parts. `cuts`, `missing`, `notes`: see `Recording`. `crash`: of the last step, when an error in it ended the
+    session. `continues`: what a resumed session goes on from. `keyframes`: how many were met and equal. `seconds`:
+    session time simulated. `problems`: the first ones, in order.
     """
 
     path: str
     ok: bool = False
     recording_class: str = ""
     finished: bool = True
+    ending: str = ""
     parts: int = 1
     steps: int = 0
     unverified_steps: int = 0
@@ -114,12 +116,13 @@ class VerifyReport(msgspec.Struct):
         if self.continues:
             parts.append(f"continues {self.continues}")
         parts += self.notes
-        if not self.finished and not self.missing:
-            parts.append(f"good up to step {self.last_step}, then the recorder was killed")
-        if self.ok:
+        if self.ok and self.finished:
             return "ok: " + "; ".join(parts)
+        if self.ok:
+            return f"ok as far as it goes, but {self.ending}: " + "; ".join(parts)
         if self.version_differences:
             parts.append(f"versions differ: {', '.join(self.version_differences)}")
+        parts += [self.ending] if self.ending else []
         if not self.problems:
             return "FAILED: no step could be verified; " + "; ".join(parts)
         first = self.problems[0]
@@ -168,8 +171,10 @@ def verify(
         if progress is not None:
             progress(total, total)
         run.end(recording.end)
+        changed = recording.changed_spans()
         report.finished = recording.finished
         report.last_step = run.last_step
+        report.ending = "" if recording.finished else _ending(run.last_step)
         report.damage = list(recording.damage)
         report.cuts = list(recording.cuts)
         report.missing = list(recording.missing)
@@ -181,7 +186,7 @@ def verify(
             run.found(Problem(run.last_step, "missing", "file", line))
         for line in recording.damage:
             run.found(Problem(run.last_step, "unreadable", "file", line))
-        for line in recording.changed_spans():
+        for line in changed:
             run.found(Problem(run.last_step, "changed", "file", line))
     report.wall_s = round(time.perf_counter() - began, 3)
     report.ok = not report.problems and report.steps > 0 and not report.unverified_steps
@@ -339,6 +344,10 @@ class _Run:
 
     def compare(self, past: Continues) -> None:
         """Whether the recording that this one goes on from is the one beside it."""
+        if not re.fullmatch(r"[^/\0]{1,255}", past.file) or past.file in (".", ".."):
+            text = f"the header names no file that it continues, but {past.file[:80]!r}"
+            self.found(Problem(self._first, "changed", "header", text))
+            return
         self.report.continues = f"{past.file} after step {past.step}"
         path = Path(self.report.path).with_name(past.file)
         if not path.is_file():
@@ -362,6 +371,11 @@ class _Run:
             self.report.problems.append(problem)
         else:
             self.report.more_problems += 1
+
+
+def _ending(last_step: int) -> str:
+    """Of a file without an end mark. A kill of the recorder looks as a file does that was cut between two writes."""
+    return f"NOT FINISHED: nobody closed it after step {last_step}, and what may have followed is not there"
 
 
 def _one_line(error: Exception) -> str:

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.recording import NotARecordingError, Recording, rrd_file, verify
+from iris_session.recording import Continues, NotARecordingError, Recording, VerifyReport, paths, rrd_file, verify
+from iris_session.recording.columns import blobs, nanoseconds, sequence
 from iris_session.recording.paths import part_path
+from iris_session.recording.verify import _Run
+from iris_session.recording.writer import RrdWriter
 from tests.recording.support import SmallCore, journal, write
 
 
@@ -141,6 +144,61 @@ def test_a_part_that_is_missing_is_found(tmp_path: Path) -> None:
     files[0].unlink()
     with Recording.open(late) as recording:
         assert recording.finished
+
+
+def test_a_file_that_was_cut_between_two_writes_is_not_called_finished(path: Path) -> None:
+    message = rrd_file.scan(path).messages[-14]
+    os.truncate(path, message.offset)
+    report = verify(path, SmallCore)
+    assert (report.ok, report.finished, report.cuts) == (True, False, [])
+    assert report.line().startswith("ok as far as it goes, but NOT FINISHED: nobody closed it after step ")
+    assert f"after step {report.last_step}" in report.as_dict()["ending"]
+
+
+def test_what_stands_behind_the_end_is_said(path: Path) -> None:
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes() + b"x")
+    report = verify(path, SmallCore)
+    assert (report.ok, report.finished, report.steps) == (False, True, 200)
+    assert report.problems[0].text == f"session.rrd: nothing after byte {size} of {size + 1} is readable"
+
+
+PLACES = {paths.END: "end", paths.KEYFRAMES: "keyframe", paths.MARKS: "mark", paths.ROWS: "n_ticks"}
+
+
+def test_what_does_not_decode_is_one_line_that_names_the_place(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    header, batch = journal(60)
+    writer = RrdWriter(path, "id")
+    writer.header(header)
+    writer.add(batch)
+    writer.flush()
+    times = [sequence(paths.STEP, [59]), nanoseconds(paths.SESSION_TIME, [0])]
+    for entity, column in PLACES.items():
+        writer._send(entity, times, [blobs(column, [b"\xc1 nothing"])])
+    writer.flush()
+    writer._stream.close()
+    report = verify(path, SmallCore)
+    assert (report.ok, report.steps) == (False, 60)
+    for entity in PLACES:
+        start = f"session.rrd: {entity} holds something damaged, which is left out: "
+        (line,) = [problem.text for problem in report.problems if problem.text.startswith(start)]
+        assert "\n" not in line
+
+
+def test_a_mark_of_bytes_that_cannot_be_is_found(path: Path) -> None:
+    marks = [rrd_file.Mark(-5, 2**62, 0), rrd_file.Mark(12, rrd_file.scan(path).size, 0)]
+    assert [line.partition(" are")[0] for line in rrd_file.changed_spans(path, marks)] == [
+        f"bytes {mark.begin} to {mark.end}" for mark in marks
+    ]
+
+
+def test_a_header_that_continues_no_file_is_said(path: Path) -> None:
+    with Recording.open(path) as recording:
+        for name in ("", "..", "../session.rrd", "a\0b", "x" * 300):
+            run = _Run(recording, None, VerifyReport(str(path)))
+            run.compare(Continues(name, -1, b""))
+            assert "the header names no file that it continues" in run.report.problems[-1].text
 
 
 @pytest.mark.parametrize(
