@@ -261,7 +261,8 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
     welcome = desk.join()
     for i in range(desk.limits.connections - 1):
         desk.now_ns += 1_000_000_000
-        desk.intake.take(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(HELLO))), 0)
+        hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
+        desk.intake.take(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
     assert len(desk.clients) == desk.limits.connections
     desk.now_ns += 1_000_000_000
     desk.coalescer.take()
@@ -274,6 +275,17 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
     (entry,) = desk.coalescer.take()
     assert isinstance(entry.message, Join)
     assert entry.message.resume_of == "p1"
+
+
+def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(desk: Desk) -> None:
+    for i in range(1000):
+        data = encode_client(envelope(Hello("operator", "Eve")))
+        desk.intake.take(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
+    refused = desk.last()
+    assert isinstance(refused, Refused)
+    assert refused.code == "rate"
+    desk.coalescer.take()
+    assert desk.join(Peer(5, "key-of-ann")).participant_id == "p1"
 
 
 def test_who_is_above_the_limits_for_seconds_is_named_as_a_flood(desk: Desk) -> None:
