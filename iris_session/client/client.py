@@ -30,7 +30,7 @@ from iris_session.protocol.names import AlignmentKind, Role
 from iris_session.protocol.server_messages import Event, Feedback
 
 #: Roles that have no headset, so nothing to align.
-UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER})
+UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER, Role.CAMERA, Role.SOURCE})
 
 
 class Client(Driving, Requests, Sampling, Reporting):
@@ -103,6 +103,7 @@ class Client(Driving, Requests, Sampling, Reporting):
         self._arrivals = ArrivalMeter()
         self._generation = 0
         self._sockets = ClientSockets()
+        self._init_media()
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None

@@ -12,6 +12,7 @@ import zmq
 
 from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.joining import Joining
+from iris_session.client.media import Media
 from iris_session.client.reporting import ArrivalMeter
 from iris_session.client.scene_view import SceneView
 from iris_session.client.state_stream import SceneState
@@ -23,7 +24,7 @@ from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault
 DEFAULT_TIMEOUT_S = 5.0
 
 
-class Driving(SceneView, Joining):
+class Driving(SceneView, Media, Joining):
     """Part of `Client`."""
 
     on_state: Callable[[SceneState], None] | None
@@ -150,8 +151,9 @@ class Driving(SceneView, Joining):
             self.connection.tick(time.monotonic_ns())
             report = self._arrivals.take(self.connection, time.monotonic_ns())
             if report is not None:
-                self.connection.send(report)
+                self.connection.send(self._with_media(report, time.monotonic_ns()))
             self._flush()
+            progressed |= self._tend_media()
             if self.connection.phase is Phase.REFUSED:
                 self._sockets.hang_up()
             progressed |= self.connection.phase is not phase

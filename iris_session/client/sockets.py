@@ -1,10 +1,14 @@
-"""ZeroMQ sockets of one client: control (DEALER), state (SUB), and what they need to be noticed. No protocol here."""
+"""ZeroMQ sockets of one client: control (DEALER), state and media (SUB), ingest (PUSH), and what tells of their end.
+
+No protocol here.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import socket
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
@@ -18,6 +22,9 @@ STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
 STATE_RCVBUF: Final = 16_384
 CONTROL_HWM: Final = 64
+#: As much as a link of 20 Mbit/s and 50 ms holds: more would only wait there.
+MEDIA_RCVBUF: Final = 131_072
+MEDIA_HWM: Final = 2
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
 LINGER_MS: Final = 200
@@ -57,6 +64,8 @@ class ClientSockets:
         self._monitor: zmq.Socket[bytes] | None = None
         self._state: zmq.Socket[bytes] | None = None
         self._state_of = (0, 0)
+        self._media: zmq.Socket[bytes] | None = None
+        self._ingest: zmq.Socket[bytes] | None = None
         #: Changes whenever a socket is opened or closed.
         self.version = 0
         self._wake_out, self._wake_in = socket.socketpair()
@@ -68,6 +77,7 @@ class ClientSockets:
         self._host = f"[{host}]" if ":" in host else host
         self._control_port = control_port
         self._curve = curve
+        self.close_media()
         if self._state is not None:
             self._state.close(linger=0)
             self._state = None
@@ -104,6 +114,58 @@ class ClientSockets:
         state.connect(f"tcp://{self._host}:{port}")
         self._state, self._state_of = state, (port, generation)
         self.version += 1
+
+    @property
+    def has_media(self) -> bool:
+        """Whether media come, of whatever stream."""
+        return self._media is not None
+
+    def subscribe_media(self, port: int, topics: Sequence[bytes]) -> None:
+        """Adds subscriptions. Port 0: the session has no media."""
+        if self._media is None and port:
+            media = self._media = self._new_socket(zmq.SUB)
+            media.setsockopt(zmq.RCVHWM, MEDIA_HWM)
+            media.setsockopt(zmq.RCVBUF, MEDIA_RCVBUF)
+            media.setsockopt(zmq.RECONNECT_IVL, 50)
+            media.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+            media.connect(f"tcp://{self._host}:{port}")
+            self.version += 1
+        for topic in topics:
+            if self._media is not None:
+                self._media.setsockopt(zmq.SUBSCRIBE, topic)
+
+    def unsubscribe_media(self, topic: bytes) -> None:
+        """Takes one back; none that there is not."""
+        if self._media is not None:
+            with contextlib.suppress(zmq.ZMQError):
+                self._media.setsockopt(zmq.UNSUBSCRIBE, topic)
+
+    def drain_media(self) -> list[list[bytes]]:
+        """What came on the media channel, oldest first."""
+        return _drain(self._media)
+
+    def send_media(self, port: int, frames: Sequence[bytes]) -> bool:
+        """Hands in a frame of a source. False: nobody takes it now."""
+        if self._ingest is None:
+            if not port:
+                return False
+            self._ingest = self._new_socket(zmq.PUSH)
+            self._ingest.setsockopt(zmq.SNDHWM, MEDIA_HWM)
+            self._ingest.setsockopt(zmq.IMMEDIATE, 1)
+            self._ingest.connect(f"tcp://{self._host}:{port}")
+        try:
+            self._ingest.send_multipart(frames, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def close_media(self) -> None:
+        """Ends what was subscribed and handed in, with another connection."""
+        for one in (self._media, self._ingest):
+            if one is not None:
+                one.close(linger=0)
+                self.version += 1
+        self._media = self._ingest = None
 
     def send_control(self, data: bytes) -> bool:
         """Sends without waiting. False: the socket cannot take it now."""
@@ -142,7 +204,7 @@ class ClientSockets:
         """
         if self._control is not None:
             poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
-        for sock in (self._monitor, self._state):
+        for sock in (self._monitor, self._state, self._media):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
         return self._state
@@ -166,6 +228,7 @@ class ClientSockets:
         """Disconnects, after a session has sent us away: libzmq would knock at its door for ever."""
         if self._control is not None or self._state is not None:
             self.version += 1
+            self.close_media()
             self._close_control(linger_ms=0)
             if self._state is not None:
                 self._state.close(linger=0)
@@ -174,6 +237,7 @@ class ClientSockets:
     def close(self) -> None:
         """Closes everything; a last bye still has `LINGER_MS` to leave."""
         self.version += 1
+        self.close_media()
         self._close_control(linger_ms=LINGER_MS)
         if self._state is not None:
             self._state.close(linger=0)

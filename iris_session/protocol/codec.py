@@ -22,14 +22,15 @@ from iris_session.protocol.limits import (
     MAX_BEACON_BYTES,
     MAX_CLIENT_BYTES,
     MAX_INTRODUCTION_BYTES,
+    MAX_MEDIA_FRAME_BYTES,
     MAX_MEDIA_HEADER_BYTES,
     MAX_PRESENCE_BYTES,
     MAX_SERVER_BYTES,
     MAX_STATE_HEADER_BYTES,
     SERVER_LIMITS,
 )
-from iris_session.protocol.media import MediaHeader, MediaPush
-from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, is_stream_name, not_a_stream
+from iris_session.protocol.names import PROTOCOL_VERSION, BudgetClass
 from iris_session.protocol.server_messages import (
     EventKind,
     Presence,
@@ -190,6 +191,22 @@ def decode_media_header(data: Bytes) -> MediaHeader:
 def encode_media_push(push: MediaPush) -> bytes:
     """First frame of what a source hands in."""
     return _encoder.encode(push)
+
+
+def encode_media_frames(
+    stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+) -> list[bytes]:
+    """All frames of what a source hands in. `frames`: of class `full`, or by class. Raises `ValueError`."""
+    by_class = frames if isinstance(frames, Mapping) else {BudgetClass.FULL: frames}
+    if not is_stream_name(stream):
+        raise ValueError(not_a_stream(stream))
+    if BudgetClass.FULL not in by_class or any(name not in CLASSES[:-1] for name in by_class):
+        raise ValueError(f"a media frame has class 'full', and may have 'half' and 'quarter', not {list(by_class)}")
+    for data in by_class.values():
+        if len(data) > MAX_MEDIA_FRAME_BYTES:
+            raise ValueError(f"a media frame of {len(data)} bytes: at most {MAX_MEDIA_FRAME_BYTES} for each class")
+    push = MediaPush(stream, scene_epoch, capture_ns, tuple(by_class), encoding)
+    return [encode_media_push(push), *by_class.values()]
 
 
 def decode_media_push(data: Bytes) -> MediaPush:

@@ -65,6 +65,14 @@ def is_stream_name(name: str) -> bool:
     return _STREAM.fullmatch(name) is not None
 
 
+def not_a_stream(name: str) -> str:
+    """What to say of a name that is not `is_stream_name`."""
+    return (
+        f"{name!r} cannot be the name of a media stream: 1 to 48 letters, digits, '.', '_' or '-', beginning with a "
+        "letter or digit"
+    )
+
+
 def media_topic(connection_epoch: int, stream: str) -> bytes:
     """What a client subscribes to. Messages have the class after it."""
     return b"media/%d/%s/" % (connection_epoch, stream.encode())

@@ -46,6 +46,9 @@ from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replac
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
 from iris_session.transport.sockets import host_in_address
 
+#: Ports of media, from the port of state: 7723 and 7726 by default.
+MEDIA_OFFSET: Final = 1
+INGEST_OFFSET: Final = 4
 WATCH_PERIOD_NS: Final = 50_000_000
 #: What the recorder gets to take what is left, and one that was just started before.
 TAKING_S: Final = 5.0
@@ -158,6 +161,8 @@ class SessionProcesses:
             beacon_port=config.beacon_port,
             control_port=config.control_port,
             state_port=config.state_port,
+            media_port=config.state_port + MEDIA_OFFSET if config.state_port else 0,
+            media_ingest_port=config.state_port + INGEST_OFFSET if config.state_port else 0,
             session_id=self.session_id,
             session_name=self.name,
             origin_ns=self._origin_ns,

@@ -41,6 +41,7 @@ from iris_session.runtime.continuation import begin
 from iris_session.runtime.core import SessionCore, core_of
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
+from iris_session.runtime.publishing import Publishing
 from iris_session.runtime.scheduling import quiet_collector, stop_signals, tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
@@ -53,7 +54,7 @@ PAUSED_STEP_S: Final = 0.01
 PAUSED_STEP_TICKS: Final = 10
 
 
-class Session:
+class Session(Publishing):
     """A shared session over one MuJoCo model.
 
     `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,

@@ -215,7 +215,9 @@ class Admission:
                 config.heartbeat_ns,
                 config.tick_period_ns,
                 config.state_period_ns,
-                Endpoints(self._ports.state, config.media_port, config.assets_port, config.web_port),
+                Endpoints(
+                    self._ports.state, self._ports.media, config.assets_port, config.web_port, self._ports.media_ingest
+                ),
                 self._ports.key_fingerprint,
             ),
         )

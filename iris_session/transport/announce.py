@@ -48,7 +48,7 @@ def announce(config: FrontConfig, ports: Ports, listeners: Listeners, drops: Dro
         host=ports.reachable[0],
         control=ports.control,
         state=ports.state,
-        media=config.media_port,
+        media=ports.media,
         assets=config.assets_port,
         web=config.web_port,
         key_fingerprint=ports.key_fingerprint,

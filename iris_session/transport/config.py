@@ -75,6 +75,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
     loopback with `curve`. `key_home`: folder of the server's key and the allow-list, empty for that of the user;
     `curve_secret_file`: another ZeroMQ certificate of the server (`*.key_secret`); `curve_clients_dir`: folder of
     public certificates (`*.key`) instead of the allow-list. `origin_ns`: `time.monotonic_ns()` at session time 0.
+    `media_endpoint`: where processes of this session hand in media, empty for nowhere; `media_port`,
+    `media_ingest_port`: taken when they are free, else any other.
     `recorder_endpoint`: a PULL socket that takes raw samples, empty when nothing is recorded. `forward_observations`:
     raw observations reach the authority too.
     """
@@ -86,6 +88,8 @@ class FrontConfig(msgspec.Struct, frozen=True):
     control_port: int = 7721
     state_port: int = 7722
     media_port: int = 0
+    media_ingest_port: int = 0
+    media_endpoint: str = ""
     assets_port: int = 0
     web_port: int = 0
     session_id: str = ""
@@ -137,6 +141,8 @@ class Ports(msgspec.Struct, frozen=True):
     state: int
     key_fingerprint: str = ""
     reachable: tuple[str, ...] = ()
+    media: int = 0
+    media_ingest: int = 0
 
 
 class FrontStart(msgspec.Struct, frozen=True):

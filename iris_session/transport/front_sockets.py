@@ -14,7 +14,16 @@ from iris_session.transport.config import FrontError, FrontStart, Ports
 from iris_session.transport.introduction import Listeners, open_with_introduction
 from iris_session.transport.keyring import open_keyring
 from iris_session.transport.limiter import Drops
-from iris_session.transport.sockets import bound_port, open_control, open_state, watch_tcp
+from iris_session.transport.sockets import (
+    IO_THREADS,
+    bound_port,
+    open_control,
+    open_ingest,
+    open_local_ingest,
+    open_media,
+    open_state,
+    watch_tcp,
+)
 from iris_session.transport.zap import Authenticator
 
 
@@ -26,7 +35,8 @@ class Watched(NamedTuple):
 
 
 class FrontSockets:
-    """`link`: to the authority. `control`, `state`: for clients. `listeners`: of the introduction.
+    """`link`: to the authority. `control`, `state`, `media`: for clients. `ingest`, `local_ingest`: for media sources,
+    on other machines and of this session. `listeners`: of the introduction.
 
     Raises `FrontError` when one cannot be opened; the authority has been told why then, and all are closed. `refused`:
     told the fingerprint and the address of every key that was not let in.
@@ -36,7 +46,7 @@ class FrontSockets:
         self._config = start.config
         self._drops = drops
         self._state_sockets = 0
-        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(IO_THREADS)
         self.link = self.context.socket(zmq.PAIR)
         self.link.setsockopt(zmq.LINGER, 1000)
         self.link_monitor = watch_tcp(self.link, "link", zmq.EVENT_DISCONNECTED)
@@ -59,10 +69,15 @@ class FrontSockets:
         )
         try:
             self.state = self.open_state(config.state_port)
+            media = open_media(self.context, config, key)
+            self.ingest = open_ingest(self.context, config, key)
         except FrontError:
             for listener in self.listeners:
                 listener.close()
             raise
+        self.media = Watched(media, watch_tcp(media, "media"))
+        endpoint = config.media_endpoint
+        self.local_ingest = open_local_ingest(self.context, endpoint) if endpoint else None
         self.control = Watched(control, watch_tcp(control, "control"))
         self.ports = Ports(
             host_for_address(config),
@@ -70,6 +85,8 @@ class FrontSockets:
             bound_port(self.state.socket),
             key.fingerprint if key else "",
             hosts_to_tell(config),
+            bound_port(media),
+            bound_port(self.ingest),
         )
 
     def open_state(self, port: int) -> Watched:

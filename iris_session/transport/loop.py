@@ -1,4 +1,4 @@
-"""The one loop of the front process, all sockets wired. Of our threads there is only the one of `FileWorker`.
+"""The one loop of the front process, all sockets wired. Threads: of media, and of `FileWorker`.
 
 It drains the link to the authority first (state goes out before anything else), then the control socket in small
 rounds with a look at the link in between. It never waits for a client, nor for the authority.
@@ -27,6 +27,9 @@ from iris_session.transport.downlink import Downlink
 from iris_session.transport.front_sockets import FrontSockets
 from iris_session.transport.intake import Intake, RawFeed
 from iris_session.transport.limiter import Drops
+from iris_session.transport.media import MediaProxy
+from iris_session.transport.media_desk import MediaDesk
+from iris_session.transport.media_doors import MediaDoors
 from iris_session.transport.memory import MemoryWatch
 from iris_session.transport.pairing_desk import PairingDesk
 from iris_session.transport.parent import parent_is
@@ -92,8 +95,10 @@ class Front:
         self._pairing = PairingDesk(self._keyring, self._outbox, self._audit, self._drops)
         raw = RawFeed(sockets.context, config.recorder_endpoint, self._drops)
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
+        self._media = self._make_media()
+        self._status.media_row = self._media.row
         memory = MemoryWatch(config.limits.memory_bytes, doors.shed, self._shed)
-        self._services += [self._keyring, self._status, doors, memory]
+        self._services += [self._keyring, self._status, self._media, doors, memory]
         self._intake = Intake(
             config,
             self._clients,
@@ -172,6 +177,22 @@ class Front:
         if self._keyring.home is not None:
             services.append(NoteKeeper(self._keyring.home, self._keyring.files, config, sockets.ports))
         return services + announce(config, sockets.ports, sockets.listeners, self._drops, facts)
+
+    def _make_media(self) -> MediaDesk:
+        sockets, encrypted = self._sockets, self._keyring.key is not None
+        doors = MediaDoors(sockets.media.monitor, self._config.limits)
+        proxy = MediaProxy(
+            sockets.media.socket, doors, sockets.local_ingest, sockets.ingest, self._session_ns, encrypted=encrypted
+        )
+        return MediaDesk(
+            proxy,
+            self._clients,
+            self._outbox,
+            self._keyring,
+            self._drops,
+            self._status.client_report,
+            self._tokens.revoked,
+        )
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
@@ -317,4 +338,5 @@ class Front:
             self._uplink.stalled,
             self._uplink.entries,
             self._doors.warnings(self._session_ns()),
+            self._media.streams(),
         )

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +21,7 @@ import zmq
 
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
+from iris_session.transport.media_source import MediaSource
 
 #: Room is left for our own names, of folder and socket.
 LONGEST_FOLDER: Final = 75
@@ -40,13 +42,16 @@ class FrontProcess:
     """
 
     def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
-        self._config = config
         self._scene = scene
         self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_folder_for_sockets())  # mode 0700
+        #: Where processes of this session hand in media, whichever front there is.
+        self.media_endpoint = f"ipc://{self._folder.name}/media"
+        self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
         self._generation = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
+        self._source: MediaSource | None = None
         self.link = FrontLink(config)
 
     @property
@@ -86,7 +91,13 @@ class FrontProcess:
             raise failure
         ports = self.link.ports
         if ports is not None:
-            self._config = msgspec.structs.replace(self._config, control_port=ports.control, state_port=ports.state)
+            self._config = msgspec.structs.replace(
+                self._config,
+                control_port=ports.control,
+                state_port=ports.state,
+                media_port=ports.media,
+                media_ingest_port=ports.media_ingest,
+            )
         start = self._open_link()
         self._replacing = threading.Thread(target=self._replace, args=(self._process, start), name="iris-front")
         self._replacing.start()
@@ -148,6 +159,14 @@ class FrontProcess:
         except OSError as error:
             raise _not_started(error) from error
 
+    def publish_media(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+    ) -> bool:
+        """Hands a frame to whichever front there is; see `MediaSource.publish`."""
+        if self._source is None:
+            self._source = MediaSource(self.media_endpoint)
+        return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
+
     def _end_process(self, patience_s: float) -> None:
         process = self._process
         if process is None:
@@ -165,6 +184,9 @@ class FrontProcess:
     def close(self, timeout_s: float = 2.0) -> None:
         """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
         self._finish_replacing()
+        if self._source is not None:
+            self._source.close()
+            self._source = None
         self.link.send_end()
         self._end_process(timeout_s if self.link.ports is not None else 0.0)
         self._process = None

@@ -13,7 +13,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from iris_session.keys import KeyPair
-from iris_session.protocol.limits import MAX_CLIENT_BYTES
+from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.transport.config import FrontConfig, FrontError, PortInUseError
 
 #: ZAP domains: keys that are not on the list may pair, on the control socket only.
@@ -26,6 +26,14 @@ STATE_BUFFER_BYTES = 32_768
 STATE_MESSAGE_BYTES = 1024
 STATE_RECEIVE_BYTES = 8192
 CONTROL_BUFFER_BYTES = 131_072
+#: Media: frames may be large, so few wait; more is refused to us, and the newest goes as soon as there is room.
+MEDIA_HWM = 2
+MEDIA_BUFFER_BYTES = 65_536
+INGEST_HWM = 8
+#: I/O threads of the front, as bits of ZMQ_AFFINITY: encrypting media must not delay state.
+IO_THREADS = 2
+MAIN_THREAD = 1
+MEDIA_THREAD = 2
 #: As plain integers: operations on the enumerations take longer than asking the socket.
 _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
@@ -62,6 +70,38 @@ def open_state(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
     state.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
     _bind(state, config, key, config.state_port, "state")
     return state
+
+
+def open_media(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
+    """XPUB for media. The front decides who gets what, and is told when a connection takes no more."""
+    media = context.socket(zmq.XPUB)
+    media.setsockopt(zmq.XPUB_MANUAL, 1)
+    media.setsockopt(zmq.XPUB_NODROP, 1)
+    media.setsockopt(zmq.SNDHWM, MEDIA_HWM)
+    media.setsockopt(zmq.SNDBUF, MEDIA_BUFFER_BYTES)
+    media.setsockopt(zmq.MAXMSGSIZE, STATE_MESSAGE_BYTES)
+    media.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
+    _bind_or_any(media, config, key, config.media_port, "media")
+    return media
+
+
+def open_ingest(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
+    """PULL for frames of cameras and other sources on other machines."""
+    ingest = context.socket(zmq.PULL)
+    ingest.setsockopt(zmq.MAXMSGSIZE, MAX_MEDIA_FRAME_BYTES)
+    ingest.setsockopt(zmq.RCVHWM, INGEST_HWM)
+    _bind_or_any(ingest, config, key, config.media_ingest_port, "media ingest")
+    return ingest
+
+
+def open_local_ingest(context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> zmq.Socket[bytes]:
+    """PULL for frames of processes of this session, in its private folder."""
+    ingest = context.socket(zmq.PULL)
+    ingest.setsockopt(zmq.AFFINITY, MEDIA_THREAD)
+    ingest.setsockopt(zmq.MAXMSGSIZE, MAX_MEDIA_FRAME_BYTES)
+    ingest.setsockopt(zmq.RCVHWM, INGEST_HWM)
+    ingest.bind(endpoint)
+    return ingest
 
 
 def host_in_address(host: str) -> str:
@@ -156,7 +196,26 @@ def raise_descriptor_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+def _bind_or_any(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, port: int, name: str) -> None:
+    """On any free port when the wanted one is taken: clients are told which it is."""
+    _prepare(bound, key, name)
+    try:
+        _listen(bound, config, port, name)
+    except PortInUseError:
+        _listen(bound, config, 0, name)
+
+
 def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, port: int, name: str) -> None:
+    _prepare(bound, key, name)
+    try:
+        _listen(bound, config, port, name)
+    except FrontError:
+        bound.close()
+        raise
+
+
+def _prepare(bound: zmq.Socket[bytes], key: KeyPair | None, name: str) -> None:
+    bound.setsockopt(zmq.AFFINITY, MEDIA_THREAD if name.startswith("media") else MAIN_THREAD)
     bound.setsockopt(zmq.LINGER, 200)
     bound.setsockopt(zmq.TCP_KEEPALIVE, 1)
     bound.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
@@ -169,12 +228,14 @@ def _bind(bound: zmq.Socket[bytes], config: FrontConfig, key: KeyPair | None, po
         bound.setsockopt(zmq.CURVE_SERVER, 1)
         bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public.encode())
         bound.setsockopt(zmq.CURVE_SECRETKEY, key.secret.encode())
+
+
+def _listen(bound: zmq.Socket[bytes], config: FrontConfig, port: int, name: str) -> None:
     for host in config.hosts:
         try:
             bound.setsockopt(zmq.IPV6, int(":" in host))
             bound.bind(f"tcp://{host_in_address(host)}:{port or '*'}")
         except zmq.ZMQError as error:
-            bound.close()
             if error.errno == zmq.EADDRINUSE:
                 raise PortInUseError(port, name) from error
             raise FrontError(f"cannot listen on {host} port {port} ({name}): {error.strerror}") from error

@@ -17,6 +17,7 @@ from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.status import (
     ClientReport,
     GetStatus,
+    MediaStreamReport,
     ParticipantReport,
     Quantiles,
     StatusReport,
@@ -67,6 +68,7 @@ class Telling(NamedTuple):
     stalled: bool = False
     entries: int = 0  # sent to the authority since the start
     warnings: tuple[str, ...] = ()  # of the front
+    media: tuple[MediaStreamReport, ...] = ()
 
 
 class StatusDesk:
@@ -80,6 +82,8 @@ class StatusDesk:
         self._outbox = outbox
         self._drops = drops
         self._tell = tell
+        #: What a participant gets of media, as fields of its row.
+        self.media_row: Callable[[int], dict[str, Any]] = lambda _number: {}
         self._lines: dict[int, _Line] = {}
         self._lost: dict[str, str] = {}  # participant id -> why its connection was lost
         self._rolled_ns = 0
@@ -171,6 +175,7 @@ class StatusDesk:
             connections=len(self._clients),
             entries_per_s=self._entries_per_s,
             authority_silent_ns=now_ns - telling.heard_ns if telling.heard_ns else -1,
+            media=telling.media,
         )
 
     def _row(self, row: ParticipantReport, connection: Connection | None, now_ns: int) -> ParticipantReport:
@@ -191,6 +196,7 @@ class StatusDesk:
             drops=self._drops.by_connection.get(connection.number, 0),
             reported=report is not None,
             **measured,
+            **self.media_row(connection.number),
         )
 
 

@@ -1,0 +1,166 @@
+"""The media proxy: takes frames of sources, sends each subscriber the newest at its level. A thread of the front.
+
+Its sockets have an I/O thread of their own, so that what media cost in encryption and copying delays neither control
+nor state. Subscribers are told apart by their topic, which names their connection: what one link does not take is
+dropped for that subscriber alone, and what somebody gets is decided here, not there.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+import zmq
+
+from iris_session.protocol.codec import decode_media_push
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.media import CLASSES, parse_topic
+from iris_session.transport.media_doors import MediaDoors
+from iris_session.transport.media_hub import MediaHub
+
+#: While a connection is full it is tried again after so long; else somebody comes to wake us.
+RETRY_MS: Final = 4
+IDLE_MS: Final = 50
+#: Messages taken of one socket before the others are looked at.
+ROUND: Final = 16
+#: Keys of sources that nobody has decided about yet.
+MAX_ASKING: Final = 64
+_SUBSCRIBE: Final = 1
+
+
+class MediaProxy:
+    """`hub`, `sources` and `asking` belong to `lock`.
+
+    `sources`: keys that may hand in frames (the empty one: who needs none). `asking`: keys that try to, and are not
+    among them.
+    """
+
+    def __init__(
+        self,
+        out: zmq.Socket[bytes],
+        doors: MediaDoors,
+        local: zmq.Socket[bytes] | None,
+        remote: zmq.Socket[bytes],
+        now_ns: Callable[[], int],
+        *,
+        encrypted: bool,
+    ) -> None:
+        self._out = out
+        self._doors = doors
+        self._local = local
+        self._remote = remote
+        self._now_ns = now_ns
+        self._encrypted = encrypted
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="iris-media", daemon=True)
+        self.lock = threading.Lock()
+        self.hub = MediaHub()
+        self.sources: set[str] = set()
+        self.asking: set[str] = set()
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Waits for the end of the thread; the sockets are free then."""
+        self._stopping = True
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._doors.close()
+        for one in (self._out, self._local, self._remote):
+            if one is not None:
+                one.close(linger=0)
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        for one in (self._out, self._local, self._remote):
+            if one is not None:
+                poller.register(one, zmq.POLLIN)
+        waits = False
+        while not self._stopping:
+            ready = dict(poller.poll(RETRY_MS if waits else IDLE_MS))
+            if self._out in ready:
+                self._take_subscriptions()
+            for one in (self._local, self._remote):
+                if one is not None and one in ready:
+                    self._take_frames(one)
+            closed = self._doors.turn(self._now_ns())
+            with self.lock:
+                for reason in closed:
+                    self.hub.count(reason)
+                waits = self.hub.flush(self._send, self._now_ns())
+
+    def _send(self, topic: bytes, header: bytes, frame: Any) -> bool:
+        try:
+            self._out.send_multipart((topic, header, frame), zmq.DONTWAIT, copy=False)
+        except zmq.Again:
+            return False
+        return True
+
+    # --- who wants what ----------------------------------------------------------------------------------------------
+
+    def _take_subscriptions(self) -> None:
+        for _ in range(ROUND):
+            try:
+                frame = self._out.recv(zmq.DONTWAIT, copy=False)
+            except zmq.Again:
+                return
+            data = frame.bytes
+            wanted = parse_topic(data[1:]) if data[:1] in (b"\0", b"\1") else None
+            cut = self._doors.heard(_descriptor(frame), self._now_ns())
+            with self.lock:
+                if cut:
+                    self.hub.count(cut)
+                elif wanted is None:
+                    self.hub.count("media_topic_unknown")
+                elif data[0] != _SUBSCRIBE:
+                    self.hub.unsubscribe(*wanted)
+                    self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
+                elif self.hub.subscribe(*wanted, self._user_of(frame)):
+                    self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
+
+    def _user_of(self, frame: zmq.Frame) -> str:
+        return str(frame.get("User-Id")) if self._encrypted else ""
+
+    # --- what comes in -----------------------------------------------------------------------------------------------
+
+    def _take_frames(self, socket: zmq.Socket[bytes]) -> None:
+        for _ in range(ROUND):
+            try:
+                frame = socket.recv(zmq.DONTWAIT, copy=False)
+            except zmq.Again:
+                return
+            frames = [frame]
+            while frame.more:
+                frame = socket.recv(zmq.DONTWAIT, copy=False)
+                if len(frames) <= len(CLASSES):
+                    frames.append(frame)
+            self._take(frames, self._user_of(frames[0]) if socket is self._remote else "")
+
+    def _take(self, frames: list[zmq.Frame], user: str) -> None:
+        try:
+            push = decode_media_push(frames[0].buffer)
+        except ProtocolError:
+            push = None
+        with self.lock:
+            if user and user not in self.sources:
+                self.hub.count("media_source_refused")
+                if len(self.asking) < MAX_ASKING:
+                    self.asking.add(user)
+            elif push is None:
+                self.hub.count("media_malformed")
+            else:
+                self.hub.push(push, frames[1:], user, self._now_ns())
+
+
+def _descriptor(frame: zmq.Frame) -> int:
+    """Of the TCP connection that it came by, -1 where libzmq does not tell: its end was noticed."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except zmq.ZMQError:
+        return -1

@@ -1,0 +1,303 @@
+"""The media proxy at a real front process: who gets which frames, and who may hand them in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zmq
+
+from iris_session.keys import KeyPair
+from iris_session.protocol.codec import decode_media_header, encode_media_frames
+from iris_session.protocol.media import MediaHeader, media_topic
+from iris_session.protocol.names import BudgetClass
+from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
+from tests.transport.harness import FrontSession, RawClient
+from tests.transport.lab import Lab
+
+Curve = tuple[bytes, bytes, bytes]
+
+
+class Viewer:
+    """A SUB socket on the media port, and what came by it."""
+
+    def __init__(self, session: FrontSession, topics: list[bytes], curve: Curve | None = None, hwm: int = 1000) -> None:
+        self.socket = session.context.socket(zmq.SUB)
+        self.socket.linger = 0
+        self.socket.rcvhwm = hwm
+        if curve:
+            self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
+        self.socket.connect(f"tcp://127.0.0.1:{session.ports.media}")
+        for topic in topics:
+            self.socket.subscribe(topic)
+        self.got: list[tuple[bytes, MediaHeader, bytes]] = []
+
+    def take(self) -> int:
+        while self.socket.poll(0):
+            topic, head, data = self.socket.recv_multipart()
+            self.got.append((topic, decode_media_header(head), data))
+        return len(self.got)
+
+
+class Stage:
+    """Somebody who publishes `cloud` at every step, and those who watch."""
+
+    def __init__(self, session: FrontSession) -> None:
+        self.session = session
+        self.viewers: list[Viewer] = []
+        self.size = 500
+        self.publishing = True
+        self._once, session.once = session.once, self._step  # type: ignore[method-assign,assignment]
+
+    def _step(self, *arguments: object) -> None:
+        self._once(*arguments)  # type: ignore[arg-type]
+        if self.publishing:
+            now_ns = self.session.process.link.now_ns
+            self.session.process.publish_media("cloud", b"c" * self.size, now_ns, 1, "bytes")
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        self.session.pump(lambda: bool(condition()), what, 30.0)
+
+    def joined(self, client: RawClient, name: str = "ann") -> RawClient:
+        if client.welcome is None:
+            client.join("observer", name)
+        client.wait_for(DeliveryBudget)
+        return client
+
+    def viewer(
+        self, client: RawClient, curve: Curve | None = None, stream: str = "cloud", epoch: int = 0, hwm: int = 1000
+    ) -> Viewer:
+        self.viewers.append(Viewer(self.session, [media_topic(epoch or client.epoch, stream)], curve, hwm))
+        return self.viewers[-1]
+
+    def drops(self, reason: str, n: int = 1) -> None:
+        self.session.pump(lambda: self.session.process.link.status.drops.get(reason, 0) >= n, reason, 30.0)
+
+    def close(self) -> None:
+        for viewer in self.viewers:
+            viewer.socket.close()
+
+
+@pytest.fixture
+def media(session: FrontSession) -> Iterator[Stage]:
+    stage = Stage(session)
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def locked(lab: Lab) -> Iterator[tuple[Lab, Stage]]:
+    stage = Stage(lab.session)
+    yield lab, stage
+    stage.close()
+
+
+def budgets(client: RawClient) -> dict[str, str]:
+    return {one.stream: one.budget_class for one in client.got(DeliveryBudget)[-1].streams}
+
+
+def test_a_subscriber_gets_the_newest_frames(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 5, "media")
+    topic, header, data = viewer.got[-1]
+    assert topic == media_topic(ann.epoch, "cloud") + b"full"
+    assert (header.stream, header.budget_class, header.scene_epoch, header.encoding) == ("cloud", "full", 1, "bytes")
+    assert header.capture_ns <= header.published_ns <= session.process.link.now_ns
+    assert data == b"c" * 500
+    assert [b[1].seq for b in viewer.got] == sorted({b[1].seq for b in viewer.got})
+    media.until(lambda: budgets(ann) == {"cloud": "full"}, "ann is told of the stream")
+
+
+def test_the_status_tells_who_gets_what(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 5, "media")
+    assert ann.welcome is not None
+    row = ParticipantReport(ann.welcome.participant_id, "ann", "observer", True)
+    session.process.link.send_report(StatusReport(0, "", "", 0, participants=(row,)))
+
+    asked_s = 0.0
+
+    def told() -> bool:
+        nonlocal asked_s
+        if time.monotonic() > asked_s + 0.3:
+            asked_s = time.monotonic()
+            ann.send(GetStatus())
+        reports = ann.got(StatusReport)
+        if not reports:
+            return False
+        report, mine = reports[-1], reports[-1].participants[0]
+        return bool(report.media and mine.media and mine.media_bytes_per_s) and (
+            (report.media[0].stream, report.media[0].subscribers) == ("cloud", 1)
+            and (mine.budget_class, mine.media[0].stream, mine.media[0].budget_class) == ("full", "cloud", "full")
+            and report.media[0].hz > 0.0
+        )
+
+    media.until(told, "the stream and its subscriber")
+
+
+def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    bad = Viewer(session, [b"", b"media/", b"cloud", media_topic(ann.epoch + 7, "cloud")])
+    media.viewers.append(bad)
+    other = media.viewer(ann, stream="other")
+    media.drops("media_topic_unknown", 3)
+    media.drops("media_refused", 1)
+    good = media.viewer(ann)
+    media.until(lambda: good.take() >= 20, "media")
+    assert (bad.take(), other.take()) == (0, 0)
+
+
+def test_who_never_reads_delays_nobody_and_gets_less(media: Stage) -> None:
+    session = media.session
+    media.size = 100_000
+    ann, bob = (media.joined(session.client(), name) for name in ("ann", "bob"))
+    viewer, stuck = media.viewer(ann), media.viewer(bob, hwm=1)
+    media.until(lambda: viewer.take() > 0, "media")
+    media.until(lambda: viewer.take() >= 0 and budgets(bob).get("cloud") == BudgetClass.NONE, "bob gets none")
+    told = bob.got(DeliveryBudget)[-1]
+    assert (told.budget_class, told.reason) == (BudgetClass.NONE, "the link does not take all media")
+    assert budgets(ann) == {"cloud": BudgetClass.FULL}
+    media.drops("media_superseded")
+    before = len(viewer.got)
+    media.until(lambda: viewer.take() >= before + 20, "ann goes on")
+    assert stuck.take() >= 1
+
+
+def test_a_client_may_ask_for_less(media: Stage) -> None:
+    session = media.session
+    media.size = 20_000
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 100, "media")
+
+    def asks() -> bool:
+        viewer.take()
+        ann.send(ClientReport(1.0, 1.0, 60, media_limit_mbit_per_s=0.001))
+        session.process.link.poll()
+        return budgets(ann) == {"cloud": BudgetClass.NONE}
+
+    media.until(asks, "none")
+    assert ann.got(DeliveryBudget)[-1].reason == "the client asked for no more"
+
+
+def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 1, "media")
+    old_seq, ports = viewer.got[-1][1].seq, session.ports
+    session.process.restart()
+    session.process.wait_ready(30.0)
+    assert session.process.link.ports == ports
+    bob = media.joined(session.client(), "bob")
+    again = media.viewer(bob)
+    media.until(lambda: again.take() >= 1, "media of the new front")
+    assert again.got[0][1].seq > old_seq
+
+
+def test_what_no_front_would_take_is_said_where_it_is_handed_in(media: Stage) -> None:
+    with pytest.raises(ValueError, match="cannot be the name of a media stream"):
+        media.session.process.publish_media("a b", b"x", 0, 0, "bytes")
+    with pytest.raises(ValueError, match="has class 'full'"):
+        media.session.process.publish_media("a", {"half": b"x"}, 0, 0, "bytes")
+    with pytest.raises(ValueError, match="at most 8388608 for each class"):
+        media.session.process.publish_media("a", bytes(8_388_609), 0, 0, "bytes")
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    ann, client = lab.allowed("ann")
+    bob, other = lab.allowed("bob")
+    stage.joined(client)
+    stage.joined(other, "bob")
+    eves = stage.viewer(client, lab.curve(KeyPair.new()))
+    bobs = stage.viewer(client, lab.curve(bob))
+    stage.drops("unknown_key")
+    stage.drops("media_refused")
+    anns = stage.viewer(client, lab.curve(ann))
+    stage.until(lambda: anns.take() >= 10, "media")
+    assert (eves.take(), bobs.take()) == (0, 0)
+
+
+def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    ann, client = lab.allowed("ann")
+    bob, other = lab.allowed("bob")
+    stage.joined(client)
+    stage.joined(other, "bob")
+    anns, bobs = stage.viewer(client, lab.curve(ann)), stage.viewer(other, lab.curve(bob))
+    stage.until(lambda: min(anns.take(), bobs.take()) >= 1, "media")
+    lab.home.clients.revoke(ann.fingerprint)
+    lab.audits("key_revoked")
+    stage.until(lambda: bobs.take() >= 0 and _quiet(anns), "nothing more for ann")
+    last, seen = len(anns.got), bobs.take()
+    stage.until(lambda: bobs.take() >= seen + 20, "bob goes on")
+    assert anns.take() == last
+    again = stage.viewer(client, lab.curve(ann))
+    stage.until(lambda: bobs.take() >= seen + 40, "bob goes on")
+    assert again.take() == 0
+
+
+def _quiet(viewer: Viewer) -> bool:
+    """Whether nothing comes for a while."""
+    before = viewer.take()
+    return not viewer.socket.poll(100) and viewer.take() == before
+
+
+def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    stage.publishing = False
+    bob, viewing = lab.allowed("bob")
+    stage.joined(viewing, "bob")
+    viewer = stage.viewer(viewing, lab.curve(bob), "depth")
+    camera = KeyPair.new()
+    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    pushes = {pair.public: _pusher(lab, pair) for pair in (camera, bob)}
+
+    def sends(pair: KeyPair, data: bytes, condition: Callable[[], bool], what: str) -> None:
+        def once() -> bool:
+            _send(pushes[pair.public], data)
+            viewer.take()
+            return condition()
+
+        stage.until(once, what)
+
+    def refused() -> int:
+        return lab.session.process.link.status.drops.get("media_source_refused", 0)
+
+    sends(camera, b"camera", lambda: len(viewer.got) > 0, "frames of the camera")
+    before = refused()
+    sends(bob, b"bob", lambda: refused() > before, "bob is refused")
+    lab.home.clients.revoke(camera.fingerprint)
+    before = refused()
+    sends(camera, b"revoked", lambda: refused() > before + 20, "the camera is refused")
+    seen = len(viewer.got)
+    sends(camera, b"late", lambda: refused() > before + 60, "and stays so")
+    assert len(viewer.got) == seen
+    assert b"bob" not in {data for _, _, data in viewer.got}
+    for socket in pushes.values():
+        socket.close()
+
+
+def _pusher(lab: Lab, pair: KeyPair) -> zmq.Socket[bytes]:
+    socket = lab.session.context.socket(zmq.PUSH)
+    socket.linger = 0
+    socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = lab.curve(pair)
+    socket.connect(f"tcp://127.0.0.1:{lab.session.ports.media_ingest}")
+    return socket
+
+
+def _send(socket: zmq.Socket[bytes], data: bytes) -> None:
+    try:
+        socket.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"), zmq.DONTWAIT)
+    except zmq.Again:
+        return
