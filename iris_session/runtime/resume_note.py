@@ -79,13 +79,18 @@ def read_note(recording: Path, session_id: str) -> tuple[ResumeNote | None, str]
 
 
 class NoteKeeper:
-    """Keeps the note of one session. `offer` never waits; `close` writes what is left, for at most `patience_s`."""
+    """Keeps the note of one session. `offer` never waits; `close` writes what is left, for at most `patience_s`.
+
+    What is not written by then is not written at all: the note may be that of the next session by the time.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._note: ResumeNote | None = None
         self._changed = threading.Event()
         self._closed = threading.Event()
+        self._given_up = False
+        self._replacing = threading.Lock()
         self._warned = False
         self._thread = threading.Thread(target=self._run, name="iris-session-note", daemon=True)
         self._thread.start()
@@ -100,14 +105,24 @@ class NoteKeeper:
         self._closed.set()
         self._changed.set()
         self._thread.join(patience_s)
+        free = self._replacing.acquire(timeout=patience_s)  # a disk that hangs keeps nobody from ending
+        self._given_up = True
+        if free:
+            self._replacing.release()
 
     def _run(self) -> None:
-        while not self._closed.is_set():
+        written: ResumeNote | None = None
+        while True:
             self._changed.wait()
             self._closed.wait(PERIOD_S)
             self._changed.clear()
-            if self._note is not None:
-                self._write(self._note)
+            last = self._closed.is_set()  # before the note is read: nobody offers another one afterwards
+            note = self._note
+            if note is not None and note is not written:
+                self._write(note)
+                written = note
+            if last:
+                return
 
     def _write(self, note: ResumeNote) -> None:
         try:
@@ -117,11 +132,21 @@ class NoteKeeper:
                     file.write(msgspec.msgpack.encode(note))
                     file.flush()
                     os.fsync(file.fileno())
-                os.replace(temporary, self._path)
-            except BaseException:
+                self._replace(temporary)
+            finally:
                 Path(temporary).unlink(missing_ok=True)
-                raise
         except OSError as error:
             if not self._warned:
                 _log.warning("%s cannot be written (%s): nobody resumes after a restart", self._path, error.strerror)
             self._warned = True
+
+    def _replace(self, temporary: str) -> None:
+        with self._replacing:
+            if self._given_up:
+                return
+            os.replace(temporary, self._path)
+        folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)  # the new name, too, is to outlive a power cut
+        finally:
+            os.close(folder)
