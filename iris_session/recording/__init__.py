@@ -12,6 +12,7 @@ from iris_session.recording.journal import (
     JournalRow,
     Keyframe,
     SessionHeader,
+    Settings,
     check_row,
     header_root,
     make_row,
@@ -26,6 +27,7 @@ from iris_session.recording.verify import Core, Problem, VerifyReport, verify
 __all__ = [
     # making one
     "SessionHeader",
+    "Settings",
     "Continues",
     "JournalRow",
     "Keyframe",

@@ -46,6 +46,18 @@ class Continues(msgspec.Struct, frozen=True):
     chain: bytes
 
 
+class Settings(msgspec.Struct, frozen=True):
+    """Of the process that recorded, not of the simulation: what a resumed session takes over.
+
+    `state_hz`: rate of state frames. `keyframe_s`: distance of keyframes [s]. `realtime`: a real-time priority was
+    asked for.
+    """
+
+    state_hz: float
+    keyframe_s: float
+    realtime: bool
+
+
 class SessionHeader(msgspec.Struct, frozen=True):
     """What a recording needs to be understood and re-simulated. Holds no key, secret or token.
 
@@ -54,6 +66,7 @@ class SessionHeader(msgspec.Struct, frozen=True):
     `versions`: of Python, the libraries and the platform, see `versions.py`. `continues`: the recording that this one
     goes on from, None for a session's first. `origin_ns`, `boot_id`: session time zero on CLOCK_MONOTONIC, and which
     boot of which machine that clock is of. `anchors`: `T_world_anchor` of each sheet that headsets are aligned to.
+    `settings`: None when nobody noted them.
     """
 
     session_id: Name
@@ -73,6 +86,7 @@ class SessionHeader(msgspec.Struct, frozen=True):
     origin_ns: int = 0
     boot_id: str = ""
     anchors: dict[str, Pose] = {}
+    settings: Settings | None = None
 
     @property
     def begins_after(self) -> int:

@@ -27,19 +27,23 @@ class RecordingInUseError(RecorderError):
 class RecordingLock:
     """A lock on the file at `path`, until `release` or the end of the process. The file must exist.
 
-    Alone (`shared` false) it waits up to `patience_s` for others to be done. Raises `RecordingInUseError`, `OSError`.
+    Alone (`shared` false) it waits up to `patience_s` for others to be done. Raises `RecordingInUseError`, which says
+    who they are, and `RecorderError` when the file cannot be opened.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, shared: bool, patience_s: float = PATIENCE_S) -> None:
-        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except (OSError, ValueError) as error:
+            raise RecorderError(f"{os.fspath(path)} cannot be opened: {_said(error)}") from error
         try:
             taken = self._take(fcntl.LOCK_SH if shared else fcntl.LOCK_EX, patience_s)
         except BaseException:
             self.release()
             raise
         if not taken:
+            text = _who(self._fd)
             self.release()
-            text = "the session that it is of still runs, or is being resumed"
             raise RecordingInUseError(f"{os.fspath(path)} is in use: {text}")
 
     def _take(self, kind: int, patience_s: float) -> bool:
@@ -61,3 +65,50 @@ class RecordingLock:
         if fd >= 0:
             with suppress(OSError):
                 os.close(fd)
+
+
+def _who(fd: int) -> str:
+    """Who has the lock that we did not get, as far as the system tells; Linux does, for processes of the same user."""
+    holders = _holders(os.fstat(fd))
+    alone = [pid for pid, kind in holders if kind == "WRITE"]
+    if alone:
+        return f"it is being resumed by {_named(alone)}"
+    if holders:
+        return f"the session that it is of still runs: {_named([pid for pid, _ in holders])}"
+    return "the session that it is of still runs, or is being resumed"
+
+
+def _holders(file: os.stat_result) -> list[tuple[int, str]]:
+    """Process and kind (`READ`, `WRITE`) of each lock on `file`. What `/proc/locks` calls its device is not always
+    that of `stat`, so a process counts when it has the file open."""
+    try:
+        with open("/proc/locks", encoding="ascii", errors="replace") as locks:
+            lines = [line.split() for line in locks]
+    except OSError:
+        return []
+    found = [(int(words[4]), words[3]) for words in lines if words[1] == "FLOCK" and _is_of(words[5], file)]
+    return sorted({(pid, kind) for pid, kind in found if pid > 0 and _has_open(pid, file)})
+
+
+def _is_of(lock: str, file: os.stat_result) -> bool:
+    return lock.rpartition(":")[2] == str(file.st_ino)
+
+
+def _has_open(pid: int, file: os.stat_result) -> bool:
+    try:
+        names = os.listdir(f"/proc/{pid}/fd")
+    except OSError:
+        return False
+    for name in names:
+        with suppress(OSError):
+            if os.path.samestat(os.stat(f"/proc/{pid}/fd/{name}"), file):
+                return True
+    return False
+
+
+def _named(pids: list[int]) -> str:
+    return f"process{'es' if len(pids) > 1 else ''} {', '.join(map(str, pids))}"
+
+
+def _said(error: Exception) -> str:
+    return (isinstance(error, OSError) and error.strerror) or str(error)

@@ -68,7 +68,7 @@ class Recorder:
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
         self._front = self._bind(zmq.PULL, config.samples_endpoint)
         self._begin_part()
-        with suppress(OSError):
+        if os.path.exists(config.path):  # somebody may have moved the first file away
             self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
         self._header: SessionHeader | None = None
         self._instance = time.monotonic_ns()  # differs from that of every recorder before it

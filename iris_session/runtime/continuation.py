@@ -79,14 +79,11 @@ class Continuation:
     def __init__(self, path: Path, patience_s: float = PATIENCE_S) -> None:
         self.notes: list[str] = []
         first = first_file(path)
-        newest = max(number for number, _ in recordings(first))
-        self.recording = Path(resume_path(str(first), newest + 1))
         try:
-            self._lock = RecordingLock(resume_path(str(first), newest), shared=False, patience_s=patience_s)
+            self._lock, newest = _lock_newest(first, patience_s)
         except RecordingError as error:
             raise ResumeError(str(error)) from error
-        except OSError as error:
-            raise ResumeError(f"{path} cannot be opened: {error.strerror}") from error
+        self.recording = Path(resume_path(str(first), newest + 1))
         try:
             self._open(first)
             self._listen(first)
@@ -134,8 +131,8 @@ class Continuation:
         changes: dict[str, Any] = {"name": self.header.session_name, "authority": core.authority}
         if self.header.anchors and given.anchors == plain.anchors:
             changes["anchors"] = {name: (pose.p, pose.q) for name, pose in self.header.anchors.items()}
-        if self.note is not None:
-            had_them = msgspec.structs.asdict(self.note.listening)
+        for kept in (self.header.settings, None if self.note is None else self.note.listening):
+            had_them = {} if kept is None else msgspec.structs.asdict(kept)
             changes |= {name: had for name, had in had_them.items() if getattr(given, name) == getattr(plain, name)}
         return dataclasses.replace(given, control=core.control, **changes)
 
@@ -274,6 +271,16 @@ def first_file(path: Path) -> Path:
     if not any(True for _ in recordings(first)):
         raise ResumeError(f"there is no recording {path}: give a session.rrd, or the folder it is in")
     return first
+
+
+def _lock_newest(first: Path, patience_s: float) -> tuple[RecordingLock, int]:
+    """The newest recording of a session and its number, for us alone; while we waited, somebody may have gone on."""
+    while True:
+        newest = max(number for number, _ in recordings(first))
+        lock = RecordingLock(resume_path(str(first), newest), shared=False, patience_s=patience_s)
+        if newest == max(number for number, _ in recordings(first)):
+            return lock, newest
+        lock.release()
 
 
 def recordings(first: Path) -> Iterator[tuple[int, Path]]:

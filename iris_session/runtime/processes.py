@@ -29,6 +29,7 @@ from iris_session.recording import (
     RecordingError,
     RecordingLock,
     SessionHeader,
+    Settings,
     header_root,
     pack_model,
 )
@@ -163,6 +164,7 @@ class SessionProcesses:
             state_port=config.state_port,
             media_port=config.state_port + MEDIA_OFFSET if config.state_port else 0,
             media_ingest_port=config.state_port + INGEST_OFFSET if config.state_port else 0,
+            adapt_media=config.adapt_media,
             session_id=self.session_id,
             session_name=self.name,
             origin_ns=self._origin_ns,
@@ -211,6 +213,7 @@ class SessionProcesses:
             origin_ns=self._origin_ns,
             boot_id=boot_id(),
             anchors=anchor_poses(self._config),
+            settings=Settings(self._config.state_hz, self._config.keyframe_s, self._config.realtime),
         )
 
     def watch(self, stepper: Stepper) -> None:

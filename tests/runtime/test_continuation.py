@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import mujoco
@@ -29,8 +30,11 @@ from iris_session.recording import (
     OPEN,
     JournalRow,
     Keyframe,
+    RecorderError,
+    RecordingInUseError,
     RecordingLock,
     SessionHeader,
+    Settings,
     header_root,
     make_row,
     pack_model,
@@ -38,6 +42,7 @@ from iris_session.recording import (
 from iris_session.recording.journal import CRASHED, seal
 from iris_session.recording.messages import Batch
 from iris_session.recording.versions import boot_id
+from iris_session.runtime import continuation
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import MARGIN_NS, Continuation, begin
 from iris_session.runtime.core import CoreState, SessionCore
@@ -201,14 +206,38 @@ def test_the_newest_recording_that_can_be_read_is_continued(session: Path) -> No
 
 def test_a_recording_in_use_is_refused(session: Path) -> None:
     writing = RecordingLock(session, shared=True)
-    with pytest.raises(ResumeError, match="still runs"):
+    with pytest.raises(ResumeError, match=f"still runs: process {os.getpid()}$"):
         Continuation(session, patience_s=0.1)
     writing.release()
     first = Continuation(session)
-    with pytest.raises(ResumeError, match="being resumed"):
+    with pytest.raises(ResumeError, match=f"being resumed by process {os.getpid()}$"):
         Continuation(session, patience_s=0.1)
     first.close()
     Continuation(session).close()
+
+
+def test_who_waited_while_another_went_on_goes_on_from_there(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between looking for the newest recording and having its lock, another process began and ended a newer one."""
+    newer = session.with_name("session.resume2.rrd")
+
+    class Late(RecordingLock):
+        def __init__(self, path: str, **options: Any) -> None:
+            super().__init__(path, **options)
+            newer.touch()
+
+    monkeypatch.setattr(continuation, "RecordingLock", Late)
+    past = Continuation(session)
+    assert past.recording.name == "session.resume3.rrd"
+    assert past.file == "session.rrd"
+    RecordingLock(session, shared=False, patience_s=0.0).release()
+    with pytest.raises(RecordingInUseError):
+        RecordingLock(newer, shared=True, patience_s=0.0)
+    past.close()
+
+
+def test_a_recording_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match=r"nothing\.rrd cannot be opened: No such file or directory$"):
+        RecordingLock(tmp_path / "nothing.rrd", shared=True)
 
 
 def test_recordings_of_a_users_loop_are_refused(tmp_path: Path) -> None:
@@ -258,6 +287,14 @@ def test_it_listens_where_it_listened_unless_told_otherwise(session: Path) -> No
     assert dataclasses.replace(config, resume=None) == SessionConfig(
         "lab", "0.0.0.0", control_port=5001, state_port=4002, curve=True, beacon_port=0
     )
+
+
+def test_rates_are_as_they_were_unless_told_otherwise(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "session.rrd", settings=Settings(30.0, 2.0, False))
+    past, config, _ = begin(SessionConfig(resume=path, keyframe_s=1.0), None, None, None, None)
+    assert past is not None
+    past.close()
+    assert (config.state_hz, config.keyframe_s, config.realtime) == (30.0, 1.0, False)
 
 
 # --- tokens -----------------------------------------------------------------------------------------------------------
