@@ -30,7 +30,10 @@ def observe(ctx: Context) -> None:
             if ctx.now_ns - tracks[name].seen_ns > ctx.config.handover_flicker_ns:
                 del tracks[name]
     for name, contact in touched.items():
-        if name not in in_hand:
+        if contact.others:  # most objects of a session lie on something
+            state.handovers.pop(name, None)
+            state.regrasps.pop(name, None)
+        elif name not in in_hand:
             _advance(ctx, state.handovers, _by_person(ctx, state.handovers.get(name), contact))
             _advance(ctx, state.regrasps, contact)
 
@@ -76,7 +79,7 @@ def _holder(ctx: Context, robot: str) -> str:
 def _advance(ctx: Context, tracks: dict[str, HandoverTrack], c: ObjectContact) -> None:
     track = tracks.get(c.object)
     pair = (track.giver, track.receiver or _second(c, track.giver)) if track is not None else ()
-    if c.others or (track is not None and any(r not in pair for r in c.touching)):
+    if track is not None and any(r not in pair for r in c.touching):
         tracks.pop(c.object, None)
         return
     if track is None:

@@ -118,8 +118,9 @@ class Controller:
         if not self._ready:
             raise ControlError("control does not know where the robots stand: call reset(data) or restore(bytes) first")
         if self._writes_ctrl:
-            self._solve_due(data)
-            if self._tick % self._check_ticks == 0:
+            checks = self._tick % self._check_ticks == 0
+            self._solve_due(data, checks)
+            if checks:
                 self._check_tracking(data)
                 if self._proximity.active:
                     self._slow_near_contact(data)
@@ -249,9 +250,14 @@ class Controller:
 
     # --- once a tick --------------------------------------------------------------------------------------------------
 
-    def _solve_due(self, data: mujoco.MjData) -> None:
-        """Integrates twists; solves for at most `max_solves_per_tick` robots, taking turns."""
+    def _solve_due(self, data: mujoco.MjData, checks: bool) -> None:
+        """Integrates twists; solves for at most `max_solves_per_tick` robots, taking turns.
+
+        A tick that `checks` distances too solves once less: ticks with all the work at once would be the late ones.
+        """
         n, left, start = len(self._states), self._config.max_solves_per_tick, self._cursor
+        if checks and self._proximity.active and self._joints.moving:
+            left = max(1, left - 1)
         self._follow_bases(data)
         for i in (*range(start, n), *range(start)):
             r = self._states[i]

@@ -8,6 +8,7 @@ nearest pairs. Only motion that closes the gap is slowed; motion that opens it n
 from __future__ import annotations
 
 import math
+from bisect import insort
 from collections.abc import Sequence
 
 import mujoco
@@ -51,7 +52,10 @@ class Proximity:
     def factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[float]:
         """Factor 0..1 on each robot's joint speed. `wanted`: joint velocities [rad/s] each robot would take, (n_i,)."""
         factors = [1.0] * len(self._geoms)
+        moves = [bool(joints.any()) for joints in wanted]
         for a, b in self._near_robots(data):
+            if not (moves[a] or moves[b]):  # nobody approaches
+                continue
             for distance, geom_a, geom_b, p_a, p_b in self._near_geoms(data, a, b):
                 gap = p_b - p_a
                 # Points of penetrating geoms are swapped: the direction from a to b stays the same.
@@ -93,13 +97,17 @@ class Proximity:
         bound = between - radius[geoms_a][:, None] - radius[geoms_b][None, :]
         order = np.argsort(bound, axis=None, kind="stable")
         near = order[bound.ravel()[order] < margin]
-        found = []
+        found: list[tuple[float, int, int, Floats, Floats]] = []
+        nearest: list[float] = []  # of those found, ascending
         for flat in near[:_MEASURED_PAIRS].tolist():
             i, j = divmod(flat, len(geoms_b))
+            if len(nearest) >= _BOUNDED_PAIRS and bound[i, j] > nearest[_BOUNDED_PAIRS - 1]:
+                break  # nor is any of those that follow nearer than the ones that count
             geom_a, geom_b = int(geoms_a[i]), int(geoms_b[j])
             distance = float(mujoco.mj_geomDistance(self._model, data, geom_a, geom_b, margin, self._segment))
             if distance < margin:
                 found.append((distance, geom_a, geom_b, self._segment[:3].copy(), self._segment[3:].copy()))
+                insort(nearest, distance)
         found.sort(key=lambda pair: pair[:3])
         return found[:_BOUNDED_PAIRS]
 

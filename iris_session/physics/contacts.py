@@ -61,8 +61,12 @@ class ContactTables:
         self._partner_names = (*names, *flex_names)
         self._robot_names = tuple(spec.name for spec in robots)
         self._object_names = tuple(spec.name for spec in objects)
-        self._last_keys = b""
+        #: Contacts change rarely from tick to tick: what was found for the same ones last time is found again.
+        self._last_active = b""
         self._last_contacts: tuple[ObjectContact, ...] = ()
+        self._last_geoms = b""
+        self._finger_rows: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._finger_robots: list[set[int]] = []
         self._has_fingers = bool((geom_finger_robot >= 0).any())
         self._no_forces = (0.0,) * len(robots)
 
@@ -72,17 +76,19 @@ class ContactTables:
             return ()
         contact = data.contact
         geom = contact.geom
+        active = contact.dist < contact.includemargin
+        seen = geom.tobytes() + active.tobytes()
+        if self._flex_first:
+            seen += contact.flex.tobytes()
+        if seen == self._last_active:
+            return self._last_contacts
         objects = self._geom_object[geom]
         partners = self._geom_partner[geom]
         if self._flex_first:
             partners = np.where(geom < 0, self._flex_first + contact.flex, partners)
-        active = contact.dist < contact.includemargin
         keys = np.where(objects >= 0, objects * self._n_partners + partners[:, ::-1], _NONE)[active]
-        # The same pairs as at the last call, as for most ticks, have the same answer.
-        fingerprint = keys.tobytes()
-        if fingerprint != self._last_keys:
-            self._last_keys = fingerprint
-            self._last_contacts = self._group(sorted(set(keys.ravel().tolist()) - {_NONE}))
+        self._last_active = seen
+        self._last_contacts = self._group(sorted(set(keys.ravel().tolist()) - {_NONE}))
         return self._last_contacts
 
     def _group(self, pairs: list[int]) -> tuple[ObjectContact, ...]:
@@ -127,20 +133,27 @@ class ContactTables:
         if not data.ncon or not self._has_fingers:
             return self._no_forces
         contact = data.contact
-        robots = self._geom_finger_robot[contact.geom]
-        if robots.max() < 0:
+        geom = contact.geom
+        geoms = geom.tobytes()
+        if geoms != self._last_geoms:
+            self._last_geoms = geoms
+            robots = self._geom_finger_robot[geom]
+            self._finger_rows = np.nonzero(robots.max(axis=1) >= 0)[0]
+            self._finger_robots = [set(pair) - {_NONE} for pair in robots[self._finger_rows].tolist()]
+        if not self._finger_robots:
             return self._no_forces
-        address = contact.efc_address
-        rows = np.nonzero((robots.max(axis=1) >= 0) & (address >= 0))[0]
         forces = list(self._no_forces)
         efc_force = data.efc_force
         pyramidal = int(model.opt.cone) == _PYRAMIDAL
-        dims = contact.dim[rows]
-        for (a, b), adr, dim in zip(robots[rows].tolist(), address[rows].tolist(), dims.tolist(), strict=True):
+        address = contact.efc_address[self._finger_rows].tolist()
+        dims = contact.dim[self._finger_rows].tolist()
+        for robots_of, adr, dim in zip(self._finger_robots, address, dims, strict=True):
+            if adr < 0:  # excluded from the solver
+                continue
             # A pyramidal contact has 2 (dim - 1) edge forces whose sum is the normal force.
             width = 2 * (dim - 1) if pyramidal and dim > 1 else 1
-            normal = float(efc_force[adr]) if width == 1 else float(sum(efc_force[adr : adr + width].tolist()))
-            for robot in {a, b} - {_NONE}:
+            normal = sum(efc_force[adr : adr + width].tolist())
+            for robot in robots_of:
                 forces[robot] += normal
         return tuple(forces)
 

@@ -60,7 +60,7 @@ def test_one_far_sample_converges_over_several_solves_at_bounded_speed() -> None
     assert made.controller.status()[0].limits == ()
 
 
-def test_solves_are_at_most_100_hz_per_robot_and_three_a_tick_and_all_robots_get_theirs() -> None:
+def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_theirs() -> None:
     model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(8)])
     made = Rig(model, robots, home=IIWA_HOME)
     solves = count_solves(made)
@@ -68,7 +68,8 @@ def test_solves_are_at_most_100_hz_per_robot_and_three_a_tick_and_all_robots_get
         x = 0.1 * np.sin(0.01 * k)
         made.step(decision(pose_command(r.name, made.source((x, 0.0, 0.0))) for r in robots))
     ticks = np.array([t for t, _ in solves])
-    assert np.bincount(ticks).max() == 3
+    assert np.bincount(ticks).max() == 2
+    assert np.bincount(ticks)[::5].max() <= 1  # ticks in which distances between robots are checked too
     for i in range(8):
         own = np.array([t for t, robot in solves if robot == i])
         assert np.diff(own).min() >= 5  # 10 ms
