@@ -45,7 +45,7 @@ test: check
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 

@@ -90,7 +90,9 @@ class Person:
             on_event=self._on_event,
         )
         self.display = Display(self.client, spec.display_delay_s)
-        self._uplink: DelayLine[Sample] = DelayLine(spec.model.link, self.headset.rng)
+        #: What is on its way, and the samples of the frame that is being taken: they travel together.
+        self._uplink: DelayLine[tuple[Sample, ...]] = DelayLine(spec.model.link, self.headset.rng)
+        self._frame: list[Sample] = []
         self._ages: deque[float] = deque(maxlen=AGES_KEPT)
         self.started_ns = start_ns
         self._joined_ns = 0
@@ -126,8 +128,9 @@ class Person:
 
     def step(self, now_ns: int) -> None:
         """One round of the loop, after `client.poll`."""
-        for sample in self._uplink.pop(now_ns):
-            self.report.samples += self.client.send(sample)
+        for frame in self._uplink.pop(now_ns):
+            sent = self.client.send_samples(frame) if len(frame) > 1 else self.client.send(frame[0])
+            self.report.samples += len(frame) if sent else 0
         if not self.headset.sample_due(now_ns) or not self.client.ready:
             return
         if not self._joined_ns:
@@ -172,9 +175,11 @@ class Person:
             self._acquire(now_ns)
         else:
             self._move_head(self._seat, now_ns)
-        self._send(Device.HEAD, self.headset.track(self.head, now_ns), now_ns)
+        self._take(Device.HEAD, self.headset.track(self.head, now_ns))
         if not self.observer:
             self._hands(now_ns)
+        self._uplink.push(tuple(self._frame), now_ns)
+        self._frame.clear()
 
     def _hands(self, now_ns: int) -> None:
         behaviour, alignment = self.behaviour, self._alignment()
@@ -204,20 +209,20 @@ class Person:
         """The person puts the hand where the display shows it, so the displayed world decides what is tracked."""
         T_world_tracking: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
         pose = self.headset.add_noise(compose(inverse(T_world_tracking), hand.pose_world))
-        self._send(
+        self._take(
             hand.device,
             pose,
-            now_ns,
             robots=(hand.robot,) if self.client.lease_version(hand.robot) is not None else (),
             clutch=self._clutches[hand.device].sample(hand, self.client, self.display.estop, now_ns),
             gripper=None if math.isnan(hand.gripper) else hand.gripper,
         )
 
-    def _send(self, device: str, pose: PoseTuple, now_ns: int, **fields: Any) -> None:
+    def _take(self, device: str, pose: PoseTuple, **fields: Any) -> None:
+        """A sample of one device, for the frame that is being taken."""
         sample = self.client.make_sample(
             device, pose, tracking_epoch=self.headset.tracking_epoch, worn=self.headset.worn, **fields
         )
-        self._uplink.push(sample, now_ns)
+        self._frame.append(sample)
 
     # --- phases -------------------------------------------------------------------------------------------------------
 
