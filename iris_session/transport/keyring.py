@@ -61,7 +61,7 @@ class Keyring:
         self._read = read
         self._signature = signature
         self._drops = drops or Drops()
-        self._seen: object = signature()
+        self._seen = signature()
         self._keys = read()
         self.gone: dict[str, AllowedKey] = {}
         self.come: dict[str, AllowedKey] = {}
@@ -89,8 +89,7 @@ class Keyring:
 
     def paired(self, mark: str) -> bool:
         """A key was put on the list by the session itself. True: it still is, and may join whatever it was before."""
-        self._seen = object()  # read it in any case: somebody may have taken the key off again since
-        self.look()
+        self.look()  # the file decides: somebody may have taken the key off again since
         entry = self._keys.get(mark)
         if entry is None:
             return False

@@ -166,9 +166,8 @@ class PairingDesk:
         entry = attempt.entry
         if entry is not None:
             self._wrong.pop(_network(waiting.address), None)
-            if mark in self._keyring.revoking or not self._keyring.paired(
-                mark
-            ):  # since it asked: the later word counts
+            revoked = mark in self._keyring.revoking  # since it asked: the later word counts
+            if revoked or not self._keyring.paired(mark):
                 self._refuse(waiting.route, REVOKED, "ask for another join code")
                 return
             roles = ", ".join(entry.roles) or "any role"
