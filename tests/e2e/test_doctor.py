@@ -248,6 +248,43 @@ def test_no_alignment_no_lease_and_a_stopped_client(plain: Server) -> None:
         bob.close()
 
 
+def test_a_jumped_tracking_frame_and_a_slow_way_of_samples(plain: Server) -> None:
+    """eva's alignment is void since her tracking frame jumped; fay's samples come two seconds old."""
+    with people(plain) as join:
+        director = join("dora", role="director", alignment="not_needed")
+        eva = join("eva", role="observer")
+        director.place_alignment(eva.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+        wait(lambda: eva.alignment is not None and eva.alignment.kind == "placed", "an alignment")
+        eva.new_tracking_frame()
+        wait(lambda: eva.alignment is None or eva.alignment.kind == "none", "that it is void")
+        with sends_late(join("fay", role="observer", alignment="not_needed")):
+            found = doctor(plain.address)
+        found.named("alignment", "eva has no alignment (lost", "its tracking frame jumped", "sheet", state="warning")
+        found.named("age", "device -> front is slow", "(fay)", "network between the headset", state="warning")
+        assert "state -> client" in found.checks["age"]["text"]
+
+
+@contextlib.contextmanager
+def sends_late(client: Client) -> Iterator[None]:
+    """Meanwhile it sends what was captured two seconds ago; from when on the session has noticed."""
+    end = threading.Event()
+
+    def send() -> None:
+        while not end.wait(0.02):
+            client.send_sample(
+                "head", ((0.0, 0.0, 1.5), (1.0, 0.0, 0.0, 0.0)), capture_ns=client.session_now_ns() - 2_000_000_000
+            )
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        wait(lambda: any(p.capture_to_receive for p in client.status().participants), "how late it comes")
+        yield
+    finally:
+        end.set()
+        thread.join()
+
+
 CARL = """
 import sys
 from iris_session import Client
