@@ -72,7 +72,7 @@ class LiveSession:
         """The whole authority stands still, as a user's script in a debugger."""
         (self._paused.set if paused else self._paused.clear)()
 
-    def wait_lost(self, participant: str, timeout_s: float = 10.0) -> None:
+    def wait_lost(self, participant: str, timeout_s: float = 30.0) -> None:
         """Until the session has given up on a silent participant."""
         deadline = time.monotonic() + timeout_s
         while not self.kinds(Lost):

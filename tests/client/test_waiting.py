@@ -13,7 +13,7 @@ Join = Callable[..., Client]
 
 def test_only_those_with_something_to_do_are_named(session: LiveSession, join: Join) -> None:
     ann, idle = join(), Client(session.address)
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 30.0
     seen: list[Client] = []
     while ann not in seen:
         assert time.monotonic() < deadline
@@ -25,7 +25,7 @@ def test_only_those_with_something_to_do_are_named(session: LiveSession, join: J
 
 def test_polling_all_keeps_all_alive(session: LiveSession, join: Join) -> None:
     clients = [join(f"c{i}") for i in range(3)]
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 30.0
     while min(client.counters()["state"]["delivered"] for client in clients) < 100:
         assert time.monotonic() < deadline
         poll_all(clients, 0.1)
@@ -38,7 +38,7 @@ def test_a_group_passes_over_those_that_were_closed(session: LiveSession, join: 
     group = ClientGroup([gone, ann])
     group.poll(0.1)
     gone.close()
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 30.0
     before = ann.counters()["state"]["delivered"]
     while ann.counters()["state"]["delivered"] < before + 3:
         assert time.monotonic() < deadline

@@ -144,7 +144,7 @@ class FrontSession:
         self.event_seq += 1
         return Event(self.event_seq, self.step, 0, Notice("info", text))
 
-    def pump(self, until: Callable[[], bool], what: str = "condition", timeout_s: float = 10.0) -> None:
+    def pump(self, until: Callable[[], bool], what: str = "condition", timeout_s: float = 30.0) -> None:
         """Steps until the condition holds."""
         deadline = time.monotonic() + timeout_s
         while not until():

@@ -309,7 +309,7 @@ def test_raw_samples_go_to_the_recorder(open_session: OpenSession, tmp_path: obj
         client.send(Sample("head", "pose", seq, 0, 1, 0, 1, pose=IDENTITY))
     rows = []
     while len(rows) < 20:
-        assert recorder.poll(5000)
+        assert recorder.poll(30_000)
         rows.append(msgspec.msgpack.decode(recorder.recv()))
     samples = [msgspec.msgpack.decode(data, type=Sample) for _, _, data in rows]
     assert [s.seq for s in samples] == list(range(20))

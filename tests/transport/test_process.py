@@ -23,6 +23,7 @@ from iris_session.protocol.client_messages import GetSnapshot, Heartbeat, Hello,
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import FrontRestarted, Join
 from iris_session.protocol.server_messages import ProtocolFault, Snapshot
+from iris_session.protocol.status import DeliveryBudget
 from iris_session.transport import FrontConfig, FrontError, FrontProcess
 from tests.transport.harness import FrontSession, scene
 
@@ -39,7 +40,7 @@ def gone(pid: int) -> bool:
 
 
 def wait(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 30
     while not condition():
         assert time.monotonic() < deadline, f"no {what}"
         time.sleep(0.005)
@@ -149,8 +150,9 @@ def test_ipv6(open_session: OpenSession) -> None:
 def test_clients_are_told_when_the_session_is_closed(session: FrontSession) -> None:
     client = session.client()
     client.join()
+    client.wait_for(DeliveryBudget)
     session.process.close()
-    assert client.socket.poll(5000)
+    assert client.socket.poll(30_000)
     client.receive()
     assert [f.code for f in client.got(ProtocolFault)] == ["session_ended"]
 
@@ -293,7 +295,8 @@ def test_a_link_closed_without_a_word_ends_the_front(session: FrontSession) -> N
 def test_a_session_that_stands_still_is_reported_once_and_again_when_it_recovers(session: FrontSession) -> None:
     client = session.client()
     client.join()
-    assert client.socket.poll(5000), "no word about the stall"
+    client.wait_for(DeliveryBudget)
+    assert client.socket.poll(30_000), "no word about the stall"
     client.receive()
     assert [f.code for f in client.got(ProtocolFault)] == ["stalled"]
     assert client.socket.poll(300) == 0
@@ -328,7 +331,7 @@ def test_the_front_does_not_outlive_its_parent(number: signal.Signals, tmp_path:
     client.linger = 0
     client.connect(f"tcp://127.0.0.1:{port}")
     client.send(encode_client(envelope(Hello("operator", "Ann", secret=b"s" * 16))))
-    assert client.poll(5000)
+    assert client.poll(30_000)
     client.recv()
     parent.send_signal(number)
     parent.wait()

@@ -54,7 +54,7 @@ def test_what_waits_is_known_to_the_byte_but_for_the_handshake(curve: bool) -> N
     settled(traffic, descriptor, 0, HANDSHAKE)
     for _ in range(30):
         dealer.send(bytes(10_000))
-    settled(traffic, descriptor, 250_000, 30 * 10_100 + HANDSHAKE)
+    settled(traffic, descriptor, 60_000, 30 * 10_100 + HANDSHAKE)  # what no buffer of the system took is not counted
     take(30)
     settled(traffic, descriptor, 0, HANDSHAKE)
 
