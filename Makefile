@@ -3,12 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 export IRIS_DATA ?= $(abspath ../shared)
+# Some environments forbid compiled files: then each process that a test starts compiles all our modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev demo test check bench clean help
+.PHONY: install install-dev demo test check test-unit test-e2e test-random coverage bench clean help
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
-	@echo "make test     lint, strict types, every test"
+	@echo "make test     lint, strict types, every test: the four below, one after the other"
+	@echo "  make check      lint, format, strict types"
+	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
+	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_people.py"
+	@echo "  make coverage   the bounds of coverage, after test-unit"
+	@echo "make test-random  the unit tests with other random examples than the usual ones"
 	@echo "make bench    the benchmarks of the README"
 	@echo "make install  only makes $(VENV) and installs"
 
@@ -37,9 +44,26 @@ check: install-dev
 # What decides; the rest talks to sockets, disks and people.
 CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 
+# Tests at once, and which; the suite is made for two.
+JOBS ?= 2
+T ?= tests
+
 test: check
-	$(BIN)/python -m pytest -q -m "not e2e" -n 2 --cov --cov-report= 
-	$(BIN)/python -m pytest -q -m e2e -n 2 --dist loadfile
+	$(MAKE) --no-print-directory test-unit
+	$(MAKE) --no-print-directory test-e2e
+	$(MAKE) --no-print-directory coverage
+
+test-unit: install-dev
+	$(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report= $(T)
+
+# A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
+test-e2e: install-dev
+	$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T)
+
+test-random: install-dev
+	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)
+
+coverage: install-dev
 	$(BIN)/python -m coverage report --include="$(CORE)" --fail-under=95
 	$(BIN)/python -m coverage report --omit="$(CORE)" --fail-under=90
 

@@ -1,16 +1,55 @@
-"""Settings of every test: hypothesis draws the same examples in continuous integration, so a failure there repeats."""
+"""Settings of every test: hypothesis draws the same examples every time, and no process may stay behind.
+
+`HYPOTHESIS=random` draws others (`make test-random`): they find more, but what blocks a change must repeat.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import uuid
 from collections.abc import Iterator
 
+import psutil
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
-settings.register_profile("local", deadline=None)
-settings.load_profile("ci" if os.environ.get("CI") else "local")
+#: A busy machine is slow in everything: no deadline, no complaint about slow examples.
+settings.register_profile(
+    "same", derandomize=True, deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("random", settings.get_profile("same"), derandomize=False)
+settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
+
+#: In the environment of every process that the tests start, also of one whose parent has died.
+MARK = "IRIS_TEST_RUN"
+#: What ends by itself may take this long, on a machine that others keep busy.
+ENDING_S = 30.0
+
+
+def _ours() -> list[psutil.Process]:
+    """Processes that were started by the tests of this one."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            marked = process.pid != os.getpid() and process.environ().get(MARK) == os.environ[MARK]
+            if marked and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+    return found
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_process_stays() -> Iterator[None]:
+    """Ends with an error that names what still runs after the last test, and ends it."""
+    os.environ[MARK] = uuid.uuid4().hex
+    yield
+    _, alive = psutil.wait_procs(_ours(), ENDING_S)
+    left = []
+    for process in alive:
+        with contextlib.suppress(psutil.Error):
+            left.append(f"{process.pid} {' '.join(process.cmdline())}")
+            process.kill()
+    assert not left, f"left behind: {left}"
 
 
 @pytest.fixture(scope="session", autouse=True)
