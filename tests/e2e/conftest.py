@@ -5,6 +5,8 @@ Everything waits on conditions with a deadline; everything that was started is e
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import signal
@@ -13,17 +15,30 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import psutil
 import pytest
 
 from anchors.pose import PoseTuple
+from iris_session.cli.main import main
 from iris_session.client import Client
 from iris_session.protocol.server_messages import Event
 
 DEADLINE_S = 30.0
+#: Commands that end by themselves; and a whole demo, which takes a minute on a machine with time to spare.
+COMMAND_S = 120.0
+DEMO_S = 300.0
 COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
+#: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
+LONGEST: Final = (
+    "test_demos_paper.py", "test_demo_link.py", "test_soak.py", "test_handover.py", "test_people.py",
+    "test_recovery.py", "test_resume.py", "test_user_loop.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
 def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
@@ -35,7 +50,7 @@ def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE
         time.sleep(0.005)
 
 
-def iris(*arguments: str, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+def iris(*arguments: str, cwd: Path, timeout_s: float = COMMAND_S) -> subprocess.CompletedProcess[str]:
     """Runs one command to its end."""
     return subprocess.run(
         [*COMMAND, *arguments], capture_output=True, text=True, check=False, cwd=cwd, timeout=timeout_s
@@ -47,7 +62,7 @@ def relatives(pid: int) -> list[psutil.Process]:
     return psutil.Process(pid).children(recursive=True)
 
 
-def none_left(processes: Sequence[psutil.Process], timeout_s: float = 10.0) -> None:
+def none_left(processes: Sequence[psutil.Process], timeout_s: float = DEADLINE_S) -> None:
     """Fails when one of `processes` does not end by itself; ends it then."""
     _, alive = psutil.wait_procs(list(processes), timeout=timeout_s)
     text = [f"{p.pid} {' '.join(p.cmdline())}" for p in alive if p.is_running()]
@@ -72,11 +87,22 @@ def front_and_recorder(pid: int) -> dict[str, psutil.Process]:
     return found
 
 
+def here(*arguments: str) -> tuple[int, str, str]:
+    """Runs one command in this process, which has its modules loaded: exit status, output, errors.
+
+    For commands that start no session. To import what they need takes longer than most of them do.
+    """
+    out, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        status = main(list(arguments))
+    return status, out.getvalue(), errors.getvalue()
+
+
 def verify(recording: Path, status: int = 0) -> dict[str, Any]:
-    """Report of `iris-session verify --json`, which must exit with `status`."""
-    done = iris("verify", "--json", str(recording), cwd=recording.parent)
-    assert done.returncode == status, (done.stdout[-2000:], done.stderr[-2000:])
-    report: dict[str, Any] = json.loads(done.stdout)["files"][0]
+    """Report of `iris-session verify --json`, which must end with `status`."""
+    code, out, errors = here("verify", "--json", str(recording))
+    assert code == status, (out[-2000:], errors[-2000:])
+    report: dict[str, Any] = json.loads(out)["files"][0]
     return report
 
 
@@ -262,7 +288,7 @@ def end_all(servers: Sequence[Server]) -> None:
             children = relatives(server.process.pid)
             server.process.kill()
             server.process.wait()
-            psutil.wait_procs(children, timeout=5.0)
+            psutil.wait_procs(children, timeout=DEADLINE_S)
 
 
 @pytest.fixture

@@ -7,16 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.conftest import iris
+from tests.e2e.conftest import DEMO_S, iris
 
 pytestmark = pytest.mark.e2e
 
 
-@pytest.mark.timeout(150)
 def test_handover_over_busy_wifi(tmp_path: Path) -> None:
     recording = tmp_path / "session.rrd"
     options = ("--profile", "busy-wifi", "--seed", "3", "--record", str(recording), "--json")
-    done = iris("demo", "handover", *options, cwd=tmp_path, timeout_s=140.0)
+    done = iris("demo", "handover", *options, cwd=tmp_path, timeout_s=DEMO_S)
     result = json.loads(done.stdout)
     assert result["ok"], (result["problems"], done.stderr[-2000:])
     assert result["verified"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.conftest import iris
+from tests.e2e.conftest import DEMO_S, iris
 from tests.models import robot_models
 
 __all__ = ["robot_models"]
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("robot_models")]
 
 def play(folder: Path, *arguments: str) -> dict[str, Any]:
     """Runs a demo that must succeed; its result."""
-    done = iris("demo", *arguments, "--json", cwd=folder, timeout_s=170.0)
+    done = iris("demo", *arguments, "--json", cwd=folder, timeout_s=DEMO_S)
     assert done.returncode == 0, (done.stdout, done.stderr[-3000:])
     result: dict[str, Any] = json.loads(done.stdout)
     assert result["ok"]
@@ -27,7 +27,6 @@ def play(folder: Path, *arguments: str) -> dict[str, Any]:
     return result
 
 
-@pytest.mark.timeout(180)
 def test_two_people_with_two_arms_each_exchange_boards(tmp_path: Path) -> None:
     result = play(tmp_path, "aloha")
     found = {h["object"]: (h["giver"], h["receiver"]) for h in result["handovers"]}
@@ -39,7 +38,6 @@ def test_two_people_with_two_arms_each_exchange_boards(tmp_path: Path) -> None:
         assert 0.0 < error["at_sheet"] < 2.0 * error["stated_p95"]
 
 
-@pytest.mark.timeout(180)
 def test_iiwa_arms_hand_a_hammer_over(tmp_path: Path) -> None:
     result = play(tmp_path, "iiwa")
     assert [(h["object"], h["giver"], h["receiver"]) for h in result["handovers"]] == [("object1", "left", "right")]

@@ -26,22 +26,31 @@ from tests.e2e.conftest import DEADLINE_S, Server, iris, serve_command, wait
 pytestmark = pytest.mark.e2e
 
 
-def free_block() -> int:
-    """A port whose lower neighbour is free too."""
-    while True:
-        with socket.socket() as one, socket.socket() as two:
-            one.bind(("127.0.0.1", 0))
-            port = int(one.getsockname()[1])
-            with contextlib.suppress(OSError):
-                two.bind(("127.0.0.1", port - 1))
-                return port
+@contextlib.contextmanager
+def block() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two sockets on neighbouring ports, the lower first. Nobody else can have the ports, and nothing listens yet."""
+    for _ in range(1000):
+        with socket.socket() as upper, socket.socket() as lower:
+            upper.bind(("127.0.0.1", 0))
+            try:
+                lower.bind(("127.0.0.1", port_of(upper) - 1))
+            except OSError:
+                continue
+            yield lower, upper
+            return
+    pytest.fail("no two neighbouring ports are free")
+
+
+def port_of(one: socket.socket) -> int:
+    return int(one.getsockname()[1])
 
 
 # --- the way ---------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_listens() -> None:
-    found = doctor(f"127.0.0.1:{free_block()}")
+    with block() as (_, upper):
+        found = doctor(f"127.0.0.1:{port_of(upper)}")
     found.named("tcp", "nothing listens", "iris-session serve")
     assert found.status == 1
     assert found.checks["join"]["state"] == "skipped"
@@ -65,11 +74,9 @@ def test_no_session_of_that_name() -> None:
 
 def test_other_protocol_version() -> None:
     """A session of version 2 introduces itself."""
-    port = free_block()
-    beacon = Beacon(2, "s2", "future", "live", "127.0.0.1", port, 0, 0, 0, 0)
-    with socket.socket() as introducing, socket.socket() as control:
-        introducing.bind(("127.0.0.1", port - 1))
-        control.bind(("127.0.0.1", port))
+    with block() as (introducing, control):
+        port = port_of(control)
+        beacon = Beacon(2, "s2", "future", "live", "127.0.0.1", port, 0, 0, 0, 0)
         for listener in (introducing, control):
             listener.listen(4)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.e2e.conftest import COMMAND, iris, none_left, relatives, verify, wait
+from tests.e2e.conftest import COMMAND, DEMO_S, iris, none_left, relatives, verify, wait
 
 pytestmark = pytest.mark.e2e
 
@@ -20,7 +20,7 @@ CHILDREN = 5
 
 
 def test_the_hammer_changes_hands_and_the_recording_verifies(tmp_path: Path) -> None:
-    done = iris("demo", "handover", "--json", cwd=tmp_path, timeout_s=115.0)
+    done = iris("demo", "handover", "--json", cwd=tmp_path, timeout_s=DEMO_S)
     assert done.returncode == 0, (done.stdout, done.stderr[-3000:])
     result = json.loads(done.stdout)  # exactly one object
     assert result["ok"] is True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import pytest
 from anchors.pose import distance
 from iris_session.protocol.server_messages import Gap, MarkerAdded
 from iris_session.recording.feed import BATCH_ROWS
-from tests.e2e.conftest import Hand, Server, Stage, iris, none_left, relatives, wait
+from tests.e2e.conftest import Hand, Server, Stage, here, iris, none_left, relatives, wait
 
 pytestmark = pytest.mark.e2e
 
@@ -202,14 +203,17 @@ def folder(tmp_path: Path) -> Path:
         (["handover", "--name", "no/slash"], "letters"),
     ],
 )
-def test_input_that_cannot_be_used_is_one_line(folder: Path, arguments: list[str], expected: str) -> None:
-    done = iris("serve", *arguments, cwd=folder)
-    assert done.returncode == 2, (done.stdout, done.stderr)
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1, done.stderr
+def test_input_that_cannot_be_used_is_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], expected: str
+) -> None:
+    monkeypatch.chdir(folder)
+    status, out, errors = here("serve", *arguments)
+    assert status == 2, (out, errors)
+    lines = errors.strip().splitlines()
+    assert len(lines) == 1, errors
     assert lines[0].startswith("iris-session: ")
     assert expected.lower() in lines[0].lower()
-    assert not done.stdout.strip()
+    assert not out.strip()
     _nothing_runs_in(folder)
 
 
@@ -249,10 +253,10 @@ def _nothing_runs_in(folder: Path) -> None:
         found = []
         for process in psutil.process_iter():
             try:
-                if process.cwd() == str(folder):
+                if process.pid != os.getpid() and process.cwd() == str(folder):
                     found.append(" ".join(process.cmdline()))
             except psutil.Error:
                 continue
         return found
 
-    wait(lambda: not left(), f"nothing is left of the command, but {left()}", 10.0)
+    wait(lambda: not left(), f"nothing is left of the command, but {left()}")

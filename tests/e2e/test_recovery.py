@@ -25,8 +25,8 @@ from tests.e2e.conftest import Hand, Server, Stage, none_left, relatives, verify
 
 pytestmark = pytest.mark.e2e
 
-#: Everything ends within 2 s of Ctrl-C; on a machine that other tests keep busy, well before a hang would.
-END_S = 6.0
+#: Everything ends within 2 s of Ctrl-C; on a machine that other tests keep busy it may take much longer.
+END_S = 30.0
 
 
 @pytest.fixture

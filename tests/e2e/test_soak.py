@@ -18,12 +18,11 @@ RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
 
 
 @pytest.mark.e2e
-@pytest.mark.timeout(150)
 def test_a_minute_of_disturbances(tmp_path: Path) -> None:
     """Three people over busy Wi-Fi: everybody is back at the end, no event is lost, the recording verifies."""
     command = [sys.executable, str(TOOLS / "soak.py"), "--seconds", "22", "--operators", "2", "--observers", "1"]
     command += ["--per-process", "1", "--seed", "1", "--keep", str(tmp_path), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=140.0)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300.0)
     assert done.stdout, done.stderr[-3000:]
     result = json.loads(done.stdout)
     assert result["problems"] == [], done.stderr[-3000:]

@@ -13,7 +13,7 @@ from anchors.pose import distance
 from iris_session.client import DeniedError
 from iris_session.protocol.names import CommandKind, DenialReason, HoldReason
 from iris_session.protocol.server_messages import Gap, MarkerAdded, SceneChanged
-from tests.e2e.conftest import Server, Stage, end_all, none_left, relatives, verify
+from tests.e2e.conftest import Hand, Server, Stage, end_all, none_left, relatives, verify
 
 pytestmark = pytest.mark.e2e
 
@@ -196,6 +196,7 @@ def test_a_loop_that_blocks_for_five_seconds(script: Callable[[str], Stage], bod
     (hand,) = stage.hands
     ann, director = hand.client, stage.join("director", "director")
     hand.velocity = (0.0, 0.0, 0.0)
+    stage.run(lambda: _resting(stage, hand), "the robot has come to rest")
     _order(stage, "block")
     stage.run(lambda: _standing(stage, director), "the loop stands still")
     before, tick = hand.tip, director.state.header.tick  # type: ignore[union-attr]
@@ -219,6 +220,13 @@ def test_a_loop_that_blocks_for_five_seconds(script: Callable[[str], Stage], bod
     stage.engage(hand)
     assert distance(before[0], hand.tip[0]) < 4e-3
     _end(stage)
+
+
+def _resting(stage: Stage, hand: Hand) -> bool:
+    """True once the tip has not moved for 0.3 s."""
+    before = hand.tip
+    stage.seconds(0.3)
+    return distance(before[0], hand.tip[0]) < 1e-4
 
 
 def _standing(stage: Stage, client: object) -> bool:
