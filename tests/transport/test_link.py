@@ -200,9 +200,10 @@ def test_the_last_words_of_a_front_that_died_are_heard(pair: Pair) -> None:
     pair.say(messages.ENTRIES, encode_entries([stop]))
     pair.say(messages.HANDBACK, b"tokens")
     assert pair.link._socket is not None
-    while not pair.link._socket.poll(1000):
-        pass
-    pair.far.close()
+    with pair.link._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:
+        pair.far.close(linger=30_000)
+        assert monitor.poll(30_000), "everything that it said has come by then"
+        pair.link._socket.disable_monitor()
     pair.far = pair.connect("b")
     assert pair.link.handback == b"tokens"
     heard = [entry.message for entry in pair.link.poll()]

@@ -296,12 +296,17 @@ def test_a_session_that_stands_still_is_reported_once_and_again_when_it_recovers
     client = session.client()
     client.join()
     client.wait_for(DeliveryBudget)
-    assert client.socket.poll(30_000), "no word about the stall"
-    client.receive()
-    assert [f.code for f in client.got(ProtocolFault)] == ["stalled"]
+
+    def told() -> list[str]:
+        return [fault.code for fault in client.got(ProtocolFault)]
+
+    while not told() or told()[-1] != "stalled":
+        assert client.socket.poll(30_000), "no word about the stall"
+        client.receive()
     assert client.socket.poll(300) == 0
-    session.pump(lambda: len(client.got(ProtocolFault)) == 2, "recovery")
-    assert client.got(ProtocolFault)[-1].code == "recovered"
+    session.pump(lambda: told()[-1] == "recovered", "recovery")
+    stalls = told().count("stalled")  # a machine with nothing to spare may have made others
+    assert told() == ["stalled", "recovered"] * stalls
 
 
 PARENT = """
