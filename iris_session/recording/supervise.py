@@ -20,7 +20,8 @@ from iris_session.recording.errors import RecorderError
 from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
 
-START_S: Final = 20.0
+#: Half a second, on a machine with time to spare.
+START_S: Final = 60.0
 #: Room is left for our own names, of folder and socket.
 LONGEST_FOLDER: Final = 75
 

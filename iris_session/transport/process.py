@@ -71,7 +71,7 @@ class FrontProcess:
     def restarts(self) -> int:
         return max(0, self._generation - 1)
 
-    def start(self, timeout_s: float = 15.0) -> Ports:
+    def start(self, timeout_s: float = 60.0) -> Ports:
         """Starts the front and waits until it listens.
 
         Raises `FrontError` with one line that says what to do: a port in use, a missing key, a wrong address.
