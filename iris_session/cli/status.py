@@ -190,6 +190,7 @@ def _lines(report: StatusReport) -> Iterator[str]:
             f"{r.name:20.20s} {holder:20.20s} {r.state:9s} {r.hold_reason or '-':14s} "
             f"{_quantiles(r.receive_to_step):>19s}  {waits}"
         )
+    yield from _media(report)
     yield ""
     took = stages(report.participants, report)
     yield "data age, p99 of the worst: " + (
@@ -233,6 +234,24 @@ def _participant(p: ParticipantReport) -> str:
         f"{name:20.20s} {p.role:9.9s} {aligned:22.22s} {age:>15s} {p.rtt_ms:7.1f} {p.missed_share:7.1%} "
         f"{p.samples_per_s:9.0f} {p.drops:6d}  {', '.join(p.holds)}{waits}"
     )
+
+
+def _media(report: StatusReport) -> Iterator[str]:
+    """Every stream, and who gets what of it."""
+    if report.media:
+        yield ""
+    for one in report.media:
+        gets = []
+        for p in report.participants:
+            for budget in p.media:
+                if budget.stream == one.stream:
+                    gets.append(f"{p.name} ({p.id}) {budget.budget_class}" + _dropped(p.media_drops))
+        source = f" from {one.source}" if one.source else ""
+        yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {', '.join(gets) or 'nobody'}"
+
+
+def _dropped(n: int) -> str:
+    return f", {n} dropped" if n else ""
 
 
 def _quantiles(values: Quantiles | None) -> str:

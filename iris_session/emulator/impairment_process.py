@@ -216,7 +216,7 @@ def parser(prog: str | None = None, description: str | None = __doc__) -> argpar
         prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     made.add_argument("--target", default="127.0.0.1", metavar="ADDR", help="where the session is (%(default)s)")
-    made.add_argument("--ports", type=port_list, default=port_list("7720-7725"), help="TCP (default: 7720-7725)")
+    made.add_argument("--ports", type=port_list, default=port_list("7720-7726"), help="TCP (default: 7720-7726)")
     made.add_argument("--udp", type=port_list, default=[], metavar="PORTS", help="UDP ports (default: none)")
     made.add_argument(
         "--link", action="append", metavar="ADDR[=PROFILE]", help="address of a link, repeatable (127.0.0.2)"

@@ -22,7 +22,7 @@ def links_before(session: Session, links: Mapping[str, str], seed: int = 0) -> I
     assert front is not None
     assert front.link.ports is not None
     ports = front.link.ports
-    return ImpairmentProcess(links, [ports.control, ports.state], target=ports.host, seed=seed)
+    return ImpairmentProcess(links, [ports.control, ports.state, ports.media], target=ports.host, seed=seed)
 
 
 def address_over(session: Session, link: str) -> str:

@@ -19,8 +19,9 @@ SECOND: Final = 1_000_000_000
 #: Index of `BudgetClass.NONE`.
 NOTHING: Final = len(CLASSES) - 1
 
-#: State that is so much older than it was at its best counts as late [ms], and half of that best beside it.
-RISE_MS: Final = 40.0
+#: State that is so much older than it was at its best counts as late [ms], and half of that best beside it. A single
+#: large frame of media before it makes state tens of milliseconds older, which is no reason yet.
+RISE_MS: Final = 80.0
 #: More frames of state are missed than at best, by this share.
 RISE_MISSED: Final = 0.3
 #: Reports among which the best is looked for: a minute.
@@ -167,7 +168,7 @@ class BudgetController:
             self._judge(line, measure.report, now_ns)
         if measure.due:
             share = measure.taken / measure.due
-            line.sent = share
+            line.sent = (line.sent + share) / 2  # buffers take some before the link is known
             line.blocked = line.blocked + 1 if 1.0 - share > BLOCKED else 0
         if line.reported_ns >= 0 and now_ns - line.reported_ns > SILENT_NS:
             line.sent = 0.0

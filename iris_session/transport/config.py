@@ -76,7 +76,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     `curve_secret_file`: another ZeroMQ certificate of the server (`*.key_secret`); `curve_clients_dir`: folder of
     public certificates (`*.key`) instead of the allow-list. `origin_ns`: `time.monotonic_ns()` at session time 0.
     `media_endpoint`: where processes of this session hand in media, empty for nowhere; `media_port`,
-    `media_ingest_port`: taken when they are free, else any other.
+    `media_ingest_port`: taken when they are free, else any other. `adapt_media`: slow links get less.
     `recorder_endpoint`: a PULL socket that takes raw samples, empty when nothing is recorded. `forward_observations`:
     raw observations reach the authority too.
     """
@@ -90,6 +90,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     media_port: int = 0
     media_ingest_port: int = 0
     media_endpoint: str = ""
+    adapt_media: bool = True
     assets_port: int = 0
     web_port: int = 0
     session_id: str = ""

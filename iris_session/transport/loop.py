@@ -192,6 +192,7 @@ class Front:
             self._drops,
             self._status.client_report,
             self._tokens.revoked,
+            adapt=self._config.adapt_media,
         )
 
     def _open_state_again(self) -> zmq.Socket[bytes]:

@@ -42,7 +42,10 @@ class _Told:
 
 
 class MediaDesk:
-    """A `Service`. `report_of(connection, now_ns)`: the newest of a client; `revoked(key)`: it may do nothing."""
+    """A `Service`. `adapt`: slow links get less.
+
+    `report_of(connection, now_ns)`: the newest of a client; `revoked(key)`: it may do nothing.
+    """
 
     def __init__(
         self,
@@ -53,6 +56,8 @@ class MediaDesk:
         drops: Drops,
         report_of: Callable[[int, int], ClientReport | None],
         revoked: Callable[[str], bool],
+        *,
+        adapt: bool = True,
     ) -> None:
         self._proxy = proxy
         self._clients = clients
@@ -61,7 +66,7 @@ class MediaDesk:
         self._drops = drops
         self._report_of = report_of
         self._revoked = revoked
-        self._controller = BudgetController()
+        self._controller = BudgetController() if adapt else None
         self._told: dict[int, _Told] = {}
         self._facts: dict[str, StreamFacts] = {}
         self._names: dict[str, str] = {}  # of sources, by key
@@ -114,7 +119,8 @@ class MediaDesk:
     def _take_over(self, here: set[int]) -> None:
         for number in [number for number in self._told if number not in here]:
             del self._told[number]
-            self._controller.forget(number)
+            if self._controller is not None:
+                self._controller.forget(number)
         for number in sorted(here - set(self._told)):
             self._told[number] = _Told()
 
@@ -152,7 +158,8 @@ class MediaDesk:
         limit = max(0.0, told.report.media_limit_mbit_per_s) * MBIT if told.report is not None else 0.0
         measure = Measure(fresh, tally.taken - before.taken, tally.due - before.due, limit)
         rates = {stream: self._facts[stream].rates for stream in told.wanted if stream in self._facts}
-        told.grant = self._controller.update(number, measure, rates, now_ns)
+        if self._controller is not None:
+            told.grant = self._controller.update(number, measure, rates, now_ns)
 
     def _publish(self) -> None:
         listeners = {
@@ -176,7 +183,9 @@ class MediaDesk:
         self._names = {}
         for mark in asking | known:
             entry = self._keyring.find(mark)
-            if entry is not None and SOURCES.intersection(entry.roles) and not self._revoked(mark):
+            if entry is None or self._revoked(mark):
+                continue
+            if not entry.roles or SOURCES.intersection(entry.roles):
                 self._names[mark] = entry.name
         with self._proxy.lock:
             self._proxy.hub.stop_sources(known - set(self._names))

@@ -12,7 +12,15 @@ from iris_session.cli.main import main
 from iris_session.cli.metrics import exposition
 from iris_session.cli.status import screen
 from iris_session.doctor.findings import Finding, failed, ok, warning
-from iris_session.protocol.status import ParticipantReport, Quantiles, RecorderReport, RobotReport, StatusReport
+from iris_session.protocol.media import StreamBudget
+from iris_session.protocol.status import (
+    MediaStreamReport,
+    ParticipantReport,
+    Quantiles,
+    RecorderReport,
+    RobotReport,
+    StatusReport,
+)
 
 ANN = ParticipantReport(
     "p1",
@@ -67,6 +75,17 @@ def test_one_screen_says_it_all() -> None:
     assert "device -> front 20.0 ms" in text
     assert "front 1" in text
     assert "mind the gap" in text
+
+
+def test_media_are_shown_with_who_gets_what() -> None:
+    ann = ParticipantReport("p1", "ann", "observer", True, media=(StreamBudget("cloud", "full", 20.0),))
+    bob = ParticipantReport(
+        "p2", "bob", "observer", True, media=(StreamBudget("cloud", "quarter", 5.0),), media_drops=7
+    )
+    streams = (MediaStreamReport("cloud", 30.0, 20.0, "cam-1", 2), MediaStreamReport("cloth", 60.0, 2.0))
+    text = screen(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams))
+    assert "media cloud: 30 Hz, 20.0 Mbit/s from cam-1; ann (p1) full, bob (p2) quarter, 7 dropped" in text
+    assert "media cloth: 60 Hz, 2.0 Mbit/s; nobody" in text
 
 
 def test_names_of_strangers_move_no_cursor() -> None:

@@ -162,7 +162,7 @@ rates_of_streams = st.dictionaries(
 
 
 @given(rates_of_streams, st.floats(0.0, 5e7), st.floats(0.0, 5e7))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_more_budget_is_never_less_of_any_stream(rates: dict[str, tuple[float, ...]], one: float, other: float) -> None:
     less, more = sorted((one, other))
     low, high = fit(rates, less), fit(rates, more)
@@ -171,7 +171,7 @@ def test_more_budget_is_never_less_of_any_stream(rates: dict[str, tuple[float, .
 
 
 @given(st.floats(0.3, 60.0), st.floats(1.0, 120.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
     link = Link(mbit, age_ms)
     link.play(120)
@@ -185,7 +185,7 @@ def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
 
 
 @given(st.floats(0.3, 100.0), st.floats(2.0, 30.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_link_that_dies_gets_nothing(mbit: float, after_s: float) -> None:
     link = Link(mbit)
     link.play(after_s)

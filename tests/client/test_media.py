@@ -1,0 +1,99 @@
+"""Media of a client: subscriptions, what is dropped, sources, and what people get wrong."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from iris_session.client import Client, InvalidMessageError, NotConnectedError
+from tests.client.harness import LiveSession
+
+DEADLINE_S = 30.0
+
+
+@pytest.fixture
+def cloud(session: LiveSession) -> Iterator[threading.Event]:
+    """The session publishes `cloud` until this is set."""
+    stop = threading.Event()
+
+    def publish() -> None:
+        while not stop.wait(0.01):
+            session.front.publish_media("cloud", b"points", session.now_ns, 1, "bytes")
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    yield stop
+    stop.set()
+    thread.join()
+
+
+@pytest.mark.usefixtures("cloud")
+def test_the_newest_frame_is_taken_once(join: Callable[..., Client]) -> None:
+    ann = join()
+    feed = ann.media("cloud")
+    assert ann.media("cloud") is feed
+    assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
+    frame = feed.take()
+    assert frame is not None
+    assert (frame.data, frame.header.stream, feed.budget_class) == (b"points", "cloud", "full")
+    assert frame is feed.newest
+    assert 0 < frame.age_ns < DEADLINE_S * 1e9
+    assert feed.take() is None
+    assert ann.wait_for(lambda _: feed.take() is not None, DEADLINE_S)
+    assert ann.wait_for(lambda one: bool(one.delivery and one.delivery.streams), DEADLINE_S)
+    ann.drop_media("cloud")
+    assert ann.media("cloud") is not feed
+
+
+@pytest.mark.usefixtures("cloud")
+def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
+    ann = join()
+    feed = ann.media("cloud")
+    assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
+    generation, newest = ann.connection.generation, feed.newest
+    assert newest is not None
+    session.front._process.kill()  # type: ignore[union-attr]
+    assert ann.wait_for(lambda one: one.connection.generation > generation and one.ready, DEADLINE_S)
+    received = feed.received
+    assert ann.wait_for(lambda _: feed.received > received, DEADLINE_S)
+    assert feed.newest is not None
+    assert feed.newest.header.seq > newest.header.seq
+
+
+@pytest.mark.usefixtures("cloud")
+def test_a_limit_of_the_client_holds(join: Callable[..., Client]) -> None:
+    ann = join()
+    feed = ann.media("cloud")
+    assert ann.wait_for(lambda _: feed.received >= 1, DEADLINE_S)
+    ann.media_limit_mbit_per_s = 0.0001
+    assert ann.wait_for(lambda _: feed.budget_class == "none", DEADLINE_S)
+    assert ann.delivery is not None
+    assert ann.delivery.reason == "the client asked for no more"
+
+
+def test_names_that_cannot_be(join: Callable[..., Client]) -> None:
+    ann = join(connect=False)
+    for name in ("", "a/b", "-a", "x" * 49, "ä"):
+        with pytest.raises(InvalidMessageError, match="cannot be the name of a media stream"):
+            ann.media(name)
+    with pytest.raises(NotConnectedError):
+        ann.publish_media("cloud", b"")
+    ann.connect()
+    with pytest.raises(InvalidMessageError, match="has class 'full'"):
+        ann.publish_media("cloud", {"half": b""})
+
+
+def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
+    camera, ann = join("cam", role="camera"), join("ann")
+    feed = ann.media("depth")
+
+    def comes(_: Client) -> bool:
+        camera.publish_media("depth", {"full": b"all", "half": b"less"}, capture_ns=5)
+        camera.poll()
+        return feed.received > 0
+
+    assert ann.wait_for(comes, DEADLINE_S)
+    assert feed.newest is not None
+    assert (feed.newest.data, feed.newest.header.capture_ns) == (b"all", 5)
