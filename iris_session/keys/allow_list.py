@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 
 from iris_session.keys.curve import fingerprint, raw_key
-from iris_session.keys.files import PATIENCE_S, KeysError, PrivateFolder
+from iris_session.keys.files import PATIENCE_S, KeysBusyError, KeysError, PrivateFolder
 from iris_session.keys.lines import line_of
 from iris_session.protocol.names import Role
 
@@ -53,7 +53,7 @@ class AllowList:
         self._folder = folder
 
     @property
-    def signature(self) -> tuple[int, int, int] | None:
+    def signature(self) -> tuple[int, ...] | None:
         """Differs after every change of the file: for who watches it."""
         return self._folder.signature(FILE)
 
@@ -127,10 +127,12 @@ class AllowList:
     def seen(self, fingerprints: dict[str, str], patience_s: float = PATIENCE_S) -> None:
         """Notes when keys were last here: UTC by fingerprint. Keys that are off the list are passed over."""
         with self._folder.locked(patience_s):
-            entries = self.read()
+            before, entries = self.signature, self.read()
             noted = {mark: utc for mark, utc in fingerprints.items() if mark in entries}
             for mark, utc in noted.items():
                 entries[mark] = msgspec.structs.replace(entries[mark], last_seen=utc)
+            if self.signature != before:  # an editor knows no lock: what it took off the list must stay off
+                raise KeysBusyError(f"{self._folder.path / FILE} was edited just now: try again")
             if noted:
                 self._folder.write_json(FILE, list(entries.values()), durable=False)
 

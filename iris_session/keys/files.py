@@ -98,13 +98,13 @@ class PrivateFolder:
         """Replaces a JSON file, indented for people."""
         self.write(name, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n", durable=durable)
 
-    def signature(self, name: str) -> tuple[int, int, int] | None:
+    def signature(self, name: str) -> tuple[int, ...] | None:
         """Changes whenever a file was replaced, edited, or got other permissions; `None` while there is none."""
         try:
             status = (self.path / name).stat()
         except OSError:
             return None
-        return status.st_ino, status.st_ctime_ns, status.st_size
+        return status.st_ino, status.st_ctime_ns, status.st_size, status.st_mode
 
     @contextlib.contextmanager
     def locked(self, patience_s: float = PATIENCE_S) -> Iterator[None]:

@@ -63,7 +63,7 @@ class JoinCodes:
         self._folder = folder
 
     @property
-    def signature(self) -> tuple[int, int, int] | None:
+    def signature(self) -> tuple[int, ...] | None:
         """Differs after every change of the file: for who watches it."""
         return self._folder.signature(FILE)
 

@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 from zmq.auth import create_certificates
 
-from iris_session.keys import KeyHome, KeyPair, KeysError, curve, load_public, load_secret
+from iris_session.keys import (
+    AllowedKey,
+    KeyHome,
+    KeyPair,
+    KeysBusyError,
+    KeysError,
+    curve,
+    load_public,
+    load_secret,
+)
 
 
 @pytest.fixture
@@ -143,6 +152,25 @@ def test_a_key_that_is_listed_twice_is_said(home: KeyHome, listed: Path) -> None
     rows = json.loads(listed.read_text())
     listed.write_text(json.dumps([*rows, {**rows[0], "name": "eve"}], indent=2))
     assert complaint(home, listed)[1] == "this key is listed as 'ann' already"
+
+
+def test_a_note_of_the_session_does_not_undo_an_edit(
+    home: KeyHome, listed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An editor knows nothing of our lock."""
+    read = home.clients.read
+    marks = list(read())
+
+    def edited_meanwhile() -> dict[str, AllowedKey]:
+        keys = read()
+        listed.write_text("[]")
+        return keys
+
+    with monkeypatch.context() as patch:
+        patch.setattr(home.clients, "read", edited_meanwhile)
+        with pytest.raises(KeysBusyError, match="edited just now"):
+            home.clients.seen({marks[0]: "2026-01-01T00:00:00+00:00"})
+    assert read() == {}
 
 
 def test_new_permissions_are_a_change(home: KeyHome) -> None:

@@ -349,6 +349,7 @@ def test_the_list_may_be_edited_by_hand_while_the_session_runs(lab: Lab) -> None
     _, ann = lab.allowed("ann")
     _, bob = lab.allowed("bob")
     path = lab.home.path / "clients.json"
+    lab.session.pump(lambda: any(key.last_seen for key in lab.home.clients.read().values()), "the session's own note")
     rows = json.loads(path.read_text())
     path.write_text(json.dumps(rows[1:]))  # in place
     assert ann.wait_for(ProtocolFault).code == FaultCode.REVOKED
