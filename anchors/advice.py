@@ -6,8 +6,6 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-import numpy as np
-
 from anchors.groups import Sighting
 from anchors.pose import Vec3, distance
 
@@ -39,7 +37,8 @@ def size_advice(sightings: Iterable[tuple[str, Sighting]], tolerance: float) -> 
         if s.size_m > 0.0 and math.isfinite(s.size_m):
             sizes.setdefault(anchor_id, []).append(s.size_m)
     for anchor_id, seen in sizes.items():
-        low, high = np.quantile(seen, (0.1, 0.9))
+        seen.sort()
+        low, high = seen[len(seen) // 10], seen[(9 * len(seen)) // 10 if len(seen) > 1 else 0]
         if high - low > tolerance * low:
             return f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"
     return ""

@@ -60,7 +60,7 @@ class AlignmentConfig:
     tilt_warning_rad: float = math.radians(1.0)
     max_tilt_rad: float = math.radians(15.0)
     drift_m_per_s: float = 0.003 / 60.0 / math.sqrt(3.0)
-    walk_m_per_sqrt_s: float = 0.0005 / math.sqrt(60.0)
+    walk_m_per_sqrt_s: float = 0.001 / math.sqrt(60.0)
     max_error_m: float = 0.03
     min_observations: int = 5
     max_observations: int = 600
@@ -128,6 +128,7 @@ class AlignmentEstimator:
     against_gravity: int = 0
     unmirrored: int = 0
     _misprint: str = ""
+    _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
     _memory: Memory = field(init=False)
 
     def __post_init__(self) -> None:
@@ -176,7 +177,7 @@ class AlignmentEstimator:
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
             self._memory.clear()
-            self._misprint = ""
+            self._misprint, self._near = "", None
         if not self._is_of_size(anchor_id, size_m):
             return False
         pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
@@ -225,13 +226,14 @@ class AlignmentEstimator:
             return self._refusal(CONTRADICT)
         prior = self.config.prior
         b = self._problem(keys, merged, prior)
-        s = solve(b, prior)
+        s = solve(b, prior, self._near)
         if not s.inside.any():
             return self._refusal(disagreement(sorted(set(b.anchor))))
         tilt = _common_tilt(b, s)
         if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
             prior = Prior(tilt, prior.drift_m_per_s, prior.walk_m_per_sqrt_s)
-            s = solve(b, prior)
+            s = solve(b, prior, (s.q, s.t))
+        self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
         moved = outvoted(b.anchor, s)
         if agreeing < self.config.min_observations or not self._is_majority(b, s, len(self._memory.groups)):
@@ -274,7 +276,7 @@ class AlignmentEstimator:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = b.p_world[s.inside].mean(axis=0)
         pivot_world = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
-        covariance = tuple(float(v) for v in (in_world(s.q, s.covariance, pivot) * wider).ravel())
+        covariance = tuple((in_world(s.q, s.covariance, pivot) * wider).ravel().tolist())
         error = position_error_p95(covariance, pivot_world, pivot_world)
         refused = not error <= self.config.max_error_m
         if refused:
@@ -310,14 +312,17 @@ class AlignmentEstimator:
     def snapshot(self) -> bytes:
         """Everything that `estimate` and `add` depend on but anchors, sizes and configuration."""
         counters = [getattr(self, name) for name in _COUNTERS]
-        return json.dumps({"counters": counters, "misprint": self._misprint, **self._memory.snapshot()}).encode()
+        near = None if self._near is None else [part.tolist() for part in self._near]
+        plain = {"counters": counters, "misprint": self._misprint, "near": near}
+        return json.dumps({**plain, **self._memory.snapshot()}).encode()
 
     def restore(self, snapshot: bytes) -> None:
         """Takes up a snapshot: from here on results are the same as those of the estimator that wrote it."""
         data = json.loads(snapshot)
         for name, value in zip(_COUNTERS, data["counters"], strict=True):
             setattr(self, name, int(value))
-        self._misprint = str(data["misprint"])
+        self._misprint, near = str(data["misprint"]), data["near"]
+        self._near = None if near is None else (np.array(near[0]), np.array(near[1]))
         self._memory.restore(data)
 
 
@@ -367,5 +372,5 @@ def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:
 def _common_tilt(b: Problem, s: Solution) -> float:
     """Tilt [rad] that the agreeing groups show together, gravity left out."""
     weight = s.inside / np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2)
-    tilt = weight @ swing(b.q) / float(np.sum(weight))
-    return float(math.hypot(tilt[0], tilt[1]))
+    tilt = weight @ swing(b.q) / float(weight.sum())
+    return math.hypot(float(tilt[0]), float(tilt[1]))

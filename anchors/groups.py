@@ -15,7 +15,7 @@ import numpy as np
 from anchors.lie import Array
 from anchors.noise import NoiseModel, stated
 from anchors.pose import Quat, Vec3
-from anchors.robust import Merged, merge
+from anchors.robust import Merged, merge, middle
 
 Key = tuple[str, int]
 
@@ -56,7 +56,7 @@ class Group:
             return noise.split(np.mean(given, axis=0))
         heads = [s.p_head for s in self.sightings if s.p_head is not None]
         if heads:
-            return noise.seen_from(np.median(heads, axis=0), np.median(p, axis=0))
+            return noise.seen_from(middle(np.array(heads)), middle(p))
         quality = float(np.mean([min(max(s.quality, 0.05), 1.0) for s in self.sightings]))
         return noise.split(fallback / quality)
 

@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from anchors.pose import quat_from_rotvec
+
 Array = NDArray[np.float64]
 
 _SMALL: Final = 1e-7  # [rad] below it the series of sine and cosine are exact to double precision
@@ -19,6 +21,9 @@ _CONJUGATE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 
 def quat_multiply(a: Array, b: Array) -> Array:
     """Hamilton product of quaternions `(..., 4)`: the rotation `b` followed by `a`."""
+    if b.ndim == 1:  # many by one: a product with a matrix is one call
+        w, x, y, z = b.tolist()
+        return np.asarray(a @ np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]))
     aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
     return np.stack(
@@ -39,6 +44,8 @@ def quat_conjugate(q: Array) -> Array:
 
 def quat_exp(r: Array) -> Array:
     """Rotation vectors `(..., 3)` to unit quaternions `(..., 4)`, smooth at zero."""
+    if r.ndim == 1:  # one alone: plain floats are faster
+        return np.array(quat_from_rotvec((float(r[0]), float(r[1]), float(r[2]))))
     angle = np.linalg.norm(r, axis=-1, keepdims=True)
     safe = np.maximum(angle, _SMALL)
     scale = np.where(angle < _SMALL, 0.5, np.sin(0.5 * safe) / safe)
@@ -57,12 +64,14 @@ def quat_log(q: Array) -> Array:
 
 def quat_matrix(q: Array) -> Array:
     """Rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    w, x, y, z = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
+    if q.ndim == 1:
+        return np.array(rows)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply
-from anchors.uncertainty import Z99, chi2_quantile
+from anchors.uncertainty import Z999, chi2_quantile
 
 _CHI2_3_MEDIAN: Final = 2.366
 _CHI2_3_999: Final = 16.266
@@ -41,48 +40,51 @@ def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -
     less than the share `min_agreeing` of them agree.
     """
     count = len(p)
-    centre = np.where((q @ q[0])[:, None] < 0.0, -q, q)
-    centre_q = np.median(centre, axis=0)
-    norm = math.sqrt(float(centre_q @ centre_q))
+    centre = middle(np.where((q @ q[0])[:, None] < 0.0, -q, q))
+    norm = math.sqrt(float(centre @ centre))
     if norm < 0.1:
         return None  # orientations all over the sphere
-    centre_q = centre_q / norm
-    turns = quat_log(quat_multiply(q, quat_conjugate(centre_q)))
-    keep = _within(p, each[:3, :3]) & _within(turns, each[3:, 3:])
+    centre = centre / norm
+    x = np.empty((2, count, 3))  # positions, and turns from the median
+    x[0], x[1] = p, quat_log(quat_multiply(q, quat_conjugate(centre)))
+    information = np.linalg.inv(np.array([each[:3, :3], each[3:, 3:]]))
+    d2 = _distance2(x - middle(x)[:, None, :], information)
+    scatter = np.clip(middle(d2.T) / _CHI2_3_MEDIAN, 1.0, _MAX_SCATTER)
+    keep = np.all(d2 <= _CHI2_3_999 * scatter[:, None], axis=0)
     n = int(np.count_nonzero(keep))
     if n == 0 or n < min_agreeing * count:
         return None
-    p_kept, turns_kept = p[keep], turns[keep]
-    p_mean, turn_mean = p_kept.mean(axis=0), turns_kept.mean(axis=0)
+    x = x[:, keep]
+    mean = np.add.reduce(x, axis=1) / n
+    wider = _excess(np.add.reduce(_distance2(x - mean[:, None, :], information), axis=1).tolist(), n)
     covariance = common + each / n
-    wider = np.ones(6)
-    wider[:3] = math.sqrt(_excess(p_kept - p_mean, each[:3, :3]))
-    wider[3:] = math.sqrt(_excess(turns_kept - turn_mean, each[3:, 3:]))
-    covariance = covariance * wider[:, None] * wider
-    return Merged(p_mean, quat_multiply(quat_exp(turn_mean), centre_q), covariance, n, count)
+    if wider is not None:
+        covariance = covariance * wider[:, None] * wider
+    return Merged(mean[0], quat_multiply(quat_exp(mean[1]), centre), covariance, n, count)
 
 
-def _within(x: Array, cov: Array) -> NDArray[np.bool_]:
-    """Which of `x` (n, 3) lie within the 99.9 % ellipsoid of their scatter, at least that of `cov`, about the
-    median."""
-    d2 = _distance2(x - np.median(x, axis=0), cov)
-    scatter = min(max(1.0, float(np.median(d2)) / _CHI2_3_MEDIAN), _MAX_SCATTER)
-    return np.asarray(d2 <= _CHI2_3_999 * scatter)
+def middle(x: Array) -> Array:
+    """Median over the last but one axis (numpy's own costs more than everything else here)."""
+    n = x.shape[-2]
+    x = np.sort(x, axis=-2)
+    return np.asarray(0.5 * (x[..., (n - 1) // 2, :] + x[..., n // 2, :]))
 
 
-def _excess(residuals: Array, cov: Array) -> float:
-    """By what factor the variance is larger than stated; 1 unless chi-square says so at 99 %: never narrower, that so
-    few residuals happen to be small proves nothing."""
-    freedom = 3.0 * (len(residuals) - 1)
+def _distance2(x: Array, information: Array) -> Array:
+    """Squared Mahalanobis distances (2, n) of rows (2, n, 3)."""
+    return np.asarray(np.add.reduce((x @ information) * x, axis=2))
+
+
+def _excess(chi2: list[float], n: int) -> Array | None:
+    """By what factors standard deviations are larger than stated, `None` unless chi-square says so at 99.9 %: never
+    narrower, that so few residuals happen to be small proves nothing."""
+    freedom = 3.0 * (n - 1)
     if freedom < 1.0:
-        return 1.0
-    chi2 = float(np.sum(_distance2(residuals, cov)))
-    return chi2 / freedom if chi2 > chi2_quantile(freedom, Z99) else 1.0
-
-
-def _distance2(x: Array, cov: Array) -> Array:
-    """Squared Mahalanobis distances of rows (n, 3)."""
-    return np.asarray(np.sum((x @ np.linalg.inv(cov)) * x, axis=1))
+        return None
+    bound = chi2_quantile(freedom, Z999)
+    if max(chi2) <= bound:
+        return None
+    return np.repeat([math.sqrt(c / freedom) if c > bound else 1.0 for c in chi2], 3)
 
 
 def circular_median(angles: Array) -> float:

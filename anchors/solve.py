@@ -17,14 +17,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, skew, swing
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, skew
 from anchors.pose import PoseTuple, quat_normalize
 from anchors.robust import Merged, circular_median
 
 _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
-_CONVERGED: Final = 1e-8  # [m], [rad]
+_STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
+_CONVERGED: Final = 1e-6  # [m], [rad]; the step after would be smaller by orders of magnitude
 Mask = NDArray[np.bool_]
 
 
@@ -81,16 +82,17 @@ def problem(
     p = np.array([m.p for m in merged])
     q = quat_multiply(np.array([m.q for m in merged]), quat_conjugate(q_world))
     covariance = np.array([m.covariance for m in merged])
-    walked = prior.walk_m_per_sqrt_s**2 * np.abs(age_s)
+    walked = prior.walk_m_per_sqrt_s**2 * np.maximum(np.abs(age_s) - _STEADY_S, 0.0)
     covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
     whitening = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
     return Problem(tuple(anchor), p_world, p, q, covariance, whitening, age_s)
 
 
-def solve(b: Problem, prior: Prior) -> Solution:
-    """Robust solution; `inside` is all false where two groups are all there is and they disagree."""
+def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> Solution:
+    """Robust solution; `inside` is all false where two groups are all there is and they disagree. `near`: rotation and
+    translation of an earlier solution, to begin with."""
     everyone = np.ones(b.size, dtype=bool)
-    solution = _fit(b, everyone, _start(b, prior), prior)
+    solution = _fit(b, everyone, near or _start(b, prior), prior)
     if bool(np.all(solution.distance2 <= _CHI2_6_999)) and (b.size != 2 or solution.chi2 <= _CHI2_6_999):
         return solution
     if b.size == 1:
@@ -136,38 +138,53 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
     J = np.zeros((b.size, 6, 9))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = J[:, 3, 3] = J[:, 4, 4] = J[:, 5, 5] = 1.0
     J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
-    weights = inside.astype(np.float64)[:, None]
+    some = not bool(inside.all())
+    weights = inside.astype(np.float64)
     tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
     diagonal = np.zeros(9)
     diagonal[3:5] = tilt_information
     diagonal[6:] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
-    H = np.eye(9)
     for _ in range(_ITERATIONS):
         r, turned = _residuals(b, q, t, drift)
-        J[:, :3, 3:6] = -skew(turned)
-        A = (b.whitening @ J * weights[:, :, None]).reshape(-1, 9)
-        g = A.T @ ((b.whitening @ r[:, :, None])[:, :, 0] * weights).ravel()
+        J[:, 0, 4], J[:, 0, 5] = turned[:, 2], -turned[:, 1]  # minus the cross-product matrix of the turned anchor
+        J[:, 1, 3], J[:, 1, 5] = -turned[:, 2], turned[:, 0]
+        J[:, 2, 3], J[:, 2, 4] = turned[:, 1], -turned[:, 0]
+        whitened_J = b.whitening @ J
+        whitened = (b.whitening @ r[:, :, None])[:, :, 0]
+        A = (whitened_J * weights[:, None, None] if some else whitened_J).reshape(-1, 9)
+        g = A.T @ whitened.ravel()
         H = A.T @ A
-        H[range(9), range(9)] += diagonal
+        H.flat[::10] += diagonal
         if prior.gravity:
-            g[3:5] -= tilt_information * swing(q)
+            g[3:5] -= tilt_information * _tilt(q)
         g[6:] -= diagonal[6:] * drift
-        step = np.linalg.solve(H, g)
+        step = np.asarray(np.linalg.solve(H, g), dtype=np.float64)
         t, drift = t + step[:3], drift + step[6:]
-        q = quat_multiply(quat_exp(np.asarray(step[3:6], dtype=np.float64)), q)
-        if float(np.max(np.abs(step[:6]))) < _CONVERGED:
+        q = quat_multiply(quat_exp(step[3:6]), q)
+        if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
-    r, _ = _residuals(b, q, t, drift)
-    whitened = (b.whitening @ r[:, :, None])[:, :, 0]
-    distance2 = np.sum(whitened * whitened, axis=1)
+    whitened = whitened - whitened_J @ step  # the last step was small: its linear effect is all there is
+    distance2 = np.add.reduce(whitened * whitened, axis=1)
     chi2 = float(np.sum(distance2[inside])) + float(drift @ (diagonal[6:] * drift))
     freedom = 6.0 * float(np.count_nonzero(inside)) - 6.0
     if prior.gravity:
-        chi2 += tilt_information * float(np.sum(swing(q) ** 2))
+        chi2 += tilt_information * float(np.sum(_tilt(q) ** 2))
         freedom += 2.0
     return Solution(
         t, q, np.asarray(np.linalg.inv(H)[:6, :6], dtype=np.float64), inside, chi2, freedom, drift, distance2
     )
+
+
+def _tilt(q: Array) -> Array:
+    """`swing` of one quaternion near the vertical or anywhere, in plain floats."""
+    w, x, y, z = q.tolist()
+    n = math.hypot(w, z)
+    if n < 1e-12:
+        return np.array([math.pi, 0.0])
+    sx, sy = (x * w - y * z) / n, (y * w + x * z) / n
+    s = math.hypot(sx, sy)
+    scale = 2.0 if s < 1e-12 else 2.0 * math.atan2(s, n) / s
+    return np.array([scale * sx, scale * sy])
 
 
 def _residuals(b: Problem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:

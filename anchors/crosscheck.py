@@ -1,0 +1,178 @@
+"""Measured error between headsets: two that see the same sheet, or the same controller, should put it in the same
+place.
+
+Every stated error rests on a noise model; this does not. Sheets stand still, so the medians of what either saw within
+`max_age_ns` are compared; what moves is compared at the same instants. Pure: times are passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from anchors.alignment import AlignmentEstimate
+from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
+from anchors.noise import NoiseModel
+from anchors.pose import PoseTuple, Vec3, compose
+from anchors.uncertainty import length_p95
+
+
+class Disagreement(NamedTuple):
+    """Where headset `a` and headset `b` put the same thing: distance between the two [m], angle [rad], and the distance
+    that 95 % of pairs stay below by their stated errors and the noise of these looks. `p_world`: midway."""
+
+    a: str
+    b: str
+    thing: str
+    error_m: float
+    error_rad: float
+    expected_p95_m: float
+    p_world: Vec3
+    n: int
+
+    @property
+    def as_expected(self) -> bool:
+        """Twice the p95 is beyond chance (about one pair in 10^4 for errors along one axis, fewer for others)."""
+        return self.error_m <= 2.0 * self.expected_p95_m
+
+
+@dataclass(frozen=True)
+class CrossCheckConfig:
+    """`max_age_ns`: how long ago a headset may have looked. `max_gap_ns`: between two readings of a moving thing that
+    are interpolated. `max_seen`: per headset and thing, the oldest go first."""
+
+    max_age_ns: int = 60 * 1_000_000_000
+    max_gap_ns: int = 50_000_000
+    min_seen: int = 5
+    max_seen: int = 100
+    max_things: int = 64
+
+
+class _Look(NamedTuple):
+    capture_ns: int
+    pose: PoseTuple  # T_tracking_thing
+    p_head: Vec3
+    viewpoint_id: int
+
+
+@dataclass
+class CrossCheck:
+    """Keeps what each headset saw of each thing. Alignments are passed in when asked, so one that improved counts."""
+
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
+    dropped: int = 0
+    _looks: dict[tuple[str, str], deque[_Look]] = field(default_factory=dict)
+    _epochs: dict[str, int] = field(default_factory=dict)
+
+    def see(
+        self,
+        headset: str,
+        thing: str,
+        T_tracking_thing: PoseTuple,
+        p_tracking_head: Vec3,
+        capture_ns: int,
+        tracking_epoch: int,
+        viewpoint_id: int = 0,
+    ) -> None:
+        """One detection of a sheet, or one tracked pose of a controller, on the session's clock."""
+        if tracking_epoch != self._epochs.setdefault(headset, tracking_epoch):
+            self.forget(headset)
+            self._epochs[headset] = tracking_epoch
+        key = (headset, thing)
+        finite = all(map(math.isfinite, (*T_tracking_thing[0], *T_tracking_thing[1], *p_tracking_head)))
+        if not finite or (key not in self._looks and len(self._looks) >= self.config.max_things):
+            self.dropped += 1
+            return
+        looks = self._looks.setdefault(key, deque(maxlen=self.config.max_seen))
+        if looks and capture_ns <= looks[-1].capture_ns:
+            self.dropped += 1  # out of order
+            return
+        looks.append(_Look(capture_ns, T_tracking_thing, p_tracking_head, viewpoint_id))
+
+    def forget(self, headset: str) -> None:
+        """It left, or its tracking frame is a new one."""
+        for key in [key for key in self._looks if key[0] == headset]:
+            del self._looks[key]
+        self._epochs.pop(headset, None)
+
+    def compare(
+        self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()
+    ) -> list[Disagreement]:
+        """All pairs of aligned headsets and all things that both saw. `moving`: things that do not stand still."""
+        out = []
+        headsets = sorted(h for h, e in alignments.items() if not e.refused and e.tracking_epoch == self._epochs.get(h))
+        for thing in sorted({thing for _, thing in self._looks}):
+            for a, b in combinations(headsets, 2):
+                looks_a, looks_b = self._fresh(a, thing, now_ns), self._fresh(b, thing, now_ns)
+                ways = self._together if thing in moving else self._apart
+                pairs = ways(looks_a, looks_b)
+                if pairs is not None:
+                    out.append(self._one((a, b, thing), (alignments[a], alignments[b]), (looks_a, looks_b), pairs))
+        return out
+
+    def _fresh(self, headset: str, thing: str, now_ns: int) -> list[_Look]:
+        looks = self._looks.get((headset, thing), ())
+        return [k for k in looks if 0 <= now_ns - k.capture_ns <= self.config.max_age_ns]
+
+    def _apart(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
+        """A thing at rest: every look of the one with the same number of the other; medians are taken later."""
+        n = min(len(a), len(b))
+        return [(x.pose, y.pose) for x, y in zip(a[-n:], b[-n:], strict=True)] if n >= self.config.min_seen else None
+
+    def _together(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
+        """A thing that moves: looks of `a`, and those of `b` interpolated to the same instants."""
+        times = [k.capture_ns for k in b]
+        pairs = []
+        for look in a:
+            i = bisect_left(times, look.capture_ns)
+            if i < len(b) and times[i] == look.capture_ns:
+                pairs.append((look.pose, b[i].pose))
+            elif 0 < i < len(b) and times[i] - times[i - 1] <= self.config.max_gap_ns:
+                share = (look.capture_ns - times[i - 1]) / (times[i] - times[i - 1])
+                (p0, q0), (p1, q1) = b[i - 1].pose, b[i].pose
+                p = (
+                    p0[0] + share * (p1[0] - p0[0]),
+                    p0[1] + share * (p1[1] - p0[1]),
+                    p0[2] + share * (p1[2] - p0[2]),
+                )
+                pairs.append((look.pose, (p, q0 if share < 0.5 else q1)))
+        return pairs if len(pairs) >= self.config.min_seen else None
+
+    def _one(
+        self,
+        names: tuple[str, str, str],
+        estimates: tuple[AlignmentEstimate, AlignmentEstimate],
+        looks: tuple[list[_Look], list[_Look]],
+        pairs: list[tuple[PoseTuple, PoseTuple]],
+    ) -> Disagreement:
+        placed = [
+            (compose(estimates[0].T_world_tracking, x), compose(estimates[1].T_world_tracking, y)) for x, y in pairs
+        ]
+        between = np.median([np.subtract(x[0], y[0]) for x, y in placed], axis=0)
+        middle = np.median([np.add(x[0], y[0]) for x, y in placed], axis=0) / 2.0
+        at: Vec3 = (float(middle[0]), float(middle[1]), float(middle[2]))
+        S = estimates[0].covariance_at(at) + estimates[1].covariance_at(at)
+        for estimate, seen in zip(estimates, looks, strict=True):
+            S = S + self._look_noise(estimate, seen)
+        turns = quat_log(
+            quat_multiply(np.array([x[1] for x, _ in placed]), quat_conjugate(np.array([y[1] for _, y in placed])))
+        )
+        turn = float(np.linalg.norm(np.median(turns, axis=0)))
+        return Disagreement(*names, float(np.linalg.norm(between)), turn, length_p95(S), at, len(pairs))
+
+    def _look_noise(self, estimate: AlignmentEstimate, looks: list[_Look]) -> Array:
+        """Covariance of where these looks put the thing, seen in the world: what viewpoints share counts once each."""
+        viewpoints = len({k.viewpoint_id for k in looks})
+        head, p = np.median([k.p_head for k in looks], axis=0), np.median([k.pose[0] for k in looks], axis=0)
+        common, each = self.noise.seen_from(head, p)
+        C = common[:3, :3] / viewpoints + each[:3, :3] * (math.pi / 2.0 / len(looks))
+        R = quat_matrix(np.array(estimate.T_world_tracking[1]))
+        return np.asarray(R @ C @ R.T)

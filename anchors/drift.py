@@ -1,0 +1,241 @@
+"""Watches an alignment in force: alarms when an anchor is suddenly seen elsewhere, and lets corrections in smoothly.
+
+A change is found in two ways. (1) Against what was seen just before: the same anchor, the last second against the ten
+before it; what is common to a viewpoint cancels, so small changes show. (2) Against the alignment in force, also after
+the anchor was out of sight; here all uncertainties count. A jump (the tracking frame moved at once) needs no
+statistics: a new `tracking_epoch`, a head faster than people are, or three detections in a row that agree with each
+other far away. Pure: times are passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from anchors.alignment import AlignmentEstimate
+from anchors.lie import Array, quat_matrix
+from anchors.noise import NoiseModel
+from anchors.pose import PoseTuple, Vec3, apply, distance, quat_angle
+
+AlarmKind = Literal["changed", "differs", "jump", "epoch"]
+
+_CHI2_3_ONE_IN_A_MILLION: Final = 30.66
+_MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaussian noise
+
+
+class Alarm(NamedTuple):
+    """What was seen: `changed` and `differs` ask for a new look, `jump` and `epoch` invalidate the alignment at once.
+
+    `size_m`: by how much; `beside`: other anchors that did not change in that time (then this one was moved)."""
+
+    kind: AlarmKind
+    anchor_id: str
+    size_m: float
+    capture_ns: int
+    beside: tuple[str, ...] = ()
+
+    @property
+    def invalidates(self) -> bool:
+        return self.kind in ("jump", "epoch")
+
+
+@dataclass(frozen=True)
+class DriftConfig:
+    """`window_ns`: what counts as now; `reference_ns`: what counts as before, summed up anew every
+    `reference_every_ns`. `min_change_m`: less is left to smooth
+    updates. `jump_m`: detections that far away, three in a row, are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`:
+    no head is faster. `quiet_ns`: an anchor that raised an alarm raises no other for so long."""
+
+    window_ns: int = 1_000_000_000
+    reference_ns: int = 10_000_000_000
+    reference_every_ns: int = 500_000_000
+    min_in_window: int = 8
+    min_change_m: float = 0.005
+    min_difference_m: float = 0.010
+    jump_m: float = 0.05
+    jump_in_a_row: int = 3
+    max_speed_m_per_s: float = 6.0
+    max_turn_rad_per_s: float = 20.0
+    quiet_ns: int = 2_000_000_000
+    max_seen: int = 600
+
+
+class _Seen(NamedTuple):
+    capture_ns: int
+    p: Vec3
+    p_head: Vec3
+    viewpoint_id: int
+
+
+class _Window(NamedTuple):
+    """Median position of some observations of one viewpoint, its own covariance, and that of what they share."""
+
+    p: Array
+    own: Array
+    common: Array
+    viewpoint_id: int
+
+
+@dataclass
+class DriftMonitor:
+    """Watches one headset. `anchors`: `T_world_anchor`. Feed every detection and, as often as known, the head pose."""
+
+    anchors: Mapping[str, PoseTuple]
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    config: DriftConfig = field(default_factory=DriftConfig)
+    tracking_epoch: int = 0
+    _seen: dict[str, deque[_Seen]] = field(default_factory=dict)
+    _quiet_until_ns: dict[str, int] = field(default_factory=dict)
+    _references: dict[str, tuple[int, int, _Window | None]] = field(default_factory=dict)
+    _steady_ns: dict[str, int] = field(default_factory=dict)
+    _head: tuple[int, PoseTuple] | None = None
+
+    def head(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
+        """A head pose as tracked: a new epoch or an impossible speed is a jump."""
+        alarm = self._epoch(capture_ns, tracking_epoch)
+        last, self._head = self._head, (capture_ns, T_tracking_head)
+        if alarm is not None or last is None or not 0 < capture_ns - last[0] <= 500_000_000:
+            return alarm
+        seconds = (capture_ns - last[0]) * 1e-9
+        moved, turned = distance(last[1][0], T_tracking_head[0]), quat_angle(last[1][1], T_tracking_head[1])
+        c = self.config
+        if moved > c.jump_m + c.max_speed_m_per_s * seconds or turned > 0.2 + c.max_turn_rad_per_s * seconds:
+            self._forget()
+            return Alarm("jump", "", moved, capture_ns)
+        return None
+
+    def observe(
+        self,
+        anchor_id: str,
+        p_tracking_anchor: Vec3,
+        p_tracking_head: Vec3,
+        capture_ns: int,
+        tracking_epoch: int,
+        viewpoint_id: int = 0,
+        alignment: AlignmentEstimate | None = None,
+    ) -> Alarm | None:
+        """One detection, and the alignment in force (`None`: none). Says at most one thing at a time."""
+        if not all(map(math.isfinite, (*p_tracking_anchor, *p_tracking_head))):
+            return None
+        alarm = self._epoch(capture_ns, tracking_epoch)
+        if alarm is not None or tracking_epoch < self.tracking_epoch or anchor_id not in self.anchors:
+            return alarm
+        seen = self._seen.setdefault(anchor_id, deque(maxlen=self.config.max_seen))
+        while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.window_ns + self.config.reference_ns:
+            seen.popleft()
+        seen.append(_Seen(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
+        if capture_ns < self._quiet_until_ns.get(anchor_id, capture_ns):
+            return None
+        return self._judge(anchor_id, capture_ns, alignment)
+
+    def _judge(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
+        seen = self._seen[anchor_id]
+        new = [
+            s for s in seen if now_ns - s.capture_ns < self.config.window_ns and s.viewpoint_id == seen[-1].viewpoint_id
+        ]
+        reference = self._before(anchor_id, now_ns, new[-1].viewpoint_id)
+        if reference is not None:
+            jumped = self._jump(new, reference)
+            if jumped:
+                self._forget()
+                return Alarm("jump", anchor_id, jumped, now_ns)
+        if len(new) < self.config.min_in_window:
+            return None
+        now = self._window(new, new[-1].viewpoint_id)
+        assert now is not None
+        change = self._change(now, reference)
+        if change is None:
+            change = self._difference(anchor_id, now, alignment)
+        if change is None:
+            self._steady_ns[anchor_id] = now_ns
+            return None
+        self._quiet_until_ns[anchor_id] = now_ns + self.config.quiet_ns
+        self._references.pop(anchor_id, None)
+        seen.clear()  # from here on the new place is what was seen before
+        beside = tuple(
+            other
+            for other in sorted(self._steady_ns)
+            if other != anchor_id and now_ns - self._steady_ns[other] < self.config.window_ns
+        )
+        return Alarm(change[0], anchor_id, change[1], now_ns, beside)
+
+    def _before(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
+        kept = self._references.get(anchor_id)
+        if kept is not None and now_ns < kept[0] and kept[1] == viewpoint_id:
+            return kept[2]
+        old = [s for s in self._seen[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
+        reference = self._window(old, viewpoint_id)
+        self._references[anchor_id] = (now_ns + self.config.reference_every_ns, viewpoint_id, reference)
+        return reference
+
+    def _window(self, seen: list[_Seen], viewpoint_id: int) -> _Window | None:
+        """Those of the wanted viewpoint, else of the one that has most; `None` when there are too few of either."""
+        counts: dict[int, int] = {}
+        for s in seen:
+            counts[s.viewpoint_id] = counts.get(s.viewpoint_id, 0) + 1
+        if counts.get(viewpoint_id, 0) < self.config.min_in_window:
+            viewpoint_id = max(counts, key=lambda v: (counts[v], v), default=viewpoint_id)
+        rows = [s for s in seen if s.viewpoint_id == viewpoint_id]
+        if len(rows) < self.config.min_in_window:
+            return None
+        p = np.median([s.p for s in rows], axis=0)
+        common, each = self.noise.seen_from(np.array(rows[len(rows) // 2].p_head), p)
+        return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], viewpoint_id)
+
+    def _change(self, now: _Window, before: _Window | None) -> tuple[AlarmKind, float] | None:
+        if before is None:
+            return None
+        C = now.own + before.own
+        if now.viewpoint_id != before.viewpoint_id:
+            C = C + now.common + before.common
+        size = _significant(now.p - before.p, C, self.config.min_change_m)
+        return ("changed", size) if size else None
+
+    def _difference(
+        self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None
+    ) -> tuple[AlarmKind, float] | None:
+        if alignment is None or alignment.refused or alignment.tracking_epoch != self.tracking_epoch:
+            return None
+        p_world = self.anchors[anchor_id][0]
+        placed = apply(alignment.T_world_tracking, (float(now.p[0]), float(now.p[1]), float(now.p[2])))
+        R = quat_matrix(np.array(alignment.T_world_tracking[1]))
+        C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
+        size = _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
+        return ("differs", size) if size else None
+
+    def _jump(self, new: list[_Seen], reference: _Window) -> float:
+        """The last few detections, far from the reference and near to each other: one alone is a wrong detection."""
+        last = new[-self.config.jump_in_a_row :]
+        if len(last) < self.config.jump_in_a_row:
+            return 0.0
+        away = np.array([s.p for s in last]) - reference.p
+        sizes = np.linalg.norm(away, axis=1)
+        together = float(np.max(np.linalg.norm(away - away.mean(axis=0), axis=1)))
+        if float(np.min(sizes)) > self.config.jump_m and together < 0.5 * self.config.jump_m:
+            return float(np.median(sizes))
+        return 0.0
+
+    def _epoch(self, capture_ns: int, tracking_epoch: int) -> Alarm | None:
+        if tracking_epoch <= self.tracking_epoch:
+            return None
+        self.tracking_epoch = tracking_epoch
+        self._forget()
+        return Alarm("epoch", "", math.inf, capture_ns)
+
+    def _forget(self) -> None:
+        self._seen.clear()
+        self._references.clear()
+        self._quiet_until_ns.clear()
+        self._steady_ns.clear()
+        self._head = None
+
+
+def _significant(d: Array, C: Array, least_m: float) -> float:
+    """Length of `d` [m] when it is at least so long and chance explains it once in a million; else 0."""
+    size = float(np.linalg.norm(d))
+    return size if size >= least_m and float(d @ np.linalg.solve(C, d)) > _CHI2_3_ONE_IN_A_MILLION else 0.0

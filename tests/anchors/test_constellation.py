@@ -1,0 +1,173 @@
+"""Sheets solved together: exact without noise, robust, saved and read back, and those that were moved are named."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.constellation import (
+    Constellation,
+    ConstellationError,
+    Seen,
+    find_moved,
+    solve_constellation,
+)
+from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rotvec, quat_from_yaw, quat_mul
+from tests.anchors.worlds import Look, around, headset, shifted
+
+ROOM: dict[str, PoseTuple] = {
+    "door": ((0.0, 0.0, 0.8), quat_from_yaw(0.2)),
+    "left": ((1.5, 0.1, 0.8), quat_from_yaw(2.9)),
+    "right": ((0.7, 1.3, 0.75), quat_from_yaw(-1.4)),
+    "wall": ((2.2, 1.0, 1.3), quat_mul(quat_from_yaw(1.0), quat_from_rotvec((1.4, 0.0, 0.0)))),
+}
+
+
+def _looks(
+    room: dict[str, PoseTuple], plan: dict[str, str], seed: int = 0, noise: float = 1.0, repeat: int = 10
+) -> list[Seen]:
+    """Headset -> initials of the sheets it looks at, one viewpoint each."""
+    rng = np.random.default_rng(seed)
+    by_initial = {name[0]: name for name in room}
+    out = []
+    for who, initials in plan.items():
+        T = headset(rng, 0.2 * noise)
+        for viewpoint, initial in enumerate(initials):
+            name = by_initial[initial]
+            look = Look(rng, room[name], around(rng, room[name][0], rng.uniform(0.4, 0.9)), noise)
+            for _ in range(repeat):
+                out.append(Seen(who, 0, viewpoint, name, look.new(T), look.head(T)))
+    return out
+
+
+def test_exact_without_noise_from_several_headsets() -> None:
+    got = solve_constellation(_looks(ROOM, {"a": "dl", "b": "lr", "c": "rwd"}, noise=0.0), "door", ROOM["door"])
+    for name, T in ROOM.items():
+        found = got.constellation.anchors[name]
+        assert distance(found[0], T[0]) < 1e-6
+        assert quat_angle(found[1], T[1]) < 1e-6
+    assert got.rejected == ()
+    assert len(got.T_world_tracking) == 3
+
+
+def test_noisy_looks_give_what_the_stated_error_says() -> None:
+    inside, tried = 0, 0
+    for seed in range(12):
+        got = solve_constellation(_looks(ROOM, {"a": "dlrwdlrw", "b": "wrldwrld"}, seed), "door", ROOM["door"])
+        for name in ("left", "right", "wall"):
+            off = distance(got.constellation.anchors[name][0], ROOM[name][0])
+            assert off < 0.03
+            inside += off <= got.constellation.error_m[name]
+            tried += 1
+    assert inside >= 0.85 * tried
+
+
+def test_a_look_that_fits_nowhere_is_named_and_left_out() -> None:
+    seen = _looks(ROOM, {"a": "dlrwdlrw", "b": "dlrwdlrw"}, 4)
+    wrong = [
+        Seen(
+            o.headset, 0, o.viewpoint_id, o.anchor_id, shifted(o.T_tracking_anchor, (0.2, 0.1, 0.0)), o.p_tracking_head
+        )
+        if (o.headset, o.viewpoint_id) == ("b", 2)
+        else o
+        for o in seen
+    ]
+    got = solve_constellation(wrong, "door", ROOM["door"])
+    assert got.rejected == (("b", 0, 2, "right"),)
+    assert max(got.residuals_m.values()) < 0.01
+    for name, T in ROOM.items():
+        assert distance(got.constellation.anchors[name][0], T[0]) < 0.02
+
+
+def test_sheets_that_no_headset_ties_together_are_named() -> None:
+    with pytest.raises(ConstellationError, match="not tied to 'door': right, wall"):
+        solve_constellation(_looks(ROOM, {"a": "dl", "b": "rw"}), "door")
+    with pytest.raises(ConstellationError, match="sheet 'roof' was not seen; seen: door, left"):
+        solve_constellation(_looks(ROOM, {"a": "dl"}), "roof")
+
+
+def test_many_sheets_and_headsets_are_solved_with_a_sparse_jacobian() -> None:
+    rng = np.random.default_rng(7)
+    room = {chr(97 + i): ((*rng.uniform(0.0, 5.0, 2).tolist(), 0.8), quat_from_yaw(float(i))) for i in range(12)}
+    plan = {f"h{k}": "abcdefghijkl"[k : k + 5] + "a" for k in range(8)}
+    got = solve_constellation(_looks(room, plan, noise=0.0, repeat=2), "a", room["a"])
+    assert max(distance(got.constellation.anchors[n][0], T[0]) for n, T in room.items()) < 1e-5
+
+
+def _saved(anchors: dict[str, PoseTuple]) -> Constellation:
+    return Constellation("door", anchors, dict.fromkeys(anchors, 0.002), {"door": 0.16})
+
+
+def test_saved_and_read_back_exactly() -> None:
+    saved = _saved(ROOM)
+    back = Constellation.from_toml(saved.to_toml())
+    assert back.reference == "door"
+    assert back.sizes == saved.sizes
+    assert back.error_m == saved.error_m
+    for name, (p, q) in ROOM.items():
+        assert back.anchors[name][0] == p
+        assert np.allclose(back.anchors[name][1], q, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("format = ", "not a TOML file"),
+        ("format = 2", "reads format = 1"),
+        ("format = 1", "reference"),
+        ('format = 1\nreference = "x"\n[anchors.y]\nposition_m = [0, 0, 0]', "one of their names"),
+        ('format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0]', "position_m must be a list of 3"),
+        (
+            'format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0, nan]\nquaternion_wxyz = [1, 0, 0, 0]',
+            "finite",
+        ),
+        (
+            'format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 1, 0, 0]',
+            "no unit quaternion",
+        ),
+        (
+            'format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]\n'
+            "size_m = -1",
+            "size_m must be a length",
+        ),
+    ],
+)
+def test_files_that_are_none_say_why(text: str, word: str) -> None:
+    with pytest.raises(ConstellationError, match=word):
+        Constellation.from_toml(text)
+
+
+def test_a_moved_sheet_is_found_and_named_also_when_it_is_the_reference() -> None:
+    saved = _saved(ROOM)
+    assert find_moved(saved, _saved(ROOM)) == ()
+    for name in ("left", "door"):
+        now = _saved({**ROOM, name: shifted(ROOM[name], (0.03, 0.0, 0.0))})
+        (moved,) = find_moved(saved, now)
+        assert moved.anchor_id == name
+        assert moved.distance_m == pytest.approx(0.03, abs=1e-6)
+    turned = {**ROOM, "wall": (ROOM["wall"][0], quat_mul(quat_from_yaw(math.radians(4.0)), ROOM["wall"][1]))}
+    assert [m.anchor_id for m in find_moved(saved, _saved(turned))] == ["wall"]
+
+
+def test_a_whole_constellation_may_be_seen_from_elsewhere() -> None:
+    T: PoseTuple = ((3.0, -1.0, 0.2), quat_from_yaw(1.0))
+    assert find_moved(_saved(ROOM), _saved({name: compose(T, pose) for name, pose in ROOM.items()})) == ()
+
+
+def test_of_two_sheets_nobody_can_say_which_one_moved() -> None:
+    two = {name: ROOM[name] for name in ("door", "left")}
+    now = {**two, "left": shifted(ROOM["left"], (0.1, 0.0, 0.0))}
+    with pytest.raises(ConstellationError, match="no majority"):
+        find_moved(_saved(two), _saved(now))
+    with pytest.raises(ConstellationError, match="2 are needed"):
+        find_moved(_saved(two), Constellation("wall", {"wall": ROOM["wall"]}, {}, {}))
+
+
+def test_a_moved_sheet_is_found_through_noise() -> None:
+    plan = {"a": "dlrwdlrw", "b": "wrldwrld"}
+    saved = solve_constellation(_looks(ROOM, plan, 11), "door", ROOM["door"]).constellation
+    moved = {**ROOM, "right": shifted(ROOM["right"], (0.0, 0.04, 0.0))}
+    now = solve_constellation(_looks(moved, plan, 12), "door", ROOM["door"]).constellation
+    assert [m.anchor_id for m in find_moved(saved, now)] == ["right"]

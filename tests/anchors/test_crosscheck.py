@@ -1,0 +1,107 @@
+"""Two headsets on one sheet or one controller: what they disagree by is measured, not stated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.crosscheck import CrossCheck, CrossCheckConfig
+from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
+from tests.anchors.worlds import Look, around, headset, shifted
+
+SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
+PERIOD = 100_000_000
+
+
+def _aligned(rng: np.random.Generator, T_world_tracking: PoseTuple) -> AlignmentEstimate:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    for viewpoint in range(3):
+        look = Look(rng, SHEET, around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
+        for _ in range(20):
+            pose, head = look.new(T_world_tracking), look.head(T_world_tracking)
+            estimator.add("sheet", pose, 0, 0, viewpoint, p_tracking_head=head)
+    return estimator.estimate()
+
+
+def _see(check: CrossCheck, name: str, look: Look, T: PoseTuple, n: int = 20, epoch: int = 0, start: int = 1) -> None:
+    for i in range(start, start + n):
+        check.see(name, "sheet", look.new(T), look.head(T), i * PERIOD, epoch)
+
+
+def test_headsets_that_agree_do_so_within_what_is_expected() -> None:
+    sizes, expected = [], []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        check, alignments = CrossCheck(), {}
+        for name in "ab":
+            T = headset(rng)
+            alignments[name] = _aligned(rng, T)
+            _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), T)
+        (got,) = check.compare(alignments, 30 * PERIOD)
+        assert (got.a, got.b, got.thing, got.n) == ("a", "b", "sheet", 20)
+        assert got.as_expected
+        assert got.error_rad < math.radians(3.0)
+        assert math.dist(got.p_world, SHEET[0]) < 0.01
+        sizes.append(got.error_m)
+        expected.append(got.expected_p95_m)
+    assert sum(s <= e for s, e in zip(sizes, expected, strict=True)) >= 21
+
+
+def test_a_headset_that_was_bumped_disagrees_by_as_much() -> None:
+    rng = np.random.default_rng(1)
+    check, alignments = CrossCheck(), {}
+    for name, bump in (("a", 0.0), ("b", 0.05)):
+        T = headset(rng)
+        alignments[name] = _aligned(rng, T)
+        _see(check, name, Look(rng, SHEET, around(rng, SHEET[0], 0.6)), shifted(T, (bump, 0.0, 0.0)))
+    (got,) = check.compare(alignments, 30 * PERIOD)
+    assert got.error_m == pytest.approx(0.05, abs=0.01)
+    assert not got.as_expected
+
+
+def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
+    rng = np.random.default_rng(2)
+    frames = {name: headset(rng) for name in "ab"}
+    alignments = {name: _aligned(rng, T) for name, T in frames.items()}
+    check = CrossCheck(CrossCheck().noise, CrossCheckConfig(max_gap_ns=30_000_000))
+    for i in range(200):
+        name = "ab"[i % 2]  # 72 Hz each, never at the same time; 1 m/s
+        at: PoseTuple = ((i * 0.00694, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+        pose = compose(inverse(frames[name]), at)
+        check.see(name, "controller", pose, (0.0, 0.0, 0.0), i * 6_940_000, 0)
+    (got,) = check.compare(alignments, 200 * 6_940_000, moving=frozenset({"controller"}))
+    assert got.error_m < 0.02
+    assert check.compare(alignments, 200 * 6_940_000 + 61 * 10**9, moving=frozenset({"controller"})) == []
+
+
+def test_a_recentred_refused_or_stale_headset_is_not_compared() -> None:
+    rng = np.random.default_rng(3)
+    T = headset(rng)
+    good = _aligned(rng, T)
+    check = CrossCheck()
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
+    _see(check, "a", look, T)
+    _see(check, "b", look, T)
+    refused = AlignmentEstimator({}).estimate()
+    assert len(check.compare({"a": good, "b": good}, 30 * PERIOD)) == 1
+    assert check.compare({"a": good, "b": refused}, 30 * PERIOD) == []
+    assert check.compare({"a": good, "b": good}, 700 * 10**9) == [], "too long ago"
+    _see(check, "b", look, T, epoch=1, start=40)
+    assert check.compare({"a": good, "b": good}, 60 * PERIOD) == [], "its alignment is of another tracking frame"
+    check.forget("a")
+    assert check.compare({"a": good}, 60 * PERIOD) == []
+
+
+def test_memory_is_bounded_and_what_is_of_no_use_is_counted() -> None:
+    check = CrossCheck(config=CrossCheckConfig(max_things=2, max_seen=10))
+    pose, zero = SHEET, (0.0, 0.0, 0.0)
+    for i in range(100):
+        check.see("a", f"thing{i}", pose, zero, i, 0)
+        check.see("a", "thing0", pose, zero, i, 0)
+    assert check.dropped == 98 + 1
+    check.see("a", "thing0", ((math.nan, 0.0, 0.0), pose[1]), zero, 1000, 0)
+    check.see("a", "thing0", pose, zero, 5, 0)
+    assert check.dropped == 98 + 1 + 2

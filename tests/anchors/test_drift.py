@@ -1,0 +1,156 @@
+"""The watch over an alignment in force: 10 mm within 2 s, jumps at once, and quiet when nothing happens."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.drift import Alarm, DriftConfig, DriftMonitor
+from anchors.pose import PoseTuple, Vec3, quat_from_rotvec, quat_from_yaw
+from tests.anchors.worlds import Look, around, headset, shifted
+
+SHEET: PoseTuple = ((0.2, -0.4, 0.75), quat_from_yaw(0.5))
+OTHER: PoseTuple = ((1.2, 0.4, 0.75), quat_from_yaw(-2.0))
+ANCHORS = {"sheet": SHEET, "other": OTHER}
+PERIOD = 100_000_000
+
+
+def _estimate(rng: np.random.Generator, T_world_tracking: PoseTuple) -> AlignmentEstimate:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    for viewpoint in range(3):
+        look = Look(rng, SHEET, around(rng, SHEET[0], rng.uniform(0.4, 1.0)))
+        for _ in range(20):
+            head = look.head(T_world_tracking)
+            estimator.add("sheet", look.new(T_world_tracking), 0, 0, viewpoint, p_tracking_head=head)
+    return estimator.estimate()
+
+
+def _watch(
+    monitor: DriftMonitor,
+    look: Look,
+    T_world_tracking: PoseTuple,
+    frames: range,
+    alignment: AlignmentEstimate | None = None,
+    wrong: np.random.Generator | None = None,
+    viewpoint: int = 0,
+) -> list[Alarm]:
+    """Detections at 10 Hz, one in twenty of them wrong where `wrong` is given; the alarms raised meanwhile."""
+    alarms = []
+    for i in frames:
+        p = look.new(T_world_tracking)[0]
+        if wrong is not None and wrong.random() < 0.05:
+            p = (p[0] + wrong.normal(0.0, 0.25), p[1] + wrong.normal(0.0, 0.25), p[2])
+        alarm = monitor.observe("sheet", p, look.head(T_world_tracking), i * PERIOD, 0, viewpoint, alignment)
+        if alarm is not None:
+            alarms.append(alarm)
+    return alarms
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_change_of_10_mm_seen_from_70_cm_is_told_within_2_s(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_world_tracking = headset(rng)
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.7))
+    monitor = DriftMonitor(ANCHORS)
+    assert _watch(monitor, look, T_world_tracking, range(40), wrong=rng) == []
+    way = rng.normal(size=3)
+    x, y, z = (0.010 * way / np.linalg.norm(way)).tolist()
+    alarms = _watch(monitor, look, shifted(T_world_tracking, (x, y, z)), range(40, 80), wrong=rng)
+    assert alarms[0].kind == "changed"
+    assert alarms[0].capture_ns <= (40 + 20) * PERIOD
+    assert alarms[0].size_m == pytest.approx(0.010, abs=0.005)
+    assert len(alarms) == 1, "it is told once"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_is_told_while_the_frame_drifts_slowly_and_the_head_moves_about(seed: int) -> None:
+    """One minute, 3 mm/min, a new viewpoint every 4 s, wrong detections."""
+    rng = np.random.default_rng(100 + seed)
+    T_world_tracking = headset(rng)
+    alignment = _estimate(rng, T_world_tracking)
+    monitor, alarms = DriftMonitor(ANCHORS), []
+    for viewpoint in range(15):
+        look = Look(rng, SHEET, around(rng, SHEET[0], rng.uniform(0.4, 1.2)))
+        now = shifted(T_world_tracking, (0.0002 * viewpoint, 0.0, 0.0))
+        frames = range(40 * viewpoint, 40 * viewpoint + 40)
+        alarms += _watch(monitor, look, now, frames, alignment, rng, viewpoint)
+    assert alarms == []
+
+
+def test_a_change_while_the_sheet_was_out_of_sight_is_told_from_the_alignment() -> None:
+    rng = np.random.default_rng(3)
+    T_world_tracking = headset(rng)
+    alignment = _estimate(rng, T_world_tracking)
+    monitor = DriftMonitor(ANCHORS)
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.5))
+    alarms = _watch(monitor, look, shifted(T_world_tracking, (0.03, 0.0, 0.0)), range(20), alignment)
+    assert [a.kind for a in alarms] == ["differs"]
+    assert alarms[0].size_m == pytest.approx(0.03, abs=0.01)
+    assert not alarms[0].invalidates
+
+
+def test_a_jump_invalidates_after_three_detections_and_one_wrong_detection_does_not() -> None:
+    rng = np.random.default_rng(4)
+    T_world_tracking = headset(rng)
+    look, monitor = Look(rng, SHEET, around(rng, SHEET[0], 0.7)), DriftMonitor(ANCHORS)
+    assert _watch(monitor, look, T_world_tracking, range(30)) == []
+    far = shifted(T_world_tracking, (0.0, 0.3, 0.0))
+    assert _watch(monitor, look, far, range(30, 32)) == []
+    assert _watch(monitor, look, T_world_tracking, range(32, 45)) == []
+    alarms = _watch(monitor, look, far, range(45, 48))
+    assert [a.kind for a in alarms] == ["jump"]
+    assert alarms[0].invalidates
+    assert alarms[0].size_m == pytest.approx(0.3, abs=0.02)
+
+
+def test_the_sheet_that_was_moved_is_told_from_the_others_that_stayed() -> None:
+    rng = np.random.default_rng(5)
+    T_world_tracking = headset(rng)
+    looks = {name: Look(rng, T, around(rng, T[0], 0.6)) for name, T in ANCHORS.items()}
+    monitor, alarms = DriftMonitor(ANCHORS), []
+    for i in range(60):
+        for name, look in looks.items():
+            place = shifted(SHEET, (0.02, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
+            p = look.new(T_world_tracking, place)[0]
+            alarm = monitor.observe(name, p, look.head(T_world_tracking), i * PERIOD, 0)
+            alarms += [alarm] if alarm is not None else []
+    assert [(a.anchor_id, a.beside) for a in alarms] == [("sheet", ("other",))]
+
+
+def test_a_new_tracking_epoch_is_a_jump_and_starts_anew() -> None:
+    monitor = DriftMonitor(ANCHORS)
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    alarm = monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 0, 1)
+    assert alarm is not None
+    assert (alarm.kind, alarm.invalidates) == ("epoch", True)
+    assert monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 1, 1) is None
+    assert monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 2, 0) is None, "what is older is of no use"
+    assert monitor.head((zero, (1.0, 0.0, 0.0, 0.0)), 3, 2) is not None
+
+
+def test_a_head_faster_than_people_is_a_jump() -> None:
+    monitor = DriftMonitor(ANCHORS)
+    pose: PoseTuple = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
+    turned: PoseTuple = (pose[0], quat_from_rotvec((0.0, 0.0, 1.0)))
+    assert monitor.head(pose, 0, 0) is None
+    assert monitor.head(shifted(pose, (0.03, 0.0, 0.0)), 14_000_000, 0) is None
+    alarm = monitor.head(shifted(pose, (0.5, 0.0, 0.0)), 28_000_000, 0)
+    assert alarm is not None
+    assert alarm.kind == "jump"
+    assert monitor.head(pose, 42_000_000, 0) is None, "after a jump a new count begins"
+    assert monitor.head(turned, 56_000_000, 0) is not None
+    assert monitor.head(pose, 2_000_000_000, 0) is None, "after a pause anything may have happened"
+
+
+def test_hostile_numbers_and_unknown_anchors_say_nothing_and_memory_is_bounded() -> None:
+    monitor = DriftMonitor(ANCHORS, config=DriftConfig(max_seen=50))
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    assert monitor.observe("sheet", (math.nan, 0.0, 0.0), zero, 0, 0) is None
+    assert monitor.observe("nobody", zero, zero, 0, 0) is None
+    for i in range(200):
+        monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5, 0)
+        monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5 - i, 0)
+    assert len(monitor._seen["sheet"]) <= 50

@@ -1,0 +1,257 @@
+"""The estimator with noise as docs/anchors.md has it: gravity, mirrored poses, several sheets, drift, snapshots."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from anchors.advice import error_advice
+from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, mirrored
+from anchors.lie import matrix_quat, quat_matrix
+from anchors.noise import NoiseModel, stated
+from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from tests.anchors.worlds import NOISE, Look, around, axis, headset, shifted
+
+SHEET: PoseTuple = ((0.1, -0.4, 0.72), quat_from_yaw(0.3))
+TRIANGLE: dict[str, PoseTuple] = {
+    "a": ((0.0, 0.0, 0.7), quat_from_yaw(0.1)),
+    "b": ((1.5, 0.0, 0.7), quat_from_yaw(2.0)),
+    "c": ((0.75, 1.3, 0.7), quat_from_yaw(-1.0)),
+}
+SECOND = 1_000_000_000
+
+
+def _look(
+    estimator: AlignmentEstimator,
+    rng: np.random.Generator,
+    T: PoseTuple,
+    name: str = "sheet",
+    viewpoint: int = 0,
+    at_s: float = 0.0,
+    place: PoseTuple | None = None,
+    n: int = 20,
+    noise: float = 1.0,
+) -> None:
+    """`n` observations from a new viewpoint; `place`: where the sheet really is."""
+    anchor = place or estimator.anchors[name]
+    look = Look(rng, anchor, around(rng, anchor[0], rng.uniform(0.4, 1.2)), noise)
+    for i in range(n):
+        ns = round((at_s + 0.1 * i) * SECOND)
+        estimator.add(name, look.new(T), ns, 0, viewpoint, p_tracking_head=look.head(T))
+
+
+def _off(got: AlignmentEstimate, T: PoseTuple, at: Vec3) -> float:
+    return distance(apply(got.T_world_tracking, apply(inverse(T), at)), at)
+
+
+def test_coverage_is_what_is_stated_at_the_sheet_and_2_m_away() -> None:
+    inside = {0.0: 0, 2.0: 0}
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        estimator, T = AlignmentEstimator({"sheet": SHEET}), headset(rng)
+        for viewpoint in range(3):
+            _look(estimator, rng, T, viewpoint=viewpoint, n=8)
+        got = estimator.estimate()
+        for far in inside:
+            at = (SHEET[0][0] + far, SHEET[0][1], SHEET[0][2])
+            inside[far] += _off(got, T, at) <= got.error_at(at)
+    assert all(0.87 <= n / 100 <= 0.99 for n in inside.values()), inside
+
+
+def test_sheets_far_apart_measure_the_tilt_one_alone_leaves_it_to_gravity() -> None:
+    """A tilt of 0.6 deg: three standard deviations of what gravity allows."""
+    tilted: PoseTuple = ((1.0, 0.5, 0.2), quat_from_rotvec((math.radians(0.6), 0.0, 0.0)))
+    left = {}
+    for names in ("a", "abc"):
+        rng = np.random.default_rng(2)
+        estimator = AlignmentEstimator({name: TRIANGLE[name] for name in names})
+        for viewpoint in range(9):
+            _look(estimator, rng, tilted, names[viewpoint % len(names)], viewpoint)
+        got = estimator.estimate()
+        up = axis(got.T_world_tracking[1], 2)
+        left[names] = math.degrees(math.acos(float(np.clip(up @ axis(tilted[1], 2), -1.0, 1.0))))
+        assert got.rotation_error_rad < math.radians(0.9)
+    assert left["abc"] < 0.15
+    assert left["abc"] < left["a"]
+
+
+def test_six_degrees_of_freedom_where_asked() -> None:
+    tilted: PoseTuple = ((1.0, 0.5, 0.2), quat_from_rotvec((0.9, -0.7, 1.0)))
+    estimator = AlignmentEstimator(TRIANGLE, AlignmentConfig(dof=6))
+    rng = np.random.default_rng(0)
+    for viewpoint, name in enumerate("abc"):
+        _look(estimator, rng, tilted, name, viewpoint, noise=0.0)
+    got = estimator.estimate()
+    assert distance(got.T_world_tracking[0], tilted[0]) < 1e-6
+    assert quat_angle(got.T_world_tracking[1], tilted[1]) < 1e-6
+    with pytest.raises(ValueError, match=r"it is 4 .* or 6"):
+        AlignmentEstimator(TRIANGLE, AlignmentConfig(dof=5))
+
+
+def test_mirrored_is_the_other_pose_of_opencv() -> None:
+    """IPPE returns both poses of a flat sheet; they are each other's mirror image along the line of sight."""
+    half = 0.05
+    corners = np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+    K = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 360.0], [0.0, 0.0, 1.0]])
+    for tilt in (0.5, 0.8, 1.1):
+        true = (np.array([math.pi + tilt, 0.1, 0.2]), np.array([0.1, -0.05, 1.2]))
+        image, _ = cv2.projectPoints(corners, *true, K, None)
+        n, turns, places, _ = cv2.solvePnPGeneric(corners, image, K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+        assert n == 2
+        poses = []
+        for r, t in zip(turns, places, strict=True):
+            q = matrix_quat(cv2.Rodrigues(r)[0]).tolist()
+            p = t.ravel().tolist()
+            poses.append(((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3])))
+        other = mirrored(poses[0], (0.0, 0.0, 0.0))
+        # That the sheet is near and not infinitely far is worth a few degrees.
+        assert quat_angle(other[1], poses[1][1]) < math.radians(6.0)
+        assert quat_angle(poses[0][1], poses[1][1]) > math.radians(40.0)
+        assert quat_angle(mirrored(other, (0.0, 0.0, 0.0))[1], poses[0][1]) < 1e-6
+
+
+@pytest.mark.parametrize("tell", ["head", "alternative", "nothing"])
+def test_a_viewpoint_that_sees_the_sheet_mirrored_is_put_right(tell: str) -> None:
+    rng = np.random.default_rng(8)
+    T = headset(rng)
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
+    for i in range(20):
+        good, head = look.new(T), look.head(T)
+        seen = mirrored(good, head)
+        used = estimator.add(
+            "sheet",
+            seen,
+            i,
+            0,
+            p_tracking_head=head if tell == "head" else None,
+            alternative=good if tell == "alternative" else None,
+        )
+        assert used is (tell != "nothing")
+    got = estimator.estimate()
+    assert got.refused is (tell == "nothing")
+    if got.refused:
+        assert estimator.against_gravity == 20
+        assert "not mounted as configured" in got.advice
+    else:
+        assert estimator.unmirrored == 20
+        assert _off(got, T, SHEET[0]) < 0.01
+
+
+def test_of_three_sheets_the_moved_one_is_named_and_left_out_however_often_it_was_seen() -> None:
+    rng = np.random.default_rng(3)
+    T = headset(rng)
+    estimator = AlignmentEstimator(TRIANGLE)
+    for viewpoint, name in enumerate("bbbbbac"):
+        place = shifted(TRIANGLE["b"], (0.05, 0.03, 0.0)) if name == "b" else None
+        _look(estimator, rng, T, name, viewpoint, place=place)
+    got = estimator.estimate()
+    assert not got.refused
+    assert got.moved == ("b",)
+    assert "'b'" in got.advice
+    assert _off(got, T, TRIANGLE["a"][0]) < 0.02
+
+
+def test_of_two_sheets_that_disagree_both_are_named() -> None:
+    rng = np.random.default_rng(4)
+    T = headset(rng)
+    estimator = AlignmentEstimator(TRIANGLE)
+    _look(estimator, rng, T, "a", 0)
+    _look(estimator, rng, T, "b", 1, place=shifted(TRIANGLE["b"], (0.1, 0.0, 0.0)))
+    got = estimator.estimate()
+    assert got.refused
+    assert got.advice.endswith("one of these was moved: a, b")
+
+
+def test_a_steadily_drifting_frame_is_followed() -> None:
+    """3 mm/min for a minute: the estimate is for now, not for the middle of the time."""
+    errors = {}
+    for drift in (AlignmentConfig().drift_m_per_s, 1e-9):
+        far = []
+        for seed in range(10):
+            rng = np.random.default_rng(seed)
+            estimator = AlignmentEstimator(TRIANGLE, AlignmentConfig(drift_m_per_s=drift))
+            T = headset(rng)
+            for viewpoint in range(12):
+                now = shifted(T, (0.003 * 5.0 * viewpoint / 60.0, 0.0, 0.0))
+                _look(estimator, rng, now, "abc"[viewpoint % 3], viewpoint, 5.0 * viewpoint, n=6, noise=0.3)
+            far.append(_off(estimator.estimate(), now, (0.75, 0.4, 0.7)))
+        errors[drift] = float(np.median(far))
+    assert min(errors, key=errors.__getitem__) == AlignmentConfig().drift_m_per_s
+
+
+def test_a_snapshot_goes_on_exactly() -> None:
+    rng = np.random.default_rng(5)
+    T = headset(rng)
+    estimator = AlignmentEstimator(TRIANGLE, AlignmentConfig(max_observations=45))
+    for viewpoint in range(3):
+        _look(estimator, rng, T, "abc"[viewpoint], viewpoint, viewpoint * 5.0)
+    estimator.estimate()
+    twin = AlignmentEstimator(TRIANGLE, AlignmentConfig(max_observations=45))
+    twin.restore(estimator.snapshot())
+    assert twin.estimate() == estimator.estimate()
+    for one in (estimator, twin):
+        _look(one, np.random.default_rng(6), T, "b", 4, 20.0)
+        one.add("b", SHEET, 0, 0, covariance=(0.0,) * 36)
+    assert twin.estimate() == estimator.estimate()
+    assert twin.forgotten == estimator.forgotten > 0
+    assert twin.snapshot() == estimator.snapshot()
+
+
+def test_memory_is_bounded_in_viewpoints_too() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET}, AlignmentConfig(max_groups=4))
+    for i in range(50):
+        estimator.add("sheet", SHEET, i, 0, viewpoint_id=i)
+    assert estimator.estimate().n_viewpoints == 4
+    assert estimator.forgotten == 46
+
+
+def test_near_looks_count_for_more_than_far_ones() -> None:
+    rng = np.random.default_rng(9)
+    T = headset(rng)
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    for viewpoint, d in enumerate((0.4, 1.2)):
+        look = Look(rng, SHEET, around(rng, SHEET[0], d), noise=0.0)
+        wrong = shifted(SHEET, (0.004, 0.0, 0.0)) if d > 1.0 else None
+        for i in range(20):
+            estimator.add("sheet", look.new(T, wrong), i, 0, viewpoint, p_tracking_head=look.head(T))
+    assert _off(estimator.estimate(), T, SHEET[0]) < 0.0015
+
+
+def test_covariances_that_are_none_are_not_taken() -> None:
+    good = tuple(np.diag([1e-6] * 6).ravel().tolist())
+    assert stated(good) is not None
+    assert all(stated(bad) is None for bad in ((), good[:35], (*good[:35], math.nan), tuple(-x for x in good)))
+    lopsided = list(good)
+    lopsided[1] = 1.0
+    assert stated(lopsided) is None
+
+
+def test_noise_is_along_the_view_and_grows_with_distance() -> None:
+    common, each = NOISE.seen_from(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    assert math.sqrt(each[2, 2]) == pytest.approx(0.0048 * math.sqrt(0.5), rel=0.01)
+    assert math.sqrt(each[0, 0]) == pytest.approx(0.0016 * math.sqrt(0.5), rel=0.01)
+    assert math.sqrt(common[2, 2] - each[2, 2]) == pytest.approx(0.003, rel=0.01)
+    assert math.sqrt((common + each)[4, 4]) == pytest.approx(math.radians(0.6), rel=0.01)
+    near, _ = NoiseModel().seen_from(np.array([0.0, 0.0, 0.5]), np.zeros(3))
+    assert near[2, 2] < 0.3 * common[2, 2]
+    assert np.allclose(quat_matrix(np.array([1.0, 0.0, 0.0, 0.0])), np.eye(3))
+
+
+def test_advice_on_the_error_at_the_robot() -> None:
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    assert error_advice(0.01, 0.02, zero, (1.0, 0.0, 0.0), 3) == ""
+    assert "several sides" in error_advice(0.03, 0.02, zero, (1.0, 0.0, 0.0), 1)
+    assert "add a sheet near the robot" in error_advice(0.03, 0.02, zero, (2.0, 0.0, 0.0), 3)
+    assert "step closer" in error_advice(0.03, 0.02, zero, (0.2, 0.0, 0.0), 3)
+
+
+def test_what_is_no_pose_is_counted_and_not_used() -> None:
+    estimator = AlignmentEstimator({"sheet": SHEET})
+    assert not estimator.add("sheet", SHEET, 0, 0, p_tracking_head=(math.nan, 0.0, 0.0))
+    upside_down = compose(SHEET, ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)))
+    assert not estimator.add("sheet", upside_down, 0, 0, alternative=(SHEET[0], (9.0, 0.0, 0.0, 0.0)))
+    assert (estimator.invalid, estimator.against_gravity) == (1, 1)

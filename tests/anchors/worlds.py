@@ -1,0 +1,69 @@
+"""Headsets that look at sheets, for the tests of this room: the noise of docs/anchors.md, seeded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply
+from anchors.noise import NoiseModel
+from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
+
+NOISE = NoiseModel()
+
+
+@dataclass
+class Look:
+    """A place from which a sheet is seen; `common` is its constant error, `new()` one observation more."""
+
+    rng: np.random.Generator
+    T_world_anchor: PoseTuple
+    p_head_world: Vec3
+    noise: float = 1.0  # 0: exact
+
+    def __post_init__(self) -> None:
+        head, p = np.array(self.p_head_world), np.array(self.T_world_anchor[0])
+        self._common, self._each = NOISE.seen_from(head, p)
+        self.common = self._draw(self._common)
+
+    def new(self, T_world_tracking: PoseTuple, T_world_anchor: PoseTuple | None = None) -> PoseTuple:
+        """`T_tracking_anchor` as detected."""
+        error = self.common + self._draw(self._each)
+        p, q = T_world_anchor or self.T_world_anchor
+        turned = quat_multiply(quat_exp(error[3:]), np.array(q)).tolist()
+        seen: PoseTuple = (_vec3(np.array(p) + error[:3]), (turned[0], turned[1], turned[2], turned[3]))
+        return compose(inverse(T_world_tracking), seen)
+
+    def head(self, T_world_tracking: PoseTuple) -> Vec3:
+        return apply(inverse(T_world_tracking), self.p_head_world)
+
+    def _draw(self, C: Array) -> Array:
+        return self.noise * (np.linalg.cholesky(C) @ self.rng.normal(size=6))
+
+
+def around(rng: np.random.Generator, p: Vec3, d: float) -> Vec3:
+    """Somewhere around a place, `d` metres away, 40 to 80 degrees up."""
+    up, way = math.radians(rng.uniform(40.0, 80.0)), rng.uniform(-math.pi, math.pi)
+    return _vec3(np.array(p) + d * np.array([math.cos(up) * math.cos(way), math.cos(up) * math.sin(way), math.sin(up)]))
+
+
+def headset(rng: np.random.Generator, tilt_deg: float = 0.2) -> PoseTuple:
+    """`T_world_tracking` anywhere, nearly level."""
+    tilt = quat_exp(np.append(rng.normal(0.0, math.radians(tilt_deg), 2), 0.0))
+    q = quat_multiply(tilt, quat_exp(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))).tolist()
+    return _vec3(rng.uniform(-2.0, 2.0, 3)), (q[0], q[1], q[2], q[3])
+
+
+def shifted(T: PoseTuple, by: Vec3) -> PoseTuple:
+    (x, y, z), q = T
+    return (x + by[0], y + by[1], z + by[2]), q
+
+
+def axis(q: tuple[float, ...], i: int) -> Array:
+    return np.asarray(quat_matrix(np.array(q))[:, i])
+
+
+def _vec3(v: Array) -> Vec3:
+    return (float(v[0]), float(v[1]), float(v[2]))
