@@ -35,8 +35,8 @@ class Bar(msgspec.Struct, frozen=True):
 
 
 def bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
-    """The bar `results[key] op bound`."""
-    value = float(results[key])
+    """The bar `results[key] op bound`; a dotted key is that of an object within the results."""
+    value = float(flat(results)[key] if "." in key else results[key])
     return Bar(key, op, bound, value, bool(_OPERATORS[op](value, bound)))
 
 
@@ -61,26 +61,38 @@ class BenchReport(msgspec.Struct, frozen=True):
             "version": self.version,
             "machine": machine(),
             "params": self.params,
-            "results": {key: _finite(value) for key, value in self.results.items()},
+            "results": _finite(self.results),
             "reference": self.reference,
             "bars": [{**msgspec.to_builtins(b), "value": _finite(b.value)} for b in self.bars],
         }
 
     def lines(self) -> str:
         """The same for people."""
-        width = max(map(len, self.results))
+        nested = any("." in b.key for b in self.bars)
+        results = flat(self.results) if nested else self.results
+        width = max(map(len, results))
         rows = [f"{self.name}: {' '.join(f'{k}={v}' for k, v in self.params.items())}"]
-        bars = {b.key: b for b in self.bars}
-        for key, value in self.results.items():
-            note = ""
-            if key in bars:
-                b = bars[key]
-                note = f"   bar {b.op} {b.bound:g}  {'ok' if b.ok else 'MISSED'}"
+        for key, value in results.items():
+            held = [f"   bar {b.op} {b.bound:g}  {'ok' if b.ok else 'MISSED'}" for b in self.bars if b.key == key]
+            note = "".join(held)
             rows.append(f"  {key:<{width}}  {value}{note}")
         return "\n".join(rows)
 
 
+def flat(results: dict[str, Any]) -> dict[str, Any]:
+    """Objects within the results as dotted keys."""
+    out: dict[str, Any] = {}
+    for key, value in results.items():
+        if isinstance(value, dict):
+            out |= {f"{key}.{inner}": one for inner, one in value.items()}
+        else:
+            out[key] = value
+    return out
+
+
 def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

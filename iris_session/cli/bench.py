@@ -23,10 +23,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench state --curve --json\n"
         "  iris-session bench input --operators 4 --robots 4 --seconds 10\n"
         "  iris-session bench slow-client --check\n"
-        "  iris-session bench state --profile busy-wifi",
+        "  iris-session bench state --profile busy-wifi\n"
+        "  iris-session bench alignment --pairs 2000 --seed 1 --check",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input", "slow-client"))
+    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment"))
     parser.add_argument("--clients", type=int, default=16, help="state, slow-client: how many (default: %(default)s)")
     parser.add_argument(
         "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
@@ -34,6 +35,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--operators", type=int, default=8, help="input: people who drive (default: %(default)s)")
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
     parser.add_argument("--observers", type=int, default=8, help="input: people who look (default: %(default)s)")
+    parser.add_argument("--pairs", type=int, default=2000, help="alignment: pairs of headsets (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_seconds, help="measured part (default: 20; slow-client: 50)")
     parser.add_argument(
         "--profile",
@@ -81,6 +83,8 @@ def _check(arguments: argparse.Namespace) -> None:
     limits = {"clients": (1, 64), "bodies": (1, 2000)}
     if arguments.bench == "input":
         limits = {"robots": (1, 12), "operators": (1, arguments.robots), "observers": (0, 64)}
+    elif arguments.bench == "alignment":
+        limits = {"pairs": (10, 100_000)}
     for name, (low, high) in limits.items():
         if not low <= (value := getattr(arguments, name)) <= high:
             per = ", one robot each" if name == "operators" else ""
@@ -88,6 +92,10 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> BenchReport:
+    if arguments.bench == "alignment":
+        from iris_session.bench.alignment import run_alignment
+
+        return run_alignment(arguments.pairs, arguments.seed, progress)
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state

@@ -15,6 +15,7 @@ from iris_session.cli.main import main
         (["input", "--observers", "-1"], "takes 0 to"),
         (["state", "--clients", "0"], "--clients 0"),
         (["state", "--bodies", "0"], "--bodies 0"),
+        (["alignment", "--pairs", "3"], "--pairs 3: bench alignment takes 10 to 100000"),
         (["slow-client", "--clients", "2"], "slow-client needs"),
     ],
 )
