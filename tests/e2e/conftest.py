@@ -9,6 +9,7 @@ import contextlib
 import io
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,6 +31,8 @@ DEADLINE_S = 30.0
 COMMAND_S = 120.0
 DEMO_S = 300.0
 COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
+#: Before a command: it is told to end when the tests die, too (a killed run left servers that slowed down the next one).
+ENDS_WITH_US: Final = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 LONGEST: Final = (
     "test_demos_paper.py", "test_demo_link.py", "test_soak.py", "test_handover.py", "test_people.py",
@@ -119,7 +122,7 @@ class Server:
         self.recording = recording
         self._out = folder / "serve.out"
         with self._out.open("wb") as out:
-            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=folder)
+            self.process = subprocess.Popen([*ENDS_WITH_US, *command], stdout=out, stderr=subprocess.STDOUT, cwd=folder)
         wait(lambda: "recording to" in self.output or self.process.poll() is not None, "the session listens")
         match = re.search(r"on (\S+:\d+),", self.output)
         assert match, self.output
@@ -308,7 +311,9 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
         options = [x for headset in headsets for x in ("--headset", headset)]
         with (tmp_path / f"emulator{len(started)}.out").open("wb") as out:
             process = subprocess.Popen(
-                [*COMMAND, "emulate", address, *options, "--seconds", str(seconds)], stdout=out, stderr=out
+                [*ENDS_WITH_US, *COMMAND, "emulate", address, *options, "--seconds", str(seconds)],
+                stdout=out,
+                stderr=out,
             )
         started.append(process)
         return process
