@@ -35,7 +35,7 @@ def test_listed_keys_join_and_see_and_others_do_not(tmp_path: Path) -> None:
 
 def test_wrong_key_files_say_which_is_needed(tmp_path: Path) -> None:
     public, secret = create_certificates(tmp_path, "ann")
-    with pytest.raises(IdentityError, match="can be used by other users of this machine: chmod 600 .*ann.key_secret"):
+    with pytest.raises(IdentityError, match=r"can be used by other users of this machine: chmod 600 .*ann.key_secret"):
         CurveKeys.from_files(public, secret)
     Path(secret).chmod(0o600)
     assert CurveKeys.from_files(public, secret).public == CurveKeys.from_files(public, secret).server_public

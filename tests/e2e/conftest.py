@@ -31,7 +31,7 @@ DEADLINE_S = 30.0
 COMMAND_S = 120.0
 DEMO_S = 300.0
 COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
-#: Before a command: it is told to end when the tests die, too (a killed run left servers that slowed down the next one).
+#: Before a command: it is told to end when the tests die, too (servers of a killed run slowed down the next one).
 ENDS_WITH_US: Final = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 LONGEST: Final = (
