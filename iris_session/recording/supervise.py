@@ -114,8 +114,8 @@ class RecorderProcess:
             self._origin_ns,
             os.getpid(),
         )
-        # RERUN=off in a user's shell would silence the stream.
-        environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error"}
+        # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
+        environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}
         with open(self._log, "ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "iris_session.recording.process"],
