@@ -22,23 +22,30 @@ NOTHING: Final = len(CLASSES) - 1
 #: State that is so much older than it was at its best counts as late [ms], and half of that best beside it. A single
 #: large frame of media before it makes state tens of milliseconds older, which is no reason yet.
 RISE_MS: Final = 80.0
-#: More frames of state are missed than at best, by this share.
-RISE_MISSED: Final = 0.3
+#: More frames of state are missed than at best, by this share. Frames that come together behind a large one of media
+#: count as missed too, but for the newest.
+RISE_MISSED: Final = 0.6
 #: Reports among which the best is looked for: a minute.
 REMEMBERED: Final = 60
 #: Share of due frames that a connection did not take, in two measures in a row, that says that the link is full.
 BLOCKED: Final = 0.25
-#: After a change: what is under way still has to come through, and a report covers the second before it.
+#: After a change what is under way still has to come through.
 SETTLE_NS: Final = 500 * MILLISECOND
-REPORT_COVERS_NS: Final = 900 * MILLISECOND
+#: Reports do not count for so long after less was given: a queue on the way has to drain, beside the media that are
+#: left, and a report covers the second before it.
+DRAIN_NS: Final = 2600 * MILLISECOND
 SILENT_NS: Final = 3 * SECOND
 #: Share of what came through that is asked for after it was too much.
 LESS: Final = 0.7
-#: What was asked for may grow by this share before it counts as more than allowed.
-SLACK: Final = 1.15
+#: What was given may grow so much before it is more than was asked for (rates are measured, and vary), and how much
+#: more than its own limit a client gets at most.
+SLACK: Final = 1.5
+LIMIT_SLACK: Final = 1.15
 #: Distance of steps up. To what has failed it doubles each time, until that works.
 CLIMB_NS: Final = 3 * SECOND
 CLIMB_MAX_NS: Final = 48 * SECOND
+#: Rates are measured, and vary: what costs so much of what has failed is that again.
+SAME: Final = 0.8
 #: Trouble this soon after a step up is blamed on it; without any it has worked.
 PROBE_NS: Final = 3 * SECOND
 #: Without any media, trouble that stays so long has other causes: it is how this link is now.
@@ -118,7 +125,7 @@ class _Line:
         self.late = ""  # what the newest report says against us
         self.blocked = 0  # measures in a row
         self.sent = 1.0  # share of what was due that was taken lately
-        self.changed_ns = self.climbed_ns = self.troubled_ns = -SILENT_NS
+        self.changed_ns = self.lowered_ns = self.climbed_ns = self.troubled_ns = -SILENT_NS
         self.climb_ns = CLIMB_NS
         self.failed = math.inf  # what a step up cost that had to be taken back
         self.innocent_ns = -1  # since when there is trouble without any media
@@ -154,7 +161,7 @@ class BudgetController:
             line.innocent_ns = -1
             self._climb(line, rates, limit, now_ns)
         allowed = min(line.budget, limit)
-        if cost(rates, line.levels) > SLACK * allowed:
+        if cost(rates, line.levels) > min(SLACK * line.budget, LIMIT_SLACK * limit):
             line.levels = fit(rates, allowed)
             line.reason = line.reason if line.budget <= limit else "the client asked for no more"
         bound = 0.0 if math.isinf(allowed) else allowed
@@ -182,7 +189,7 @@ class BudgetController:
     def _judge(self, line: _Line, report: Report, now_ns: int) -> None:
         line.reported_ns = now_ns
         line.late = ""
-        if now_ns - line.changed_ns >= REPORT_COVERS_NS:
+        if now_ns - line.lowered_ns >= DRAIN_NS:
             best = min(line.ages, default=math.inf)
             if report.age_ms > 1.5 * best + RISE_MS:
                 line.late = f"state came {report.age_ms:.0f} ms old, {best:.0f} ms at best"
@@ -216,19 +223,19 @@ class BudgetController:
         levels = fit(rates, bytes_per_s)
         line.levels = {stream: max(level, line.levels[stream]) for stream, level in levels.items()}
         line.budget, line.reason = bytes_per_s, reason
-        line.changed_ns = now_ns
+        line.changed_ns = line.lowered_ns = now_ns
         line.blocked, line.late = 0, ""
 
     def _climb(self, line: _Line, rates: Rates, limit: float, now_ns: int) -> None:
         calm_ns = now_ns - max(line.changed_ns, line.troubled_ns)
         present = cost(rates, line.levels)
-        if present >= line.failed and calm_ns > PROBE_NS:
+        if present >= SAME * line.failed and calm_ns > PROBE_NS:
             line.failed, line.climb_ns = math.inf, CLIMB_NS  # it works now
         if math.isinf(line.budget) and not any(line.levels.values()):
             return
         better = [levels for levels in reversed(ladder(rates)) if cost(rates, levels) > present]
         wanted = cost(rates, better[0]) if better else present
-        if wanted > limit or calm_ns < (line.climb_ns if wanted >= line.failed else CLIMB_NS):
+        if wanted > limit or calm_ns < (line.climb_ns if wanted >= SAME * line.failed else CLIMB_NS):
             return
         # Where nothing costs more, what is left to give is given.
         line.levels = better[0] if better else dict.fromkeys(rates, 0)

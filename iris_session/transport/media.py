@@ -84,12 +84,12 @@ class MediaProxy:
         waits = False
         while not self._stopping:
             ready = dict(poller.poll(RETRY_MS if waits else IDLE_MS))
+            closed = self._doors.turn(self._now_ns())  # before what they say: who has come
             if self._out in ready:
                 self._take_subscriptions()
             for one in (self._local, self._remote):
                 if one is not None and one in ready:
                     self._take_frames(one)
-            closed = self._doors.turn(self._now_ns())
             with self.lock:
                 for reason in closed:
                     self.hub.count(reason)

@@ -17,8 +17,8 @@ from iris_session.transport.budget import MILLISECOND, NOTHING, SECOND
 #: A stream of which nothing came for so long may be taken over by another source, and is forgotten after the other.
 TAKEN_OVER_NS: Final = 3 * SECOND
 FORGOTTEN_NS: Final = 60 * SECOND
-#: Rates are those of so many looks: a second, with four looks in it.
-LOOKS: Final = 5
+#: Rates are those of so many looks: two seconds, with four looks in each.
+LOOKS: Final = 9
 #: `send(topic, header, frame)`: false when that connection takes nothing now.
 Send = Callable[[bytes, bytes, Any], bool]
 

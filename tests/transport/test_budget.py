@@ -113,8 +113,8 @@ def test_trouble_that_media_do_not_make_is_learnt() -> None:
 def test_missed_state_counts() -> None:
     controller = BudgetController()
     controller.update(1, Measure(Report(10.0, 0.0)), CLOUD, 0)
-    grant = controller.update(1, Measure(Report(10.0, 0.5)), CLOUD, SECOND)
-    assert (grant.levels["cloud"], grant.reason) == (1, "50 % of state was missed")
+    grant = controller.update(1, Measure(Report(10.0, 0.7)), CLOUD, SECOND)
+    assert (grant.levels["cloud"], grant.reason) == (1, "70 % of state was missed")
 
 
 def test_a_display_of_30_hz_misses_half_of_it_always() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 
@@ -13,8 +14,9 @@ from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.media import MediaHeader, media_topic
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
+from iris_session.transport import FrontLimits
 from tests.transport.harness import FrontSession, RawClient
-from tests.transport.lab import Lab
+from tests.transport.lab import Lab, Open
 
 Curve = tuple[bytes, bytes, bytes]
 
@@ -153,6 +155,22 @@ def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) ->
     assert (bad.take(), other.take()) == (0, 0)
 
 
+def test_who_subscribes_to_nothing_is_closed_and_nobody_else(open_session: Open) -> None:
+    session = open_session(limits=FrontLimits(hello_timeout_ns=500_000_000))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    with socket.create_connection(("127.0.0.1", session.ports.media)) as silent:
+        media.drops("media_silent")
+        silent.settimeout(30.0)
+        while silent.recv(4096):
+            pass
+    seen = viewer.take()
+    media.until(lambda: viewer.take() > seen + 100, "ann goes on")
+    assert session.process.link.status.drops["media_silent"] == 1
+    media.close()
+
+
 def test_who_never_reads_delays_nobody_and_gets_less(media: Stage) -> None:
     session = media.session
     media.size = 100_000
@@ -193,7 +211,9 @@ def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
     media.until(lambda: viewer.take() >= 1, "media")
     old_seq = viewer.got[-1][1].seq
     session.process.restart()
-    session.ports = session.process.wait_ready(30.0)
+    media.until(lambda: session.process.link.ports is not None, "a new front")
+    assert session.process.link.ports is not None
+    session.ports = session.process.link.ports
     bob = media.joined(session.client(), "bob")
     again = media.viewer(bob)
     media.until(lambda: again.take() >= 1, "media of the new front")
@@ -283,20 +303,20 @@ def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) ->
     sends(camera, b"late", lambda: refused() > before + 60, "and stays so")
     assert len(viewer.got) == seen
     assert b"bob" not in {data for _, _, data in viewer.got}
-    for socket in pushes.values():
-        socket.close()
+    for pusher in pushes.values():
+        pusher.close()
 
 
 def _pusher(lab: Lab, pair: KeyPair) -> zmq.Socket[bytes]:
-    socket = lab.session.context.socket(zmq.PUSH)
-    socket.linger = 0
-    socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = lab.curve(pair)
-    socket.connect(f"tcp://127.0.0.1:{lab.session.ports.media_ingest}")
-    return socket
+    pusher = lab.session.context.socket(zmq.PUSH)
+    pusher.linger = 0
+    pusher.curve_serverkey, pusher.curve_publickey, pusher.curve_secretkey = lab.curve(pair)
+    pusher.connect(f"tcp://127.0.0.1:{lab.session.ports.media_ingest}")
+    return pusher
 
 
-def _send(socket: zmq.Socket[bytes], data: bytes) -> None:
+def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
     try:
-        socket.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"), zmq.DONTWAIT)
+        pusher.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"), zmq.DONTWAIT)
     except zmq.Again:
         return

@@ -166,9 +166,9 @@ def test_a_stream_belongs_to_its_source_while_that_sends() -> None:
     assert wire.hub.streams() == {}
 
 
-def test_rates_are_those_of_the_last_second() -> None:
+def test_rates_are_those_of_the_last_seconds() -> None:
     wire = Wire()
-    for _ in range(8):
+    for _ in range(12):
         wire.push(16)
         wire.hub.look(wire.now_ns)
     facts = wire.hub.streams()["cloud"]
