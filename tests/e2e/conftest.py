@@ -28,6 +28,8 @@ from iris_session.protocol.server_messages import Event
 
 #: Of every condition. Ten times what it takes at worst on a machine with time to spare: others may use it too.
 DEADLINE_S = 60.0
+#: A server that starts beside others that compute.
+START_S: Final = 90.0
 #: Commands that end by themselves; and a whole demo, which takes a minute on a machine with time to spare.
 COMMAND_S = 120.0
 DEMO_S = 300.0
@@ -124,10 +126,18 @@ class Server:
         self._out = folder / "serve.out"
         with self._out.open("wb") as out:
             self.process = subprocess.Popen([*ENDS_WITH_US, *command], stdout=out, stderr=subprocess.STDOUT, cwd=folder)
-        wait(lambda: "recording to" in self.output or self.process.poll() is not None, "the session listens")
+        try:
+            wait(self._listens_or_ended, "the session listens", START_S)
+        except BaseException:
+            self.process.kill()
+            self.process.wait()
+            raise
         match = re.search(r"on (\S+:\d+),", self.output)
         assert match, self.output
         self.address = match.group(1)
+
+    def _listens_or_ended(self) -> bool:
+        return "recording to" in self.output or self.process.poll() is not None
 
     @property
     def output(self) -> str:
