@@ -21,12 +21,12 @@ import numpy as np
 
 from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, upright
 from anchors.groups import Key, Memory, Sighting
-from anchors.lie import Array, swing
+from anchors.lie import Array
 from anchors.noise import NoiseModel, isotropic
 from anchors.pose import PoseTuple, Quat, Vec3, compose, inverse, quat_mul, quat_normalize, quat_rotate
 from anchors.robust import Merged
 from anchors.solve import Prior, Problem, Solution, agreeing_anchors, in_world, inverted, problem, solve
-from anchors.uncertainty import Z99, at_point, chi2_quantile, position_error_p95, rotation_error_p95
+from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
 
 __all__ = [
     "AlignmentConfig",
@@ -229,7 +229,7 @@ class AlignmentEstimator:
         s = solve(b, prior, self._near)
         if not s.inside.any():
             return self._refusal(disagreement(sorted(set(b.anchor))))
-        tilt = _common_tilt(b, s)
+        tilt = s.tilt_seen(b)
         if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
             prior = Prior(tilt, prior.drift_m_per_s, prior.walk_m_per_sqrt_s)
             s = solve(b, prior, (s.q, s.t))
@@ -276,8 +276,9 @@ class AlignmentEstimator:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = b.p_world[s.inside].mean(axis=0)
         pivot_world = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
-        covariance = tuple((in_world(s.q, s.covariance, pivot) * wider).ravel().tolist())
-        error = position_error_p95(covariance, pivot_world, pivot_world)
+        in_the_world = in_world(s.q, s.covariance, pivot) * wider
+        covariance = tuple(in_the_world.ravel().tolist())
+        error = length_p95(in_the_world[:3, :3])
         refused = not error <= self.config.max_error_m
         if refused:
             advice = f"the error would be {error * 1e3:.0f} mm: step closer to the sheet, look at it from several sides"
@@ -367,10 +368,3 @@ def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:
     _, q = compose(T_world_anchor, inverse(T_tracking_anchor))
     up = quat_rotate(q, (0.0, 0.0, 1.0))
     return math.atan2(math.hypot(up[0], up[1]), up[2])
-
-
-def _common_tilt(b: Problem, s: Solution) -> float:
-    """Tilt [rad] that the agreeing groups show together, gravity left out."""
-    weight = s.inside / np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2)
-    tilt = weight @ swing(b.q) / float(weight.sum())
-    return math.hypot(float(tilt[0]), float(tilt[1]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -25,7 +25,7 @@ _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
-_CONVERGED: Final = 1e-6  # [m], [rad]; the step after would be smaller by orders of magnitude
+_CONVERGED: Final = 1e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
 Mask = NDArray[np.bool_]
 
 
@@ -52,7 +52,7 @@ class Problem:
     p: Array  # (G, 3) tracking
     q: Array  # (G, 4) T_tracking_world as each group alone has it
     covariance: Array  # (G, 6, 6)
-    whitening: Array  # (G, 6, 6)
+    information: Array  # (G, 6, 6), the inverse
     age_s: Array  # (G,)
 
     @property
@@ -63,7 +63,8 @@ class Problem:
 @dataclass(frozen=True)
 class Solution:
     """`T_tracking_world` at the time of the newest observation. `covariance` (6, 6) of translation and rotation
-    (tracking axes, rotation on the left), `inside` (G,): which groups agree, `chi2` of those, `freedom` of that."""
+    (tracking axes, rotation on the left), `inside` (G,): which groups agree, `chi2` of those, `freedom` of that,
+    `distance2` (G,) and `turns` (G, 3): how far each group is off, squared in units of its noise, and in rotation."""
 
     t: Array
     q: Array
@@ -73,6 +74,13 @@ class Solution:
     freedom: float
     drift: Array
     distance2: Array
+    turns: Array
+
+    def tilt_seen(self, b: Problem) -> float:
+        """Tilt [rad] that the agreeing groups show together, gravity left out."""
+        weight = self.inside / np.add.reduce(b.covariance[:, 3:, 3:].reshape(-1, 9)[:, ::4], axis=1)
+        tilt = _tilt(self.q) + weight @ self.turns[:, :2] / float(weight.sum())
+        return math.hypot(float(tilt[0]), float(tilt[1]))
 
 
 def problem(
@@ -84,8 +92,7 @@ def problem(
     covariance = np.array([m.covariance for m in merged])
     walked = prior.walk_m_per_sqrt_s**2 * np.maximum(np.abs(age_s) - _STEADY_S, 0.0)
     covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
-    whitening = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
-    return Problem(tuple(anchor), p_world, p, q, covariance, whitening, age_s)
+    return Problem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
 
 
 def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> Solution:
@@ -112,9 +119,7 @@ def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> 
 
 
 def _without(s: Solution) -> Solution:
-    return Solution(
-        s.t, s.q, s.covariance, np.zeros(len(s.inside), dtype=bool), s.chi2, s.freedom, s.drift, s.distance2
-    )
+    return replace(s, inside=np.zeros(len(s.inside), dtype=bool))
 
 
 def _level(q: Array) -> Array:
@@ -138,7 +143,6 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
     J = np.zeros((b.size, 6, 9))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = J[:, 3, 3] = J[:, 4, 4] = J[:, 5, 5] = 1.0
     J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
-    some = not bool(inside.all())
     weights = inside.astype(np.float64)
     tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
     diagonal = np.zeros(9)
@@ -149,11 +153,9 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         J[:, 0, 4], J[:, 0, 5] = turned[:, 2], -turned[:, 1]  # minus the cross-product matrix of the turned anchor
         J[:, 1, 3], J[:, 1, 5] = -turned[:, 2], turned[:, 0]
         J[:, 2, 3], J[:, 2, 4] = turned[:, 1], -turned[:, 0]
-        whitened_J = b.whitening @ J
-        whitened = (b.whitening @ r[:, :, None])[:, :, 0]
-        A = (whitened_J * weights[:, None, None] if some else whitened_J).reshape(-1, 9)
-        g = A.T @ whitened.ravel()
-        H = A.T @ A
+        A = (b.information @ J * weights[:, None, None]).reshape(-1, 9)
+        g = A.T @ r.ravel()
+        H = A.T @ J.reshape(-1, 9)
         H.flat[::10] += diagonal
         if prior.gravity:
             g[3:5] -= tilt_information * _tilt(q)
@@ -163,16 +165,15 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         q = quat_multiply(quat_exp(step[3:6]), q)
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
-    whitened = whitened - whitened_J @ step  # the last step was small: its linear effect is all there is
-    distance2 = np.add.reduce(whitened * whitened, axis=1)
+    r = r - J @ step  # the last step was small: its linear effect is all there is
+    distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
     chi2 = float(np.sum(distance2[inside])) + float(drift @ (diagonal[6:] * drift))
     freedom = 6.0 * float(np.count_nonzero(inside)) - 6.0
     if prior.gravity:
         chi2 += tilt_information * float(np.sum(_tilt(q) ** 2))
         freedom += 2.0
-    return Solution(
-        t, q, np.asarray(np.linalg.inv(H)[:6, :6], dtype=np.float64), inside, chi2, freedom, drift, distance2
-    )
+    covariance = np.asarray(np.linalg.inv(H)[:6, :6], dtype=np.float64)
+    return Solution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:])
 
 
 def _tilt(q: Array) -> Array:

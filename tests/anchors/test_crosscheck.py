@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,16 +66,16 @@ def test_a_headset_that_was_bumped_disagrees_by_as_much() -> None:
 def test_a_moving_controller_is_compared_at_the_same_instants() -> None:
     rng = np.random.default_rng(2)
     frames = {name: headset(rng) for name in "ab"}
-    alignments = {name: _aligned(rng, T) for name, T in frames.items()}
-    check = CrossCheck(CrossCheck().noise, CrossCheckConfig(max_gap_ns=30_000_000))
+    exact = {name: replace(_aligned(rng, T), T_world_tracking=T) for name, T in frames.items()}
+    check = CrossCheck(config=CrossCheckConfig(max_gap_ns=30_000_000))
     for i in range(200):
         name = "ab"[i % 2]  # 72 Hz each, never at the same time; 1 m/s
         at: PoseTuple = ((i * 0.00694, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
         pose = compose(inverse(frames[name]), at)
         check.see(name, "controller", pose, (0.0, 0.0, 0.0), i * 6_940_000, 0)
-    (got,) = check.compare(alignments, 200 * 6_940_000, moving=frozenset({"controller"}))
-    assert got.error_m < 0.02
-    assert check.compare(alignments, 200 * 6_940_000 + 61 * 10**9, moving=frozenset({"controller"})) == []
+    (got,) = check.compare(exact, 200 * 6_940_000, moving=frozenset({"controller"}))
+    assert got.error_m < 1e-6
+    assert check.compare(exact, 200 * 6_940_000 + 61 * 10**9, moving=frozenset({"controller"})) == []
 
 
 def test_a_recentred_refused_or_stale_headset_is_not_compared() -> None:

@@ -53,6 +53,18 @@ def test_stated_error_is_honest() -> None:
     assert 0.90 <= inside / 100 <= 0.99
 
 
+def test_gravity_holds_the_tilt() -> None:
+    """Of marks within half a metre the tilt alone would be off by several tenths of a degree."""
+    far: Vec3 = (0.3, 0.2, 3.0)
+    off: dict[int, list[float]] = {4: [], 6: []}
+    for seed in range(30):
+        for dof, errors in off.items():
+            got = register(MARKS, _touches("abcd", 0.0015, seed), config=AlignmentConfig(dof=dof))
+            at = apply(got.estimate.T_world_tracking, apply(inverse(T_WORLD_TRACKING), far))
+            errors.append(distance(at, far))
+    assert np.median(off[4]) < 0.8 * np.median(off[6])
+
+
 def test_too_few_points_names_those_left() -> None:
     got = register(MARKS, _touches("ab"))
     assert got.estimate.refused
