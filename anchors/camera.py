@@ -1,0 +1,155 @@
+"""A camera: intrinsics with lens distortion, points to pixels and back, and poses as matrices and rotation vectors.
+
+Camera frame as OpenCV: x right, y down, z into the scene. A pixel's centre has whole coordinates. Distortion is the
+Brown-Conrady model with OpenCV's coefficients `k1, k2, p1, p2[, k3[, k4, k5, k6]]`.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.pose import PoseTuple, quat_from_rotvec, quat_to_rotvec
+
+Array = NDArray[np.float64]
+_N_DISTORTION: Final = (0, 4, 5, 8)
+
+
+class CameraError(ValueError):
+    """Intrinsics that cannot be; the text says what would be right."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Image size [px], focal lengths and principal point [px], distortion coefficients."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(map(math.isfinite, values)) or min(self.fx, self.fy) <= 0.0 or min(self.width, self.height) <= 0:
+            raise CameraError("intrinsics must be finite, focal lengths and image size above 0")
+        if len(self.distortion) not in _N_DISTORTION:
+            raise CameraError(f"{len(self.distortion)} distortion coefficients: 0, 4, 5 or 8 of OpenCV's model")
+
+    @property
+    def matrix(self) -> Array:
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def coefficients(self) -> Array:
+        return np.array(self.distortion if self.distortion else (0.0,) * 4)
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera read out at another resolution of the same field of view."""
+        sx, sy = width / self.width, height / self.height
+        # Pixel centres are whole numbers: the image's left edge is at -0.5.
+        return Camera(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
+        )
+
+    def project(self, points: Array, T_camera_points: PoseTuple | None = None) -> Array:
+        """Pixels, shape (n, 2), of points, shape (n, 3) [m]."""
+        pose = T_camera_points if T_camera_points is not None else ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        return self.project_with_jacobian(points, *rvec_tvec(pose))[0]
+
+    def project_with_jacobian(self, points: Array, rvec: Array, tvec: Array) -> tuple[Array, Array]:
+        """Pixels, shape (n, 2), and their derivatives by rotation vector and translation, shape (2 n, 6)."""
+        import cv2
+
+        found: Any = cv2.projectPoints(
+            np.ascontiguousarray(points).reshape(-1, 1, 3), rvec, tvec, self.matrix, self.coefficients
+        )
+        return np.asarray(found[0]).reshape(-1, 2), np.asarray(found[1])[:, :6]
+
+    def normalise(self, pixels: Array) -> Array:
+        """Undistorted coordinates (x / z, y / z), shape (n, 2), of pixels."""
+        import cv2
+
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        found: Any = cv2.undistortPoints(
+            points, self.matrix, self.coefficients, R=np.eye(3), P=np.eye(3), criteria=criteria
+        )
+        return np.asarray(found).reshape(-1, 2)
+
+
+def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
+    """Intrinsics from a file: TOML (`width, height, fx, fy, cx, cy`, optional `distortion`), or a bare 3x3 matrix, for
+    which the size of the images is needed."""
+    matrix = _matrix_of(text)
+    if matrix is not None:
+        return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    wanted = "width, height, fx, fy, cx, cy [pixels], and if known distortion = [k1, k2, p1, p2, k3]"
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CameraError(f"neither a 3x3 matrix nor TOML ({error}); wanted: {wanted}") from error
+    try:
+        fx, fy, cx, cy = (float(table[key]) for key in ("fx", "fy", "cx", "cy"))
+        width, height = int(table.get("width", width)), int(table.get("height", height))
+        return Camera(width, height, fx, fy, cx, cy, tuple(float(k) for k in table.get("distortion", ())))
+    except KeyError as error:
+        raise CameraError(f"{error.args[0]} is missing; wanted: {wanted}") from error
+    except (TypeError, ValueError) as error:
+        if isinstance(error, CameraError):
+            raise
+        raise CameraError(f"not a number ({error}); wanted: {wanted}") from error
+
+
+def _matrix_of(text: str) -> Array | None:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        return None
+    return values.reshape(3, 3) if values.size == 9 else None
+
+
+def rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
+    """Rotation vector and translation of a pose, as OpenCV takes them."""
+    return np.array(quat_to_rotvec(pose[1])), np.array(pose[0])
+
+
+def pose_of(rvec: Array, tvec: Array) -> PoseTuple:
+    """The pose of a rotation vector and translation."""
+    r, t = np.asarray(rvec).ravel(), np.asarray(tvec).ravel()
+    return (float(t[0]), float(t[1]), float(t[2])), quat_from_rotvec((float(r[0]), float(r[1]), float(r[2])))
+
+
+def matrix_of(pose: PoseTuple) -> Array:
+    """4x4 matrix of a pose."""
+    (x, y, z), (w, i, j, k) = pose
+    return np.array(
+        [
+            [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j), x],
+            [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i), y],
+            [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j), z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def pose_of_matrix(matrix: Array) -> PoseTuple:
+    """The pose of a 4x4 matrix; its rotation is made orthonormal (nearest in the least-squares sense)."""
+    from scipy.spatial.transform import Rotation
+
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return pose_of(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])

@@ -1,0 +1,132 @@
+"""Cameras that see the same sheets, solved together: where every camera and every sheet stands in one frame.
+
+Sheets of known place fix the frame; cameras and other sheets follow from who sees what, by weighted robust least
+squares over all of them. A sheet that is carried through the room counts as a new one at every instant (`wand@3`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.camera import matrix_of, pose_of_matrix
+from anchors.pose import PoseTuple, compose, inverse
+from anchors.robot_world import CalibrationError
+
+Array = NDArray[np.float64]
+#: Of the print and its place, beside what a picture's covariance says: [m], [rad] per axis.
+_FLOOR: Final = (0.0003, math.radians(0.05))
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera saw one sheet: `T_camera_sheet` with its covariance (36 values, camera frame)."""
+
+    camera: str
+    sheet: str
+    T_camera_sheet: PoseTuple
+    covariance: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Poses in the common frame, covariances (36 values, common frame) beside them. `residuals`: per view, distance
+    [m] and angle [rad] between what was seen and what follows from the result."""
+
+    cameras: dict[str, PoseTuple]
+    sheets: dict[str, PoseTuple]
+    covariances: dict[str, tuple[float, ...]]
+    residuals: tuple[tuple[float, float], ...]
+
+
+def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> Rig:
+    """Cameras and unknown sheets in the frame in which the known ones stand. Raises `CalibrationError` for what
+    nothing connects with a known sheet."""
+    if not views:
+        raise CalibrationError("no camera saw a sheet: step closer, light the sheet, check its size and id")
+    poses = _first_guess(views, T_base_sheet)
+    names = [*sorted({("camera", v.camera) for v in views}), *sorted({("sheet", v.sheet) for v in views})]
+    free = [name for name in names if not (name[0] == "sheet" and name[1] in T_base_sheet)]
+    poses, normal, scale = _least_squares(views, poses, free)
+    covariance = np.linalg.inv(normal) * scale
+    blocks = {
+        name[1]: tuple(float(v) for v in covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].ravel())
+        for k, name in enumerate(free)
+        if name[0] == "camera"
+    }
+    differences = [_difference(view, poses) for view in views]
+    return Rig(
+        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
+        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
+        blocks,
+        tuple((float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))) for d in differences),
+    )
+
+
+_Name = tuple[str, str]
+
+
+def _first_guess(views: Sequence[View], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
+    """From known sheets outwards, one view for each."""
+    poses: dict[_Name, PoseTuple] = {("sheet", name): T for name, T in known.items()}
+    waiting = list(views)
+    while waiting:
+        left = []
+        for view in waiting:
+            camera, sheet = ("camera", view.camera), ("sheet", view.sheet)
+            if camera in poses and sheet not in poses:
+                poses[sheet] = compose(poses[camera], view.T_camera_sheet)
+            elif sheet in poses and camera not in poses:
+                poses[camera] = compose(poses[sheet], inverse(view.T_camera_sheet))
+            elif camera not in poses:
+                left.append(view)
+        if len(left) == len(waiting):
+            names = ", ".join(sorted({view.camera for view in left}))
+            raise CalibrationError(
+                f"nothing connects camera {names} with a sheet of known place ({', '.join(sorted(known)) or 'none'}): "
+                "let it see one of those, or a sheet that another camera sees too"
+            )
+        waiting = left
+    return {name: matrix_of(T) for name, T in poses.items()}
+
+
+def _least_squares(
+    views: Sequence[View], poses: dict[_Name, Array], free: list[_Name]
+) -> tuple[dict[_Name, Array], Array, float]:
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
+    whiteners = [np.linalg.inv(np.linalg.cholesky(np.reshape(view.covariance, (6, 6)) + floor)) for view in views]
+
+    def moved(p: Array) -> dict[_Name, Array]:
+        out = dict(poses)
+        for name, step in zip(free, p.reshape(-1, 6), strict=True):
+            M = np.eye(4)
+            M[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ poses[name][:3, :3]
+            M[:3, 3] = poses[name][:3, 3] + step[:3]
+            out[name] = M
+        return out
+
+    def residuals(p: Array) -> Array:
+        at = moved(p)
+        return np.concatenate([W @ _difference(view, at) for W, view in zip(whiteners, views, strict=True)])
+
+    solved = least_squares(residuals, np.zeros(6 * len(free)), loss="huber", f_scale=3.0, x_scale="jac")
+    freedom = max(6 * (len(views) - len(free)), 1)
+    return moved(solved.x), np.asarray(solved.jac.T @ solved.jac), max(1.0, 2.0 * float(solved.cost) / freedom)
+
+
+def _difference(view: View, poses: Mapping[_Name, Array]) -> Array:
+    """Position and rotation of the sheet as it follows from the poses against what was seen, camera frame."""
+    from scipy.spatial.transform import Rotation
+
+    seen = matrix_of(view.T_camera_sheet)
+    P = np.linalg.inv(poses["camera", view.camera]) @ poses["sheet", view.sheet]
+    turn = Rotation.from_matrix(P[:3, :3] @ seen[:3, :3].T).as_rotvec()
+    return np.concatenate([P[:3, 3] - seen[:3, 3], turn])

@@ -1,0 +1,301 @@
+"""Finds printed sheets in camera pictures: `T_camera_sheet` with covariance, and the mirrored pose it may be taken for.
+
+Markers first (OpenCV's detector; where some are missing, once more in the picture enlarged twice), all markers of one
+sheet as one board, then the whole print is laid over the picture (`anchors.registration`). A plane seen from afar has
+two poses that look nearly alike (Collins and Bartoli 2014, IPPE): both are refined, the better one is the result, and
+`mirrored_ratio` says how much worse the other one fits. Bare codes: `detect_codes`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.camera import Camera, pose_of, rvec_tvec
+from anchors.pose import PoseTuple
+from anchors.registration import register
+from anchors.sheet import Sheet, dictionary
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+#: A sheet is known by at least so many of its four markers: one alone may be a misread one of something else.
+MIN_MARKERS: Final = 2
+#: Corners of a marker that lie further than this from where the rest of the board puts them are not of this board [px].
+_MAX_CORNER_ERROR_PX: Final = 2.5
+#: Standard deviation of a corner as the detector finds it [px], where the print cannot be laid over the picture.
+_CORNER_SIGMA_PX: Final = 0.6
+_CODE_CORNER_SIGMA_PX: Final = 0.9  # of a bare code, whose corners are not refined
+_ENLARGE: Final = 2
+_MAX_ENLARGED_PIXELS: Final = 2_500_000
+#: Where the mirrored pose fits the corners worse than by this factor it is not looked at any further.
+_CLEAR_RATIO: Final = 4.0
+#: A registered print differs from the picture by at most this share of its contrast.
+_MAX_RMS: Final = 0.25
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One sheet in one picture.
+
+    `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
+    `mirrored`, `mirrored_ratio`: the other pose that a plane allows, and its residual over that of the result, at least
+    1: near 1 nobody can tell which is right; `AMBIGUOUS_RATIO` is a good bound. `reprojection_px`: rms of the corners
+    that the detector found. `registered`: whether the whole print was used.
+    """
+
+    anchor_id: str
+    kind: str
+    edge_m: float
+    T_camera_sheet: PoseTuple
+    covariance: tuple[float, ...]
+    mirrored: PoseTuple | None
+    mirrored_ratio: float
+    reprojection_px: float
+    markers: int
+    registered: bool
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.mirrored is not None and self.mirrored_ratio < AMBIGUOUS_RATIO
+
+
+AMBIGUOUS_RATIO: Final = 1.03
+
+
+class DetectionError(ValueError):
+    """Pictures or sheets that cannot be used; the text says what would be right."""
+
+
+class SheetDetector:
+    """Finds known sheets in pictures of one camera."""
+
+    def __init__(self, sheets: Sequence[Sheet], camera: Camera) -> None:
+        names = [sheet.anchor_id for sheet in sheets]
+        if len(set(names)) != len(names):
+            raise DetectionError(f"two sheets have the same id: {', '.join(sorted(names))}")
+        self.sheets = tuple(sheets)
+        self.camera = camera
+        self._detector = _marker_detector()
+
+    def detect(self, image: NDArray[Any]) -> list[Sighting]:
+        """Sheets in one picture, shape (height, width) or (height, width, 3) uint8, by id."""
+        grey = grey_of(image, self.camera)
+        found = self._find(grey, 1)
+        wanted = [sheet for sheet in self.sheets if sum(k in found for k in sheet.marker_ids) < len(sheet.marker_ids)]
+        if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS * 2:
+            for marker_id, corners in self._find(grey, _ENLARGE).items():
+                found.setdefault(marker_id, corners)
+        sightings = [self._board(sheet, found, grey) for sheet in self.sheets]
+        return [one for one in sightings if one is not None]
+
+    def _find(self, grey: Image, scale: int) -> dict[int, list[Array]]:
+        """Corners of markers by id, shape (4, 2) [px of the picture]; an id may be seen more than once."""
+        import cv2
+
+        picture: Any = grey
+        if scale != 1:
+            picture = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        corners, ids, _ = self._detector.detectMarkers(picture)
+        found: dict[int, list[Array]] = {}
+        for marker_id, four in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
+            found.setdefault(marker_id, []).append((four.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
+        return found
+
+    def _board(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> Sighting | None:
+        seen = {
+            number: candidates[0]
+            for number, marker_id in enumerate(sheet.marker_ids)
+            # Seen twice: one is of another sheet or of the room, and nothing here says which.
+            if len(candidates := found.get(marker_id, [])) == 1
+        }
+        poses = _consistent_board(sheet, seen, self.camera)
+        if poses is None:
+            return None
+        return _refined(sheet, poses, grey, self.camera)
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Two poses of a plane by its corners, better one first, with their rms [px]."""
+
+    best: tuple[PoseTuple, float]
+    mirrored: tuple[PoseTuple, float] | None
+    points: Array
+    pixels: Array
+    markers: int
+
+
+def detect_codes(image: NDArray[Any], camera: Camera, edges_m: Mapping[str, float]) -> list[Sighting]:
+    """Bare QR codes whose text and edge [m] are known. Reaches half as far as the markers of a sheet."""
+    import cv2
+
+    grey = grey_of(image, camera)
+    found, texts, corners, _ = cv2.QRCodeDetectorAruco().detectAndDecodeMulti(grey)
+    sightings = []
+    for text, four in zip(texts if found else (), corners if found else (), strict=True):
+        if text not in edges_m:
+            continue
+        sheet = Sheet(text, edges_m[text])
+        poses = _plane_poses(sheet.code_corners, np.asarray(four, dtype=np.float64), camera, 0)
+        if poses is not None:
+            sightings.append(replace(_by_corners(sheet, poses, camera, _CODE_CORNER_SIGMA_PX), kind="qr"))
+    return sightings
+
+
+def grey_of(image: NDArray[Any], camera: Camera) -> Image:
+    """The picture as grey values. Raises `DetectionError` when it is not one of this camera."""
+    import cv2
+
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
+        raise DetectionError(f"a picture is (height, width[, 3]) uint8, not {image.shape} {image.dtype}")
+    if image.shape[:2] != (camera.height, camera.width):
+        raise DetectionError(
+            f"the picture is {image.shape[1]} x {image.shape[0]}, the intrinsics are for {camera.width} x "
+            f"{camera.height}: they must belong to the same resolution"
+        )
+    grey: Any = image if image.ndim == 2 else cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(grey)
+
+
+def _marker_detector() -> Any:
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.minMarkerPerimeterRate = 0.01  # of the longer side: 6 px a marker at 640
+    parameters.relativeCornerRefinmentWinSize = 0.2
+    return cv2.aruco.ArucoDetector(dictionary(), parameters)
+
+
+def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -> _Poses | None:
+    """Poses by as many markers as agree on one board; of equally many, those that fit best."""
+    for n in range(len(seen), MIN_MARKERS - 1, -1):
+        agreeing = []
+        for numbers in combinations(seen, n):
+            points = sheet.marker_corners[list(numbers)].reshape(-1, 3)
+            pixels = np.concatenate([seen[number] for number in numbers])
+            poses = _plane_poses(points, pixels, camera, n)
+            if poses is not None and _largest_error(poses, camera) <= _MAX_CORNER_ERROR_PX:
+                agreeing.append(poses)
+        if agreeing:
+            return min(agreeing, key=lambda poses: poses.best[1])
+    return None
+
+
+def _largest_error(poses: _Poses, camera: Camera) -> float:
+    return float(np.linalg.norm(camera.project(poses.points, poses.best[0]) - poses.pixels, axis=1).max())
+
+
+def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> _Poses | None:
+    import cv2
+
+    # Undistorted to the last bit first: solvePnP does so to a few hundredths of a pixel only.
+    normalised = camera.normalise(pixels)
+    ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+        points.reshape(-1, 1, 3), normalised.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not ok:
+        return None
+    solved: list[tuple[PoseTuple, float]] = []
+    for rvec, tvec in zip(rvecs, tvecs, strict=True):
+        pose = _refine_corners(points, pixels, camera, np.asarray(rvec).ravel(), np.asarray(tvec).ravel())
+        if pose is not None:
+            rms = float(np.sqrt(np.mean(np.sum((camera.project(points, pose) - pixels) ** 2, axis=1))))
+            solved.append((pose, rms))
+    if not solved:
+        return None
+    solved.sort(key=lambda one: one[1])
+    other = solved[1] if len(solved) > 1 and _differ(solved[0][0], solved[1][0]) else None
+    return _Poses(solved[0], other, points, pixels, markers)
+
+
+def _refine_corners(points: Array, pixels: Array, camera: Camera, rvec: Array, tvec: Array) -> PoseTuple | None:
+    """Least squares of the reprojection from one of the two starts; `None` when it leaves the front of the camera."""
+    from scipy.optimize import least_squares
+
+    if not (np.all(np.isfinite(rvec)) and np.all(np.isfinite(tvec)) and tvec[2] > 0.0):
+        return None
+    solved = least_squares(
+        lambda p: (camera.project_with_jacobian(points, p[:3], p[3:])[0] - pixels).ravel(),
+        np.concatenate([rvec, tvec]),
+        jac=lambda p: camera.project_with_jacobian(points, p[:3], p[3:])[1],
+        method="lm",
+        max_nfev=50,
+    )
+    return pose_of(solved.x[:3], solved.x[3:]) if solved.x[5] > 0.0 else None
+
+
+def _differ(a: PoseTuple, b: PoseTuple) -> bool:
+    return abs(sum(p * q for p, q in zip(a[1], b[1], strict=True))) < math.cos(0.5 * math.radians(0.5))
+
+
+def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighting:
+    """The better of both poses after the print was laid over the picture; by corners alone where that fails."""
+    by_corners = _by_corners(sheet, poses, camera)
+    starts = [poses.best[0]]
+    if poses.mirrored is not None and by_corners.mirrored_ratio < _CLEAR_RATIO:
+        starts.append(poses.mirrored[0])
+    tried = [(one, start) for start in starts if (one := register(grey, camera, sheet, start)) is not None]
+    tried = [one for one in tried if one[0].rms < _MAX_RMS]
+    if not tried:
+        return by_corners
+    tried.sort(key=lambda one: one[0].rms)
+    best = tried[0][0]
+    ratio, mirrored = by_corners.mirrored_ratio, by_corners.mirrored
+    if len(tried) > 1 and _differ(best.T_camera_sheet, tried[1][0].T_camera_sheet):
+        mirrored, ratio = tried[1][0].T_camera_sheet, tried[1][0].rms / max(best.rms, 1e-9)
+    elif len(starts) > 1:
+        mirrored, ratio = None, math.inf  # both starts lead to the same pose, or the other leads nowhere
+    return replace(
+        by_corners,
+        T_camera_sheet=best.T_camera_sheet,
+        covariance=tuple(float(v) for v in best.covariance.ravel()),
+        mirrored=mirrored,
+        mirrored_ratio=ratio,
+        registered=True,
+    )
+
+
+def _by_corners(sheet: Sheet, poses: _Poses, camera: Camera, sigma_px: float = _CORNER_SIGMA_PX) -> Sighting:
+    pose, rms = poses.best
+    rvec, tvec = rvec_tvec(pose)
+    J = camera.project_with_jacobian(poses.points, rvec, tvec)[1]
+    per_axis = max(rms / math.sqrt(2.0), sigma_px)
+    by_rvec: Array = np.asarray(np.linalg.inv(J.T @ J) * per_axis**2, dtype=np.float64)
+    mirrored, ratio = None, math.inf
+    if poses.mirrored is not None:
+        mirrored, ratio = poses.mirrored[0], poses.mirrored[1] / max(rms, 1e-9)
+    return Sighting(
+        anchor_id=sheet.anchor_id,
+        kind="board",
+        edge_m=sheet.edge_m,
+        T_camera_sheet=pose,
+        covariance=tuple(float(v) for v in _position_first(by_rvec, rvec).ravel()),
+        mirrored=mirrored,
+        mirrored_ratio=ratio,
+        reprojection_px=rms,
+        markers=poses.markers,
+        registered=False,
+    )
+
+
+def _position_first(by_rvec: Array, rvec: Array) -> Array:
+    """Covariance of (rotation vector, translation) as one of (translation, small rotation in the camera frame): the
+    left Jacobian of the exponential map (Barfoot 2017, section 7.1.5) takes changes of the one into the other."""
+    angle = float(np.linalg.norm(rvec))
+    left = np.eye(3)
+    if angle > 1e-9:
+        x, y, z = rvec / angle
+        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        left = np.eye(3) + (1 - math.cos(angle)) / angle * K + (1 - math.sin(angle) / angle) * K @ K
+    turn = np.zeros((6, 6))
+    turn[:3, 3:] = np.eye(3)
+    turn[3:, :3] = left
+    return np.asarray(turn @ by_rvec @ turn.T)

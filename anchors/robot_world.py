@@ -1,0 +1,268 @@
+"""Where a camera stands in the frame of a robot, from a marker that robot and camera both see move.
+
+Two chains lead to the marker, `T_base_ee T_ee_marker = T_base_camera T_camera_marker`: kinematics knows the first
+factor, the camera the last one, and many poses determine the other two. (Robot-world and hand-eye calibration: Park and
+Martin 1994 for the start, then weighted least squares over both, as in Dornaika and Horaud 1998, section V.)
+
+The same equation serves a camera on the hand (`camera_on_hand`), and a virtual robot that is to lie over its real twin:
+there the headset is the camera, and `T_base_world` is what `T_base_camera` is here (`T_world_base_of_twin`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.camera import matrix_of, pose_of_matrix
+from anchors.pose import PoseTuple, compose, inverse
+
+Array = NDArray[np.float64]
+
+MIN_POSES: Final = 3
+#: Rotations of the marker, rms about the second of its main axes: with less, the position along the first is free.
+MIN_SPREAD_RAD: Final = math.radians(5.0)
+_OUTLIER: Final = 5.0  # whitened residual over that of the median picture
+_MIN_AGREEING: Final = 0.6
+_TURN_ADVICE: Final = (
+    "turn the hand by 30 degrees or more about at least two axes that are not parallel, and take ten pictures or more"
+)
+_MIXED_UP: Final = (
+    "are the poses those of these pictures (metres, quaternion w first), and did the marker stay fixed on the hand?"
+)
+#: Median of the pictures used, [m] and [rad]: beyond this nothing fits, whatever the noise is said to be.
+MAX_RESIDUAL: Final = (0.02, math.radians(3.0))
+
+
+class CalibrationError(ValueError):
+    """The poses do not determine a result; the text says what would help."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations per axis of the robot's poses (repeatability and kinematics), and of what the camera saw
+    where no covariance came with it."""
+
+    robot_m: float = 0.0005
+    robot_rad: float = math.radians(0.05)
+    seen_m: float = 0.001
+    seen_rad: float = math.radians(0.3)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """`covariance`: 36 values, (x, y, z [m], rx, ry, rz [rad]) of the camera in the frame of the base; scaled up where
+    residuals are larger than stated. `residuals`: per picture, distance [m] and angle [rad] between both chains.
+    `left_out`: pictures that contradict the others. `spread_rad`: how much the hand turned, about its second axis."""
+
+    T_base_camera: PoseTuple
+    T_ee_marker: PoseTuple
+    covariance: tuple[float, ...]
+    residuals: tuple[tuple[float, float], ...]
+    left_out: tuple[int, ...]
+    spread_rad: float
+    birge: float
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        return tuple(k for k in range(len(self.residuals)) if k not in self.left_out)
+
+    def rms(self) -> tuple[float, float]:
+        """Root mean square of the residuals of the pictures used: [m], [rad]."""
+        kept = np.array([self.residuals[k] for k in self.used])
+        m, rad = np.sqrt(np.mean(kept**2, axis=0))
+        return float(m), float(rad)
+
+
+def one_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
+    """`T_base_camera` where the place of the marker on the hand is known."""
+    return compose(compose(T_base_ee, T_ee_marker), inverse(T_camera_marker))
+
+
+def solve(
+    T_base_ee: Sequence[PoseTuple],
+    T_camera_marker: Sequence[PoseTuple],
+    covariances: Sequence[Sequence[float]] | None = None,
+    noise: Noise | None = None,
+) -> Solved:
+    """`T_base_camera` and `T_ee_marker` from many poses; neither needs to be known. `covariances`: of each
+    `T_camera_marker`, camera frame. Raises `CalibrationError`."""
+    if len(T_base_ee) != len(T_camera_marker):
+        raise CalibrationError(f"{len(T_base_ee)} poses of the robot, {len(T_camera_marker)} of the marker")
+    data = _Data.of(T_base_ee, T_camera_marker, covariances, noise or Noise())
+    kept = list(range(len(data.A)))
+    while True:
+        if len(kept) < max(MIN_POSES, math.ceil(_MIN_AGREEING * len(data.A))):
+            raise CalibrationError(_too_few(len(kept), len(data.A)))
+        spread = _spread(data.A[kept])
+        if spread < MIN_SPREAD_RAD:
+            raise CalibrationError(
+                f"the hand turned by {math.degrees(spread):.1f} deg about its second axis, which leaves the result "
+                f"open: {_TURN_ADVICE}"
+            )
+        X, Y, normal = _least_squares(data.only(kept))
+        whitened = np.linalg.norm(data.whitened(X, Y), axis=1)
+        # One at a time: a wrong picture drags the result towards it, and others away.
+        limit = _OUTLIER * max(float(np.median(whitened[kept])), math.sqrt(6.0) / 2.0)
+        worst = max(kept, key=lambda k: whitened[k])
+        if whitened[worst] <= limit:
+            break
+        kept.remove(worst)
+    differences = data.differences(X, Y)
+    residuals = np.column_stack(
+        [np.linalg.norm(differences[:, :3], axis=1), np.linalg.norm(differences[:, 3:], axis=1)]
+    )
+    if np.any(np.median(residuals[kept], axis=0) > MAX_RESIDUAL):
+        m, rad = np.median(residuals[kept], axis=0)
+        raise CalibrationError(
+            f"the pictures do not agree: they differ by {1e3 * m:.0f} mm and {math.degrees(rad):.1f} deg; {_MIXED_UP}"
+        )
+    birge = max(1.0, float(np.sum(whitened[kept] ** 2)) / max(6 * len(kept) - 12, 1))
+    covariance = (np.linalg.inv(normal) * birge)[:6, :6]
+    return Solved(
+        pose_of_matrix(X),
+        pose_of_matrix(Y),
+        tuple(float(v) for v in covariance.ravel()),
+        tuple((float(m), float(rad)) for m, rad in residuals),
+        tuple(k for k in range(len(data.A)) if k not in kept),
+        spread,
+        birge,
+    )
+
+
+def camera_on_hand(
+    T_base_ee: Sequence[PoseTuple],
+    T_camera_sheet: Sequence[PoseTuple],
+    covariances: Sequence[Sequence[float]] | None = None,
+    noise: Noise | None = None,
+) -> Solved:
+    """A camera on the hand that looks at a sheet in the room: `T_base_camera` of the result is `T_base_sheet`, and
+    `T_ee_marker` is `T_ee_camera`."""
+    turned = None
+    if covariances is not None:
+        turned = [_of_inverse(T, cov) for T, cov in zip(T_camera_sheet, covariances, strict=True)]
+    return solve(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
+
+
+def T_world_base_of_twin(
+    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: Noise | None = None
+) -> tuple[PoseTuple, Solved]:
+    """Where the real robot stands in the world, from a marker on its hand that an aligned headset or camera saw (or a
+    tracked controller held there): the virtual robot belongs there."""
+    solved = solve(T_base_ee, T_world_marker, None, noise)
+    return inverse(solved.T_base_camera), solved
+
+
+@dataclass(frozen=True)
+class _Data:
+    A: Array  # T_base_ee, shape (n, 4, 4)
+    B: Array  # T_camera_marker
+    whitener: Array  # of the difference between both chains, shape (n, 6, 6)
+
+    @classmethod
+    def of(
+        cls,
+        robot: Sequence[PoseTuple],
+        camera: Sequence[PoseTuple],
+        covariances: Sequence[Sequence[float]] | None,
+        noise: Noise,
+    ) -> _Data:
+        seen = np.tile(np.diag([noise.seen_m**2] * 3 + [noise.seen_rad**2] * 3), (len(camera), 1, 1))
+        if covariances is not None:
+            seen = np.reshape(np.asarray(covariances, dtype=np.float64), (-1, 6, 6))
+        floor = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
+        whitener = np.linalg.inv(np.linalg.cholesky(seen + floor)) if len(seen) else seen
+        A, B = (np.array([matrix_of(T) for T in poses]).reshape(-1, 4, 4) for poses in (robot, camera))
+        return cls(A, B, whitener)
+
+    def differences(self, X: Array, Y: Array) -> Array:
+        """Position and rotation of the marker by kinematics against what was seen, camera frame, shape (n, 6)."""
+        from scipy.spatial.transform import Rotation
+
+        P = np.linalg.inv(X) @ self.A @ Y
+        turn = Rotation.from_matrix(P[:, :3, :3] @ self.B[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+        return np.concatenate([P[:, :3, 3] - self.B[:, :3, 3], turn], axis=1)
+
+    def whitened(self, X: Array, Y: Array) -> Array:
+        return np.asarray(np.einsum("nij,nj->ni", self.whitener, self.differences(X, Y)))
+
+    def only(self, kept: list[int]) -> _Data:
+        return _Data(self.A[kept], self.B[kept], self.whitener[kept])
+
+
+def _closed_form(data: _Data) -> tuple[Array, Array]:
+    """Relative motions see `A Y = Y B` only: rotation by aligning their axes, then position linearly."""
+    from scipy.spatial.transform import Rotation
+
+    i, j = _pairs(len(data.A))
+    a, b = np.linalg.inv(data.A[j]) @ data.A[i], np.linalg.inv(data.B[j]) @ data.B[i]
+    alpha, beta = (Rotation.from_matrix(m[:, :3, :3]).as_rotvec() for m in (a, b))
+    u, _, vt = np.linalg.svd(alpha.T @ beta)
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    left = (a[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (b[:, :3, 3] @ R.T - a[:, :3, 3]).ravel()
+    X, Y = np.eye(4), np.eye(4)
+    Y[:3, :3], Y[:3, 3] = R, np.linalg.lstsq(left, right, rcond=None)[0]
+    each = data.A @ Y @ np.linalg.inv(data.B)
+    X[:3, :3] = Rotation.from_matrix(each[:, :3, :3]).mean().as_matrix()
+    X[:3, 3] = np.median(each[:, :3, 3], axis=0)
+    return X, Y
+
+
+def _least_squares(data: _Data) -> tuple[Array, Array, Array]:
+    """Both unknowns, and the normal matrix of (camera, marker)."""
+    from scipy.optimize import least_squares
+
+    X, Y = _closed_form(data)
+    solved = least_squares(
+        lambda p: data.whitened(_moved(X, p[:6]), _moved(Y, p[6:])).ravel(),
+        np.zeros(12),
+        loss="huber",
+        f_scale=3.0,
+        x_scale="jac",
+    )
+    return _moved(X, solved.x[:6]), _moved(Y, solved.x[6:]), np.asarray(solved.jac.T @ solved.jac)
+
+
+def _moved(M: Array, step: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ M[:3, :3]
+    out[:3, 3] = M[:3, 3] + step[:3]
+    return out
+
+
+def _pairs(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    i, j = np.triu_indices(n, 1)
+    return i, j
+
+
+def _spread(A: Array) -> float:
+    """Root mean square rotation between poses about the second of the main axes [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    i, j = _pairs(len(A))
+    turns = Rotation.from_matrix(A[i, :3, :3].transpose(0, 2, 1) @ A[j, :3, :3]).as_rotvec()
+    return math.sqrt(max(float(np.linalg.eigvalsh(turns.T @ turns / len(turns))[1]), 0.0))
+
+
+def _too_few(agreeing: int, n: int) -> str:
+    if n < MIN_POSES:
+        return f"{n} pictures in which the marker was found: at least {MIN_POSES} are needed; {_TURN_ADVICE}"
+    return f"only {agreeing} of {n} pictures agree; {_MIXED_UP}"
+
+
+def _of_inverse(T: PoseTuple, covariance: Sequence[float]) -> tuple[float, ...]:
+    """Covariance of the inverse of a pose."""
+    M = matrix_of(T)
+    R, (x, y, z) = M[:3, :3], M[:3, 3]
+    J = np.zeros((6, 6))
+    J[:3, :3] = J[3:, 3:] = -R.T
+    J[:3, 3:] = -R.T @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    C = J @ np.asarray(covariance, dtype=np.float64).reshape(6, 6) @ J.T
+    return tuple(float(v) for v in C.ravel())

@@ -1,0 +1,162 @@
+"""The printed sheet: a QR code that says the anchor id, framed by four square markers, as one board of known corners.
+
+Headsets track the code natively and report its edge and centre. Cameras find the markers from much further away, and
+measure the pose over the whole page. Every length is a fixed share of the edge of the code, so id and edge determine
+the sheet, whatever paper it is printed on. Which markers it has follows from a hash of the id: sheets are told apart
+even where the code cannot be read.
+
+Sheet frame: origin in the centre of the code, x right, y up, z out of the paper towards the viewer [m].
+How it becomes a PDF or SVG: `anchors.sheet_print`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Shares of the code's edge. At 160 mm everything fits on A4 with the 6 mm that printers leave white.
+MARKER_EDGE: Final = 0.29
+HALF_WIDTH: Final = 0.60  # from the centre to the outer edges of the markers
+HALF_HEIGHT: Final = 0.89
+#: ArUco, 4 x 4 bits inside a border of one: the largest modules for a given edge, so the longest range. The code has
+#: no error correction to speak of; a sheet is known by several markers in the right places instead.
+DICTIONARY: Final = "DICT_4X4_1000"
+DICTIONARY_SIZE: Final = 1000
+MARKER_MODULES: Final = 6
+MARKERS: Final = 4
+MAX_ID: Final = 64  # characters, as in the protocol
+MIN_EDGE_M: Final = 0.02
+MAX_EDGE_M: Final = 2.0
+
+
+class SheetError(ValueError):
+    """A sheet that cannot be; the text says what would be right."""
+
+
+@dataclass(frozen=True)
+class Rect:
+    """An axis-aligned black rectangle in the sheet frame [m]: lower left corner and extent."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One printed anchor. `edge_m`: edge of the QR code, its quiet zone not included."""
+
+    anchor_id: str
+    edge_m: float
+
+    def __post_init__(self) -> None:
+        if not (0 < len(self.anchor_id) <= MAX_ID and self.anchor_id.isascii() and self.anchor_id.isprintable()):
+            raise SheetError(
+                f"{self.anchor_id!r} cannot be the id of a sheet: 1 to {MAX_ID} printable ASCII characters, "
+                "which every reader of QR codes understands alike"
+            )
+        if not MIN_EDGE_M <= self.edge_m <= MAX_EDGE_M:
+            raise SheetError(
+                f"a code of {1e3 * self.edge_m:g} mm cannot be: {1e3 * MIN_EDGE_M:g} to {1e3 * MAX_EDGE_M:g} mm"
+            )
+
+    @cached_property
+    def marker_ids(self) -> tuple[int, ...]:
+        """Markers of the frame: upper left, upper right, lower right, lower left. All different."""
+        return marker_ids(self.anchor_id)
+
+    @property
+    def marker_edge_m(self) -> float:
+        return MARKER_EDGE * self.edge_m
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of everything black."""
+        return 2.0 * HALF_WIDTH * self.edge_m, 2.0 * HALF_HEIGHT * self.edge_m
+
+    @cached_property
+    def marker_corners(self) -> Array:
+        """Corners of the markers, shape (4, 4, 3) [m]: marker, corner (clockwise from the upper left, as OpenCV)."""
+        w, h, m = HALF_WIDTH * self.edge_m, HALF_HEIGHT * self.edge_m, self.marker_edge_m
+        left = ((-w, h), (w - m, h), (w - m, m - h), (-w, m - h))
+        corners = [[(x, y, 0.0), (x + m, y, 0.0), (x + m, y - m, 0.0), (x, y - m, 0.0)] for x, y in left]
+        return _frozen(np.array(corners))
+
+    @cached_property
+    def code_corners(self) -> Array:
+        """Corners of the code, shape (4, 3) [m], clockwise from the upper left."""
+        e = 0.5 * self.edge_m
+        return _frozen(np.array([(-e, e, 0.0), (e, e, 0.0), (e, -e, 0.0), (-e, -e, 0.0)]))
+
+    @cached_property
+    def code(self) -> NDArray[np.bool_]:
+        """Modules of the QR code, True where black, first row on top."""
+        return code_modules(self.anchor_id)
+
+    def black(self) -> dict[str, list[Rect]]:
+        """What is black on the paper: rectangles of the `code`, and of each marker (`marker 0` to `marker 3`)."""
+        shapes = {"code": _runs(self.code, self.code_corners[0], self.edge_m)}
+        for number, marker_id in enumerate(self.marker_ids):
+            corner = self.marker_corners[number][0]
+            shapes[f"marker {number}"] = _runs(marker_modules(marker_id), corner, self.marker_edge_m)
+        return shapes
+
+
+def marker_ids(anchor_id: str) -> tuple[int, ...]:
+    """Four different markers out of `DICTIONARY_SIZE`, by SHA-256 of the id. Two sheets have all four in common once
+    in 4e10; a single one in 1.6 % of the pairs, which geometry tells apart."""
+    digest = hashlib.sha256(b"iris-session sheet 1\0" + anchor_id.encode()).digest()
+    ids: list[int] = []
+    for k in range(0, len(digest), 2):
+        candidate = int.from_bytes(digest[k : k + 2], "big") % DICTIONARY_SIZE
+        if candidate not in ids:
+            ids.append(candidate)
+    return tuple(ids[:MARKERS])
+
+
+def code_modules(text: str) -> NDArray[np.bool_]:
+    """QR code of `text`: the smallest version at error correction M, or better where it costs no module."""
+    import segno
+
+    return np.array(segno.make(text, micro=False, error="m").matrix, dtype=np.bool_)
+
+
+def marker_modules(marker_id: int) -> NDArray[np.bool_]:
+    """Modules of an ArUco marker with its border, True where black, shape (6, 6)."""
+    import cv2
+
+    picture: Any = cv2.aruco.generateImageMarker(dictionary(), marker_id, MARKER_MODULES)
+    black: NDArray[np.bool_] = np.asarray(picture) == 0
+    return black
+
+
+def dictionary() -> Any:
+    """The dictionary of all sheets."""
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
+
+
+def _runs(modules: NDArray[np.bool_], upper_left: Array, edge_m: float) -> list[Rect]:
+    """Black modules as rectangles, those beside one another in a row as one."""
+    n = len(modules)
+    m = edge_m / n
+    rects: list[Rect] = []
+    for i, row in enumerate(modules):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
+        for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            rects.append(Rect(float(upper_left[0]) + a * m, float(upper_left[1]) - (i + 1) * m, (b - a) * m, m))
+    return rects
+
+
+def _frozen(a: Array) -> Array:
+    a.setflags(write=False)
+    return a

@@ -1,0 +1,191 @@
+"""A sheet as PDF or SVG at its exact size, with a ruler that shows whether the printer kept it.
+
+Both are a handful of vector shapes, written here by hand: one filled path per symbol (so that neighbouring modules have
+no seam), a few lines, and text in a font that every viewer has. Lengths are millimetres from the upper left corner of
+the page until the very end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Rect, Sheet, SheetError
+
+#: Width and height [mm], upright. ISO 216, and ANSI A for `letter`, ANSI B for `tabloid`.
+PAPERS: Final = {
+    "a5": (148.0, 210.0),
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "letter": (215.9, 279.4),
+    "tabloid": (279.4, 431.8),
+}
+#: White that printers leave at every side [mm].
+MARGIN_MM: Final = 6.0
+MM_PER_INCH: Final = 25.4
+POINTS_PER_MM: Final = 72.0 / MM_PER_INCH
+_LINE_MM: Final = 0.2
+
+
+@dataclass(frozen=True)
+class _Text:
+    x: float  # centre [mm]
+    y: float  # base line
+    height: float  # of the font [mm]
+    text: str
+
+
+@dataclass(frozen=True)
+class _Page:
+    """What is drawn [mm], origin in the upper left corner, y down."""
+
+    width: float
+    height: float
+    shapes: list[list[Rect]]  # each one path; `y` is the upper edge here
+    texts: list[_Text]
+
+
+def largest_edge_mm(paper: str) -> int:
+    """Largest code, in whole millimetres, whose sheet fits on the paper."""
+    width, height = _paper(paper)
+    return int(min((width / 2 - MARGIN_MM) / HALF_WIDTH, (height / 2 - MARGIN_MM) / HALF_HEIGHT))
+
+
+def to_svg(sheet: Sheet, paper: str = "a4") -> str:
+    """The sheet as an SVG whose user unit is one millimetre."""
+    page = _page(sheet, paper)
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{page.width:g}mm" height="{page.height:g}mm" '
+        f'viewBox="0 0 {page.width:g} {page.height:g}">',
+        f"<title>{_xml(_title(sheet))}</title>",
+        f'<rect width="{page.width:g}" height="{page.height:g}" fill="white"/>',
+    ]
+    for shape in page.shapes:
+        path = "".join(f"M{_n(r.x)} {_n(r.y)}h{_n(r.width)}v{_n(r.height)}h{_n(-r.width)}z" for r in shape)
+        lines.append(f'<path d="{path}"/>')
+    for text in page.texts:
+        lines.append(
+            f'<text x="{_n(text.x)}" y="{_n(text.y)}" font-family="Courier, monospace" '
+            f'font-size="{_n(text.height)}" text-anchor="middle">{_xml(text.text)}</text>'
+        )
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def to_pdf(sheet: Sheet, paper: str = "a4") -> bytes:
+    """The sheet as a one-page PDF 1.4; viewers are told not to scale it (`/PrintScaling /None`)."""
+    page = _page(sheet, paper)
+    content = "\n".join([f"{POINTS_PER_MM:.9f} 0 0 {-POINTS_PER_MM:.9f} 0 {page.height * POINTS_PER_MM:.6f} cm", "0 g"])
+    for shape in page.shapes:
+        content += "\n" + "\n".join(f"{_n(r.x)} {_n(r.y)} {_n(r.width)} {_n(r.height)} re" for r in shape) + "\nf"
+    for text in page.texts:
+        x = text.x - 0.5 * _width_of(text.text) * text.height
+        # The page's y points down: the text matrix turns it back up.
+        place = f"1 0 0 -1 {_n(x)} {_n(text.y)} Tm"
+        content += f"\nBT /F1 {_n(text.height)} Tf {place} ({_pdf_text(text.text)}) Tj ET"
+    stream = content.encode("ascii")
+    box = f"[0 0 {page.width * POINTS_PER_MM:.4f} {page.height * POINTS_PER_MM:.4f}]"
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>".encode("ascii"),
+        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Courier /Encoding /WinAnsiEncoding >>",
+        f"<< /Title ({_pdf_text(_title(sheet))}) >>".encode("ascii"),
+    ]
+    return _pdf_file(objects)
+
+
+def _pdf_file(objects: list[bytes]) -> bytes:
+    """Objects 1, 2, ... with header, cross-reference table and trailer (PDF reference 1.4, section 3.4)."""
+    out = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"
+    offsets = []
+    for number, text in enumerate(objects, 1):
+        offsets.append(len(out))
+        out += b"%d 0 obj\n%s\nendobj\n" % (number, text)
+    start = len(out)
+    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
+    out += b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
+    trailer = b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n"
+    return out + trailer % (len(objects) + 1, len(objects), start)
+
+
+def _paper(name: str) -> tuple[float, float]:
+    if name not in PAPERS:
+        raise SheetError(f"no paper {name!r}: {', '.join(PAPERS)}")
+    return PAPERS[name]
+
+
+def _page(sheet: Sheet, paper: str) -> _Page:
+    width, height = _paper(paper)
+    edge = 1e3 * sheet.edge_m
+    largest = largest_edge_mm(paper)
+    if edge > largest + 1e-9:
+        raise SheetError(
+            f"a code of {edge:g} mm with its frame does not fit on {paper}: at most {largest} mm there, or larger paper"
+        )
+    x0, y0 = 0.5 * width, 0.5 * height
+    shapes = [
+        [Rect(x0 + 1e3 * r.x, y0 - 1e3 * (r.y + r.height), 1e3 * r.width, 1e3 * r.height) for r in rects]
+        for rects in sheet.black().values()
+    ]
+    ruler, figures = _ruler(x0, y0 + 0.80 * edge, edge)
+    unit = 0.03 * edge  # height of the text; everything grows with the sheet
+    texts = [
+        *_lines(x0, y0 - 0.80 * edge, edge, unit, sheet.anchor_id),
+        _Text(x0, y0 - 0.70 * edge, unit, f"code {edge:g} mm  ^ up"),
+        _Text(x0, y0 + 0.73 * edge, 0.8 * unit, "print at 100 %, then measure:"),
+        *figures,
+    ]
+    return _Page(width, height, [*shapes, ruler], texts)
+
+
+def _lines(x: float, y: float, edge: float, unit: float, text: str) -> list[_Text]:
+    """The id between the two upper markers: as large as fits, long ones in several lines."""
+    room = 2.0 * (HALF_WIDTH - MARKER_EDGE) * edge - 4.0 * unit
+    n = min(len(text), max(16, int(room / (_width_of("m") * unit))))
+    parts = [text[k : k + n] for k in range(0, len(text), n)]
+    height = min(2.0 * unit, room / _width_of(parts[0]))
+    return [_Text(x, y + 1.2 * height * (k - 0.5 * (len(parts) - 1)), height, part) for k, part in enumerate(parts)]
+
+
+def _ruler(x: float, y: float, edge: float) -> tuple[list[Rect], list[_Text]]:
+    """A ruler of whole centimetres (millimetres on small sheets) between the two lower markers, centred at x."""
+    step = 10.0 if edge >= 60.0 else 1.0
+    n = int(0.5 * edge / step)
+    length = n * step
+    left = x - 0.5 * length
+    tick = 0.03 * edge
+    line = min(_LINE_MM, 0.1 * step)
+    # Ticks are centred on their mark: the ruler is measured from the middle of the first to the middle of the last.
+    rects = [Rect(left, y - 0.5 * line, length, line)]
+    for k in range(n + 1):
+        high = tick if k in (0, n) else 0.5 * tick
+        rects.append(Rect(left + k * step - 0.5 * line, y - high, line, high))
+    height = 0.024 * edge
+    return rects, [_Text(x, y + 1.5 * height, height, f"{length:g} mm between the long marks")]
+
+
+def _title(sheet: Sheet) -> str:
+    return f"anchor {sheet.anchor_id}, code {1e3 * sheet.edge_m:g} mm"
+
+
+def _width_of(text: str) -> float:
+    """Width of text over its height: every character of Courier is 0.6 wide."""
+    return 0.6 * len(text)
+
+
+def _n(value: float) -> str:
+    """A length with a tenth of a micrometre, without trailing zeros."""
+    text = f"{value:.4f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def _pdf_text(text: str) -> str:
+    return text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+
+
+def _xml(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")

@@ -1,0 +1,62 @@
+"""Cameras: against OpenCV, there and back, other resolutions, files with intrinsics."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from anchors.camera import Camera, CameraError, matrix_of, parse_camera, pose_of, pose_of_matrix, rvec_tvec
+from tests.models import BESIDE
+
+CAMERA = Camera(640, 480, 585.0, 584.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.01))
+
+
+def test_projection_is_that_of_opencv_and_its_inverse() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-0.3, 0.3, (50, 3))
+    rvec, tvec = np.array([0.3, -0.5, 1.1]), np.array([0.05, -0.02, 1.3])
+    pixels = CAMERA.project(points, pose_of(rvec, tvec))
+    wanted = cv2.projectPoints(points, rvec, tvec, CAMERA.matrix, CAMERA.coefficients)[0].reshape(-1, 2)
+    assert np.allclose(pixels, wanted, atol=1e-9)
+    seen = points @ cv2.Rodrigues(rvec)[0].T + tvec
+    assert np.allclose(CAMERA.normalise(pixels), seen[:, :2] / seen[:, 2:], atol=1e-10)
+
+
+def test_matrices_agree_with_rodrigues() -> None:
+    for rvec in ([0.0, 0.0, 0.0], [0.2, -0.3, 2.0], [np.pi, 0.0, 0.0]):
+        pose = pose_of(np.array(rvec), np.array([1.0, 2.0, 3.0]))
+        assert np.allclose(matrix_of(pose)[:3, :3], cv2.Rodrigues(np.array(rvec))[0], atol=1e-12)
+        assert np.allclose(matrix_of(pose_of_matrix(matrix_of(pose))), matrix_of(pose), atol=1e-12)
+        assert np.allclose(matrix_of(pose_of(*rvec_tvec(pose))), matrix_of(pose), atol=1e-12)
+
+
+def test_another_resolution_sees_the_same() -> None:
+    """The picture's edges stay where they are: pixel (-0.5, -0.5) is its corner at every resolution."""
+    double = CAMERA.scaled(1280, 960)
+    points = np.array([[0.1, -0.2, 1.0], [0.0, 0.0, 2.0]])
+    assert np.allclose(double.project(points), 2.0 * (CAMERA.project(points) + 0.5) - 0.5)
+
+
+def test_intrinsics_of_a_real_camera_are_read() -> None:
+    folder = Path(os.environ.get("IRIS_DATA") or BESIDE) / "rgbd"
+    camera = parse_camera((folder / "camera-intrinsics.txt").read_text(), 640, 480)
+    assert (camera.fx, camera.cx, camera.width) == (585.0, 320.0, 640)
+
+
+def test_files_with_intrinsics() -> None:
+    text = "width = 640\nheight = 480\nfx = 585\nfy = 584.0\ncx = 319.5\ncy = 239.5\n"
+    assert parse_camera(text + "distortion = [0.08, -0.18, 0.0008, -0.0005, 0.01]") == CAMERA
+    with pytest.raises(CameraError, match="cy is missing; wanted: width, height, fx, fy, cx, cy"):
+        parse_camera(text.replace("cy", "c_y"))
+    with pytest.raises(CameraError, match="neither a 3x3 matrix nor TOML"):
+        parse_camera("%YAML:1.0")
+    with pytest.raises(CameraError, match="3 distortion coefficients: 0, 4, 5 or 8"):
+        parse_camera(text + "distortion = [1, 2, 3]")
+    with pytest.raises(CameraError, match="not a number"):
+        parse_camera(text.replace("585", '"wide"'))
+    with pytest.raises(CameraError, match="above 0"):
+        parse_camera("585 0 320 0 585 240 0 0 1")

@@ -1,0 +1,125 @@
+"""The printed sheet: ids and layout that never change again, and PDF and SVG of exact size."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pypdfium2
+import pytest
+from numpy.typing import NDArray
+
+from anchors.sheet import Sheet, SheetError, marker_ids
+from anchors.sheet_print import MARGIN_MM, PAPERS, largest_edge_mm, to_pdf, to_svg
+
+TABLE = Sheet("table", 0.160)
+PER_MM = 10.0  # pixels of the rasterised page
+
+
+def _raster(pdf: bytes) -> NDArray[np.uint8]:
+    picture = pypdfium2.PdfDocument(pdf)[0].render(scale=PER_MM * 25.4 / 72.0, grayscale=True).to_numpy()
+    return np.asarray(picture).reshape(picture.shape[:2])
+
+
+def test_sheets_that_hang_in_labs_stay_valid() -> None:
+    """Whoever changes these numbers makes every printed sheet worthless."""
+    assert TABLE.marker_ids == (929, 562, 578, 437)
+    assert marker_ids("door") == (544, 3, 618, 419)
+    assert TABLE.marker_edge_m == pytest.approx(0.0464)
+    assert TABLE.marker_corners[0][0] == pytest.approx([-0.096, 0.1424, 0.0])
+    assert TABLE.marker_corners[2][2] == pytest.approx([0.096, -0.1424, 0.0])
+    assert TABLE.code_corners[1] == pytest.approx([0.08, 0.08, 0.0])
+
+
+def test_ids_of_sheets_differ() -> None:
+    all_ids = [marker_ids(f"anchor-{k}") for k in range(500)]
+    assert all(len(set(ids)) == 4 and min(ids) >= 0 and max(ids) < 1000 for ids in all_ids)
+    assert len({frozenset(ids) for ids in all_ids}) == 500
+
+
+@pytest.mark.parametrize(("anchor_id", "edge"), [("", 0.16), ("x" * 65, 0.16), ("Tür", 0.16), ("a\nb", 0.16)])
+def test_ids_that_readers_understand_differently_are_refused(anchor_id: str, edge: float) -> None:
+    with pytest.raises(SheetError, match="1 to 64 printable ASCII characters"):
+        Sheet(anchor_id, edge)
+
+
+@pytest.mark.parametrize("edge", [0.0, -0.1, float("nan"), float("inf"), 16.0])
+def test_impossible_sizes_are_refused(edge: float) -> None:
+    with pytest.raises(SheetError, match="20 to 2000 mm"):
+        Sheet("table", edge)
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_largest_sheet_fits_and_a_larger_one_is_refused(paper: str) -> None:
+    largest = largest_edge_mm(paper)
+    sheet = Sheet("table", largest / 1000.0)
+    width, height = PAPERS[paper]
+    assert 1e3 * sheet.size_m[0] <= width - 2 * MARGIN_MM + 1e-6
+    assert 1e3 * sheet.size_m[1] <= height - 2 * MARGIN_MM + 1e-6
+    assert to_pdf(sheet, paper).endswith(b"%%EOF\n")
+    with pytest.raises(SheetError, match=f"does not fit on {paper}: at most {largest} mm"):
+        to_svg(Sheet("table", (largest + 1) / 1000.0), paper)
+
+
+def test_unknown_paper_is_named() -> None:
+    with pytest.raises(SheetError, match="no paper 'a9': a5, a4"):
+        to_pdf(TABLE, "a9")
+
+
+def test_pdf_has_the_exact_size() -> None:
+    """Edges of what is black, in the rasterised page: within a twentieth of a millimetre of the layout."""
+    page = _raster(to_pdf(TABLE))
+    assert abs(page.shape[1] / PER_MM - 210.0) < 0.15
+    assert abs(page.shape[0] / PER_MM - 297.0) < 0.15
+    mm = 210.0 / page.shape[1]
+    ink = 1.0 - page.astype(np.float64) / 255.0
+    middle = page.shape[0] // 2 - round((80.0 - 3.8) / mm)  # through the uppermost row of modules
+    row = ink[middle, page.shape[1] // 2 - 900 : page.shape[1] // 2 + 900]
+    black = np.flatnonzero(row > 0.5)
+    assert (black[-1] - black[0] + 1) * mm == pytest.approx(160.0, abs=0.1)
+    for number, corners in enumerate(TABLE.marker_corners):
+        (x0, y0), (x1, y1) = 1e3 * corners[0, :2], 1e3 * corners[2, :2]
+        near = ink[round((147.5 - y0) / mm) : round((149.5 - y1) / mm), round((104 + x0) / mm) : round((106 + x1) / mm)]
+        for axis, edge in ((0, x1 - x0), (1, y0 - y1)):
+            black = np.flatnonzero(near.max(axis=axis) > 0.5)
+            assert (black[-1] - black[0] + 1) * mm == pytest.approx(edge, abs=0.1), number
+            assert black[0] * mm == pytest.approx(1.0, abs=0.15), number
+
+
+def test_pdf_is_well_formed() -> None:
+    pdf = to_pdf(Sheet(r"a (b) \c", 0.1))
+    table = pdf[int(re.findall(rb"startxref\n(\d+)", pdf)[0]) :]
+    assert table.startswith(b"xref\n0 7\n")
+    for number, offset in enumerate(re.findall(rb"(\d{10}) 00000 n ", table), 1):
+        assert pdf[int(offset) :].startswith(b"%d 0 obj" % number)
+    length = int(re.findall(rb"/Length (\d+)", pdf)[0])
+    assert pdf[pdf.index(b"stream\n") + 7 + length :].startswith(b"\nendstream")
+    text = pypdfium2.PdfDocument(pdf)[0].get_textpage().get_text_bounded()
+    assert r"a (b) \c" in text
+    assert "50 mm between the long marks" in text
+    assert b"/PrintScaling /None" in pdf
+
+
+def test_svg_draws_the_same() -> None:
+    root = ElementTree.fromstring(to_svg(Sheet("<a&b>", 0.160)))
+    assert (root.get("width"), root.get("height"), root.get("viewBox")) == ("210mm", "297mm", "0 0 210 297")
+    paths = [element.get("d") or "" for element in root if element.tag.endswith("path")]
+    assert len(paths) == 6  # code, four markers, ruler
+    assert "M25 68.5h" in paths[0]
+    assert paths[1].startswith("M9 6.1h46.4")
+    ticks = [float(x) for x in re.findall(r"M([\d.]+) ", paths[5])][1:]
+    assert np.allclose([b - a for a, b in pairwise(ticks)], 10.0, atol=1e-3)
+    texts = [element.text for element in root if element.tag.endswith("text")]
+    assert "<a&b>" in texts
+    assert "80 mm between the long marks" in texts
+
+
+@pytest.mark.parametrize(
+    "anchor_id", ["table", "lab 3: shelf, left", "lab-3/robot-cell-2/table-by-the-window/left-corner/sheet-no-0001"]
+)
+def test_code_says_the_id(anchor_id: str) -> None:
+    page = cv2.resize(_raster(to_pdf(Sheet(anchor_id, 0.160))), None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
+    assert cv2.QRCodeDetector().detectAndDecode(page)[0] == anchor_id
