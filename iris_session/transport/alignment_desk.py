@@ -10,7 +10,7 @@ import numpy as np
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.pose import IDENTITY_POSE, PoseTuple
 from iris_session.protocol.client_messages import Observation
-from iris_session.protocol.common import Pose
+from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
 
 #: What numbers of a stranger can make of linear algebra.
@@ -76,7 +76,8 @@ class AlignmentDesk:
         try:
             proposal = _proposal(self._estimator.estimate())
         except _UNSOLVABLE:
-            proposal = _refusal(0, "the observations of the anchor cannot be solved: look at it from elsewhere")
+            text = "the observations of the anchor cannot be solved: look at it from elsewhere"
+            proposal = _refusal(self._estimator.tracking_epoch, text)  # the authority ignores older epochs
         refused = (proposal.tracking_epoch, proposal.advice) if proposal.refused else None
         if refused is not None and refused == self._refused:
             return None
@@ -85,12 +86,12 @@ class AlignmentDesk:
 
     def _unknown_anchor(self, anchor_id: str, tracking_epoch: int) -> AlignmentProposal:
         known = ", ".join(sorted(self._anchors)) or "none"
-        return _refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}"[:512])
+        return _refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}")
 
 
 def _refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
     p, q = IDENTITY_POSE
-    return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice)
+    return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
 
 
 def _proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
@@ -105,5 +106,5 @@ def _proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
         n_observations=estimate.n_observations,
         n_viewpoints=estimate.n_viewpoints,
         refused=estimate.refused,
-        advice=estimate.advice,
+        advice=estimate.advice[:MAX_TEXT],  # it may list many sheets
     )

@@ -138,3 +138,32 @@ def test_an_unknown_sheet_beside_a_known_one_replaces_no_estimate_and_is_told_on
     assert not desk.due(2 * PERIOD)
     desk.observe(seen(10, anchor="poster", epoch=2))
     assert desk.due(2 * PERIOD), "in a new tracking frame it is worth a word again"
+
+
+def test_advice_that_names_many_sheets_still_fits_into_a_proposal() -> None:
+    names = [f"sheet on the far side of the laboratory, number {k:02}" for k in range(12)]
+    desk = AlignmentDesk({name: ((float(k), 0.0, 0.8), IDENTITY_POSE[1]) for k, name in enumerate(names)}, PERIOD)
+    for k, name in enumerate(names):  # each as if it alone were right: none agrees with another
+        for i in range(6):
+            desk.observe(
+                msgspec.structs.replace(seen(i, name, pose=Pose((-2.0 * k, k, 0.8), IDENTITY.q)), viewpoint_id=0)
+            )
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert proposal.refused
+    assert names[0] in proposal.advice
+    assert decode_entry(encode_entry(Entry(1, 1, 0, proposal))).message == proposal
+
+
+def test_what_cannot_be_solved_is_refused_in_the_epoch_it_was_seen_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The authority ignores proposals of older epochs: with another number the wearer would never be told."""
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    desk.observe(seen(epoch=3))
+
+    def fails(_: object) -> None:
+        raise ArithmeticError
+
+    monkeypatch.setattr("anchors.alignment.AlignmentEstimator.estimate", fails)
+    proposal = desk.propose(0)
+    assert proposal is not None
+    assert (proposal.refused, proposal.tracking_epoch) == (True, 3)
