@@ -50,12 +50,14 @@ class Settings(msgspec.Struct, frozen=True):
     """Of the process that recorded, not of the simulation: what a resumed session takes over.
 
     `state_hz`: rate of state frames. `keyframe_s`: distance of keyframes [s]. `realtime`: a real-time priority was
-    asked for.
+    asked for. `adapt_media`: slow links get fewer media. `anchor_sizes`: edge of the printed sheets [m].
     """
 
     state_hz: float
     keyframe_s: float
     realtime: bool
+    adapt_media: bool = True
+    anchor_sizes: dict[str, float] = {}
 
 
 class SessionHeader(msgspec.Struct, frozen=True):

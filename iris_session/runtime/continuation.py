@@ -134,6 +134,9 @@ class Continuation:
         for kept in (self.header.settings, None if self.note is None else self.note.listening):
             had_them = {} if kept is None else msgspec.structs.asdict(kept)
             changes |= {name: had for name, had in had_them.items() if getattr(given, name) == getattr(plain, name)}
+        if "anchor_sizes" in changes:  # sheets that were given anew may be others
+            anchors = changes.get("anchors", given.anchors)
+            changes["anchor_sizes"] = {name: m for name, m in changes["anchor_sizes"].items() if name in anchors}
         return dataclasses.replace(given, control=core.control, **changes)
 
     def _check(self, model: mujoco.MjModel) -> None:

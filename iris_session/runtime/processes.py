@@ -213,7 +213,7 @@ class SessionProcesses:
             origin_ns=self._origin_ns,
             boot_id=boot_id(),
             anchors=anchor_poses(self._config),
-            settings=Settings(self._config.state_hz, self._config.keyframe_s, self._config.realtime),
+            settings=settings_of(self._config),
         )
 
     def watch(self, stepper: Stepper) -> None:
@@ -310,6 +310,13 @@ class SessionProcesses:
 def anchor_poses(config: SessionConfig) -> dict[str, Pose]:
     """`T_world_anchor` of each sheet, as it travels."""
     return {name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()}
+
+
+def settings_of(config: SessionConfig) -> Settings:
+    """What a resumed session takes over, as it is noted in the recording."""
+    return Settings(
+        config.state_hz, config.keyframe_s, config.realtime, config.adapt_media, anchor_sizes=config.sheet_sizes()
+    )
 
 
 def _scene_info(world: World) -> SceneInfo:

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
 from iris_session.physics import load_model, model_bytes
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol.client_messages import Marker
-from iris_session.protocol.common import Applied
+from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import Gap, StateHeader
@@ -47,6 +48,7 @@ from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import MARGIN_NS, Continuation, begin
 from iris_session.runtime.core import CoreState, SessionCore
 from iris_session.runtime.errors import ConfigError, ResumeError
+from iris_session.runtime.processes import settings_of
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path, read_note
 from iris_session.runtime.stepper import Stepper
 from iris_session.runtime.verification import verify_recording
@@ -295,6 +297,35 @@ def test_rates_are_as_they_were_unless_told_otherwise(tmp_path: Path) -> None:
     assert past is not None
     past.close()
     assert (config.state_hz, config.keyframe_s, config.realtime) == (30.0, 1.0, False)
+
+
+@pytest.mark.parametrize(("given", "sizes"), [({}, {"wall": 0.2}), ({"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}, {})])
+def test_sheets_are_checked_for_misprints_as_they_were(
+    tmp_path: Path, given: dict[str, PoseTuple], sizes: dict[str, float]
+) -> None:
+    """Of sheets that are given anew, no size is known."""
+    settings = Settings(60.0, 5.0, True, adapt_media=False, anchor_sizes={"wall": 0.2})
+    anchors = {"wall": Pose((1.0, 0.0, 1.0), IDENTITY_QUAT)}
+    path = recorded(tmp_path / "session.rrd", settings=settings, anchors=anchors)
+    anew = {"anchors": given} if given else {}
+    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    assert past is not None
+    past.close()
+    assert config.sheet_sizes() == sizes
+    assert not config.adapt_media
+
+
+def test_what_is_noted_for_a_resumed_session_is_what_it_was_given() -> None:
+    config = SessionConfig(
+        state_hz=30.0,
+        keyframe_s=2.0,
+        realtime=False,
+        adapt_media=False,
+        anchors={"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)},
+        anchor_sizes={"wall": 0.2},
+    )
+    noted = settings_of(config)
+    assert {name: getattr(config, name) for name in noted.__struct_fields__} == msgspec.structs.asdict(noted)
 
 
 # --- tokens -----------------------------------------------------------------------------------------------------------
