@@ -46,7 +46,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     output: str = OUTPUT_CTRL
     # --- inverse kinematics
     solve_rate_hz: float = 100.0  # per robot, at most
-    max_solves_per_tick: int = 2  # of robots in turn: eight robots at 100 Hz need 1.6 in a tick of 2 ms
+    max_solves_per_tick: int = 3  # of robots in turn, where so many are needed: see `Reach.solves_per_tick`
     sample_rate_min_hz: float = 60.0  # slowest device; longer gaps between samples are not stretched into slow motion
     position_cost: float = 1.0  # [1/m]
     orientation_cost: float = 0.3  # [1/rad]: 1 mm counts as much as 3.3 mrad

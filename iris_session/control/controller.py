@@ -64,6 +64,7 @@ class Controller:
         self._grasps = Grasps(model, objects, self._config)
         self._proximity = Proximity(model, self._robots, self._config)
         self._check_ticks = max(1, round(self._config.proximity_period_s / self._dt))
+        self._solves = self._reach.solves_per_tick(self._check_ticks)
         self._states = [RobotState() for _ in self._robots]
         self._status = [ControlStatus(robot.name) for robot in self._robots]
         self._now_ns = 0
@@ -251,13 +252,13 @@ class Controller:
     # --- once a tick --------------------------------------------------------------------------------------------------
 
     def _solve_due(self, data: mujoco.MjData, checks: bool) -> None:
-        """Integrates twists; solves for at most `max_solves_per_tick` robots, taking turns.
+        """Integrates twists; solves for a bounded number of robots, taking turns.
 
-        A tick that `checks` distances too solves once less: ticks with all the work at once would be the late ones.
+        A tick that `checks` distances too solves less: ticks with all the work at once would be the late ones.
         """
-        n, left, start = len(self._states), self._config.max_solves_per_tick, self._cursor
-        if checks and self._proximity.active and self._joints.moving:
-            left = max(1, left - 1)
+        n, start = len(self._states), self._cursor
+        usual, besides_checks = self._solves
+        left = besides_checks if checks and self._proximity.active and self._joints.moving else usual
         self._follow_bases(data)
         for i in (*range(start, n), *range(start)):
             r = self._states[i]

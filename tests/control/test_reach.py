@@ -77,6 +77,22 @@ def test_solves_are_at_most_100_hz_per_robot_and_two_a_tick_and_all_robots_get_t
         assert len(own) > 70
 
 
+@pytest.mark.parametrize(("n", "tick_s", "interval_ticks"), [(3, 0.01, 1), (4, 0.005, 2), (12, 0.002, 5)])
+def test_long_ticks_and_many_robots_starve_nobody(n: int, tick_s: float, interval_ticks: int) -> None:
+    """A robot that is solved less often than its device sends moves slower than its hand."""
+    model, robots = iiwa_arms([(1.5 * (i % 4), 1.5 * (i // 4), 0.0) for i in range(n)])
+    model.opt.timestep = tick_s
+    made = Rig(model, robots, home=IIWA_HOME)
+    solves = count_solves(made)
+    for k in range(40):
+        made.step(decision(pose_command(r.name, made.source((0.001 * k, 0.0, 0.0))) for r in robots))
+    assert np.bincount([t for t, _ in solves]).max() <= 3
+    for i in range(n):
+        own = [t for t, robot in solves if robot == i]
+        assert np.diff(own)[1:].max() <= interval_ticks + 1
+        assert np.diff(own)[1:].mean() < interval_ticks + 0.2
+
+
 def test_a_new_sample_is_solved_in_its_own_tick() -> None:
     made = rig()
     made.step(decision([pose_command("iiwa", made.source((0.0, 0.0, 0.0)))]))
