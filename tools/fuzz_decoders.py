@@ -214,9 +214,14 @@ class KeyFiles(Decoder):
         self._folder.cleanup()
 
 
+#: A pair of the manual of zmq_curve: a public key that is not the secret one's is refused.
+_PUBLIC: Final = r"rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
+_SECRET: Final = r"JTKVSB%%)wK0E.X)V>+}o?pNmC{O&4W4b!Ni{Lh6"
+
+
 def _certificate(rng: Random) -> bytes:
-    key = rng.choice(("a" * 40, "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID", "~" * 40, "a" * 39, "ü" * 40))
-    lines = ["#   comment", "metadata", "curve", f'    public-key = "{key}"', f'    secret-key = "{key}"']
+    public, secret = rng.choice(((_PUBLIC, _SECRET), (_PUBLIC, _SECRET), (_SECRET, _PUBLIC), ("~" * 40, "ü" * 40)))
+    lines = ["#   comment", "metadata", "curve", f'    public-key = "{public}"', f'    secret-key = "{secret}"']
     return "\n".join(line for line in lines if rng.random() < 0.95).encode()
 
 
