@@ -24,7 +24,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, open_blob, root_of
+from iris_session.recording.journal import FORMAT, JournalRow, Keyframe, SessionHeader, open_blob, root_of
 from iris_session.recording.messages import DenialRecord, EndMark, decode_header
 from iris_session.recording.probe import Prober
 
@@ -266,6 +266,9 @@ class Recording:
                 header = decode_header(blob)
             except _UNREADABLE as error:
                 raise NotARecordingError(f"the header of {path} is damaged: {_said(error)}") from error
+            if header.format != FORMAT and intact:
+                had = f"{path} was recorded in format {header.format} on {header.created_utc[:10] or 'an unknown day'}"
+                raise NotARecordingError(f"{had}, this iris-session reads format {FORMAT}: use the one that made it")
             self.root = root_of(blob)
             if not intact:
                 self.damage.append("header: its bytes were changed (checksum)")

@@ -35,4 +35,5 @@ class ReplayCore:
 
 def verify_recording(path: Path, progress: Callable[[int, int], None] | None = None) -> VerifyReport:
     """Re-simulates every step of the recording at `path`. Raises `RecordingError` when it cannot be read at all."""
+    blas.use_one_thread()  # before versions are compared: threads that are not used here are no difference
     return verify(path, ReplayCore, progress)

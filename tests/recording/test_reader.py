@@ -6,10 +6,12 @@ import os
 import random
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from iris_session.recording import Continues, NotARecordingError, Recording, VerifyReport, paths, rrd_file, verify
 from iris_session.recording.columns import blobs, nanoseconds, sequence
+from iris_session.recording.journal import FORMAT
 from iris_session.recording.paths import part_path
 from iris_session.recording.verify import _Run
 from iris_session.recording.writer import RrdWriter
@@ -209,6 +211,15 @@ def test_what_is_no_recording_is_one_line(tmp_path: Path, data: bytes | None, re
     if data is not None:
         path.write_bytes(data)
     with pytest.raises(NotARecordingError, match=reason):
+        Recording.open(path)
+
+
+def test_a_recording_of_another_format_is_refused_in_one_line_that_says_so(tmp_path: Path) -> None:
+    header, batch = journal(5)
+    old = msgspec.structs.replace(header, format=FORMAT - 1, created_utc="2026-11-20T10:00:00.000+00:00")
+    path = write(tmp_path / "old.rrd", old, batch)
+    said = f"recorded in format {FORMAT - 1} on 2026-11-20, this iris-session reads format {FORMAT}"
+    with pytest.raises(NotARecordingError, match=said):
         Recording.open(path)
 
 
