@@ -8,6 +8,7 @@ moved. Pure: text in, text out; files are the caller's.
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -54,10 +55,10 @@ class Constellation:
 
     def to_toml(self) -> str:
         """As a person reads and edits it."""
-        lines = [f"format = {FORMAT}", f'reference = "{self.reference}"', ""]
+        lines = [f"format = {FORMAT}", f"reference = {_quoted(self.reference)}", ""]
         for name in sorted(self.anchors):
             p, q = self.anchors[name]
-            lines.append(f'[anchors."{name}"]')
+            lines.append(f"[anchors.{_quoted(name)}]")
             lines.append(f"position_m = [{', '.join(repr(float(c)) for c in p)}]")
             lines.append(f"quaternion_wxyz = [{', '.join(repr(float(c)) for c in q)}]")
             lines.append(f"error_m = {float(self.error_m.get(name, 0.0))!r}")
@@ -85,6 +86,11 @@ class Constellation:
             {name: error for name, (_, error, _) in read.items()},
             {name: size for name, (_, _, size) in read.items() if size > 0.0},
         )
+
+
+def _quoted(name: str) -> str:
+    """A string of TOML: printable names need the escapes of JSON and no others."""
+    return json.dumps(name, ensure_ascii=False)
 
 
 def _read_anchor(name: str, table: Any) -> tuple[PoseTuple, float, float]:
@@ -154,6 +160,13 @@ def solve_constellation(
         if bool(np.all(now == weights)):
             break
         weights = now
+    kept = [e for e, weight in zip(edges, weights.tolist(), strict=True) if weight > 0.0]
+    adrift = sorted(set(names) - reachable(kept, reference))
+    if adrift:  # nothing holds them in place any more, so no error could be stated
+        raise ConstellationError(
+            f"what was seen of {', '.join(adrift)} contradicts itself or the other sheets: were sheets moved "
+            "meanwhile? look at each of them again"
+        )
     return _solved(graph, x, covariance, weights, sizes or {})
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from anchors.groups import Group, Sighting
 from anchors.lie import Array, quat_conjugate, quat_matrix, quat_multiply
 from anchors.noise import NoiseModel
-from anchors.pose import PoseTuple, quat_normalize
+from anchors.pose import PoseTuple, is_rigid, quat_normalize
 
 if TYPE_CHECKING:
     from anchors.constellation import Seen
@@ -35,9 +35,12 @@ class Edge:
 
 
 def merge_edges(observations: Sequence[Seen], noise: NoiseModel, fallback: Array) -> list[Edge]:
-    """One edge per viewpoint and sheet; viewpoints whose observations do not agree are left out."""
+    """One edge per viewpoint and sheet; what is no pose, and viewpoints whose observations do not agree, are left
+    out."""
     groups: dict[tuple[str, int, int, str], Group] = {}
     for o in observations:
+        if not is_rigid(o.T_tracking_anchor):
+            continue
         p, q = o.T_tracking_anchor
         sighting = Sighting(0, p, quat_normalize(q), o.p_tracking_head, (), 1.0, 0.0)
         groups.setdefault((o.headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id), Group()).sightings.append(

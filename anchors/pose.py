@@ -108,3 +108,10 @@ def apply(a: PoseTuple, p: Vec3) -> Vec3:
 def distance(a: Vec3, b: Vec3) -> float:
     """Euclidean distance [m]."""
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+def is_rigid(T: PoseTuple, reach_m: float = 1e3) -> bool:
+    """Whether numbers from elsewhere are a pose: finite, a unit quaternion (to 1 %), no further away than `reach_m`."""
+    p, q = T
+    norm = math.sqrt(sum(c * c for c in q))
+    return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= reach_m

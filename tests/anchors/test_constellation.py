@@ -171,3 +171,36 @@ def test_a_moved_sheet_is_found_through_noise() -> None:
     moved = {**ROOM, "right": shifted(ROOM["right"], (0.0, 0.04, 0.0))}
     now = solve_constellation(_looks(moved, plan, 12), "door", ROOM["door"]).constellation
     assert [m.anchor_id for m in find_moved(saved, now)] == ["right"]
+
+
+def test_names_with_quotes_are_saved_and_read_back() -> None:
+    names = ['the "big" one', "back\\slash", "Tür"]
+    saved = Constellation(names[0], dict.fromkeys(names, ROOM["door"]), {}, {})
+    back = Constellation.from_toml(saved.to_toml())
+    assert (back.reference, sorted(back.anchors)) == (names[0], sorted(names))
+
+
+def test_a_sheet_of_which_nothing_fits_is_named_and_states_no_error() -> None:
+    """Two headsets saw it at two places: with these looks left out nothing holds it, which is no error of 0 mm."""
+    seen = _looks(ROOM, {"a": "drw", "b": "drw"}, 4)
+    torn = [
+        Seen(
+            o.headset,
+            0,
+            o.viewpoint_id,
+            o.anchor_id,
+            shifted(o.T_tracking_anchor, (0.0, 0.0, 0.0 if o.headset == "a" else 0.4)),
+            o.p_tracking_head,
+        )
+        if o.anchor_id == "right"
+        else o
+        for o in seen
+    ]
+    with pytest.raises(ConstellationError, match=r"what was seen of right.* contradicts"):
+        solve_constellation(torn, "door", ROOM["door"])
+
+
+def test_what_is_no_pose_is_left_out() -> None:
+    seen = _looks(ROOM, {"a": "dlrw"}, 4)
+    bad = [Seen("a", 0, 0, "door", (ROOM["door"][0], (math.nan, 0.0, 0.0, 0.0))), *seen]
+    assert solve_constellation(bad, "door").constellation == solve_constellation(seen, "door").constellation
