@@ -20,7 +20,7 @@ import numpy as np
 from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_matrix
 from anchors.noise import NoiseModel
-from anchors.pose import PoseTuple, Vec3, apply, distance, quat_angle
+from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, quat_angle
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
@@ -97,6 +97,8 @@ class DriftMonitor:
 
     def head(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         """A head pose as tracked: a new epoch or an impossible speed is a jump."""
+        if tracking_epoch < self.tracking_epoch or not is_rigid(T_tracking_head):
+            return None  # of a frame that is void, or no pose: nothing to compare with
         alarm = self._epoch(capture_ns, tracking_epoch)
         last, self._head = self._head, (capture_ns, T_tracking_head)
         if alarm is not None or last is None or not 0 < capture_ns - last[0] <= 500_000_000:
@@ -129,8 +131,8 @@ class DriftMonitor:
         while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.window_ns + self.config.reference_ns:
             seen.popleft()
         seen.append(_Seen(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
-        if capture_ns < self._quiet_until_ns.get(anchor_id, capture_ns):
-            return None
+        if 0 < self._quiet_until_ns.get(anchor_id, 0) - capture_ns <= self.config.quiet_ns:
+            return None  # more than that: the clock was set back
         return self._judge(anchor_id, capture_ns, alignment)
 
     def _judge(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
@@ -160,13 +162,13 @@ class DriftMonitor:
         beside = tuple(
             other
             for other in sorted(self._steady_ns)
-            if other != anchor_id and now_ns - self._steady_ns[other] < self.config.window_ns
+            if other != anchor_id and abs(now_ns - self._steady_ns[other]) < self.config.window_ns
         )
         return Alarm(change[0], anchor_id, change[1], now_ns, beside)
 
     def _before(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
         kept = self._references.get(anchor_id)
-        if kept is not None and now_ns < kept[0] and kept[1] == viewpoint_id:
+        if kept is not None and 0 < kept[0] - now_ns <= self.config.reference_every_ns and kept[1] == viewpoint_id:
             return kept[2]
         old = [s for s in self._seen[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
         reference = self._window(old, viewpoint_id)

@@ -154,3 +154,30 @@ def test_hostile_numbers_and_unknown_anchors_say_nothing_and_memory_is_bounded()
         monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5, 0)
         monitor.observe("sheet", (0.0, 0.0, 1.0), zero, 5 - i, 0)
     assert len(monitor._seen["sheet"]) <= 50
+
+
+def test_heads_of_a_void_frame_and_heads_that_are_no_pose_are_no_jump() -> None:
+    monitor = DriftMonitor(ANCHORS)
+    place: PoseTuple = ((0.0, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0))
+    assert monitor.head(place, 0, 0) is None
+    moved = monitor.head(shifted(place, (2.0, 0.0, 0.0)), PERIOD, 1)
+    assert moved is not None
+    assert moved.kind == "epoch"
+    assert monitor.head(shifted(place, (2.0, 0.0, 0.0)), 2 * PERIOD, 1) is None
+    assert monitor.head(place, 2 * PERIOD + 1, 0) is None, "late, of the frame before"
+    assert monitor.head(((math.nan, 0.0, 0.0), place[1]), 2 * PERIOD + 2, 1) is None
+    jumped = monitor.head(shifted(place, (4.0, 0.0, 0.0)), 3 * PERIOD, 1)
+    assert jumped is not None
+    assert jumped.kind == "jump"
+
+
+def test_a_clock_that_was_set_back_after_an_alarm_does_not_silence_the_next_one() -> None:
+    rng = np.random.default_rng(1)
+    T = headset(rng)
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.7))
+    monitor = DriftMonitor(ANCHORS)
+    late = 36_000
+    assert _watch(monitor, look, T, range(late, late + 40)) == []
+    assert _watch(monitor, look, shifted(T, (0.03, 0.0, 0.0)), range(late + 40, late + 60))
+    assert _watch(monitor, look, shifted(T, (0.03, 0.0, 0.0)), range(40)) == []
+    assert _watch(monitor, look, T, range(40, 60))
