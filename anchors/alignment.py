@@ -20,10 +20,10 @@ from typing import Final
 import numpy as np
 
 from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, upright
-from anchors.groups import Key, Memory, Sighting
+from anchors.groups import Group, Key, Memory, Sighting
 from anchors.lie import Array
-from anchors.noise import NoiseModel, isotropic
-from anchors.pose import PoseTuple, Quat, Vec3, compose, inverse, quat_mul, quat_normalize, quat_rotate
+from anchors.noise import NoiseModel, isotropic, stated
+from anchors.pose import PoseTuple, Quat, Vec3, compose, inverse, is_rigid, quat_mul, quat_normalize, quat_rotate
 from anchors.robust import Merged
 from anchors.solve import Prior, Problem, Solution, agreeing_anchors, in_world, inverted, problem, solve
 from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
@@ -47,9 +47,10 @@ class AlignmentConfig:
     axis) where nothing is. `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
     vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong. `drift_m_per_s`, `walk_m_per_sqrt_s`:
     how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the anchors above which the
-    estimate is refused. `max_observations`, `max_groups`: the oldest are forgotten (counted in `forgotten`), as are
-    those older than the newest by more than `max_age_ns` (`outdated`). `min_agreeing`: share of one viewpoint's
-    observations that must agree. `size_tolerance`: by what share a sheet may measure otherwise than it should.
+    estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`: the oldest are forgotten
+    (counted in `forgotten`), as are those older than the newest by more than `max_age_ns` (`outdated`).
+    `min_agreeing`: share of one viewpoint's observations that must agree. `size_tolerance`: by what share a sheet may
+    measure otherwise than it should.
     """
 
     position_sigma_m: float = 0.005
@@ -64,6 +65,7 @@ class AlignmentConfig:
     max_error_m: float = 0.03
     min_observations: int = 5
     max_observations: int = 600
+    max_in_group: int = 120
     max_groups: int = 48
     max_age_ns: int = 600 * 1_000_000_000
     min_agreeing: float = 0.6
@@ -127,14 +129,16 @@ class AlignmentEstimator:
     wrong_size: int = 0
     against_gravity: int = 0
     unmirrored: int = 0
-    _misprint: str = ""
+    _against_gravity: int = 0  # in this epoch
+    _misprints: dict[str, str] = field(default_factory=dict)  # by sheet: what its last measured size says
     _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
     _memory: Memory = field(init=False)
 
     def __post_init__(self) -> None:
         if self.config.dof not in (4, 6):
             raise ValueError(f"dof {self.config.dof}: it is 4 (level headset) or 6 (tilt is measured)")
-        self._memory = Memory(self.config.max_observations, self.config.max_groups, self.config.max_age_ns)
+        c = self.config
+        self._memory = Memory(c.max_observations, c.max_in_group, c.max_groups, c.max_age_ns)
 
     @property
     def forgotten(self) -> int:
@@ -171,22 +175,23 @@ class AlignmentEstimator:
         if tracking_epoch < self.tracking_epoch:
             self.stale_epochs += 1
             return False
-        if not _is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not _is_place(p_tracking_head):
+        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not _is_place(p_tracking_head):
             self.invalid += 1
             return False
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
             self._memory.clear()
-            self._misprint, self._near = "", None
+            self._against_gravity, self._misprints, self._near = 0, {}, None
         if not self._is_of_size(anchor_id, size_m):
             return False
         pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
         if pose is None:
             self.against_gravity += 1
+            self._against_gravity += 1
             return False
         self._memory.add(
             (anchor_id, viewpoint_id),
-            Sighting(capture_ns, pose[0], pose[1], p_tracking_head, tuple(covariance), quality, size_m),
+            Sighting(capture_ns, pose[0], pose[1], p_tracking_head, stated(covariance), quality, size_m),
         )
         return True
 
@@ -198,7 +203,7 @@ class AlignmentEstimator:
         if self.config.dof == 6 or _tilt(T_world_anchor, pose) <= self.config.max_tilt_rad:
             return pose
         if alternative is not None:
-            other = (alternative[0], quat_normalize(alternative[1])) if _is_rigid(alternative) else None
+            other = (alternative[0], quat_normalize(alternative[1])) if is_rigid(alternative) else None
         else:
             other = mirrored(pose, p_head) if p_head is not None else None
         if other is None or _tilt(T_world_anchor, other) > self.config.max_tilt_rad:
@@ -209,19 +214,26 @@ class AlignmentEstimator:
     def _is_of_size(self, anchor_id: str, size_m: float) -> bool:
         """A sheet printed too large is seen too near: its pose is off by the same share."""
         size = self.sizes.get(anchor_id, 0.0)
-        if size <= 0.0 or not size_m > 0.0 or abs(size_m - size) <= self.config.size_tolerance * size:
+        if size <= 0.0 or not size_m > 0.0:
+            return True
+        if abs(size_m - size) <= self.config.size_tolerance * size:
+            self._misprints.pop(anchor_id, None)
             return True
         self.wrong_size += 1
-        self._misprint = (
+        self._misprints[anchor_id] = (
             f"sheet '{anchor_id}' measures {size_m * 1e3:.0f} mm, not {size * 1e3:.0f} mm: printed at the wrong scale?"
         )
         return False
 
+    def _misprint(self) -> str:
+        return next(iter(self._misprints.values()), "")
+
     def estimate(self) -> AlignmentEstimate:
         """Solves what was observed in the current epoch. Groups that did not change are not merged again."""
         if len(self._memory) < self.config.min_observations:
-            return self._refusal(self._misprint or upright(self.against_gravity, len(self._memory)) or LOOK)
-        keys, merged = self._merge()
+            return self._refusal(self._misprint() or upright(self._against_gravity, len(self._memory)) or LOOK)
+        groups = self._memory.with_a_say(self.config.min_observations)
+        keys, merged = self._merge(groups)
         if not merged:
             return self._refusal(CONTRADICT)
         prior = self.config.prior
@@ -236,15 +248,15 @@ class AlignmentEstimator:
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
         moved = outvoted(b.anchor, s)
-        if agreeing < self.config.min_observations or not self._is_majority(b, s, len(self._memory.groups)):
+        if agreeing < self.config.min_observations or not self._is_majority(b, s, len(groups)):
             return self._refusal(disagreement(sorted(set(b.anchor))))
         return self._result(b, s, tilt, moved)
 
-    def _merge(self) -> tuple[list[Key], list[Merged]]:
+    def _merge(self, groups: Mapping[Key, Group]) -> tuple[list[Key], list[Merged]]:
         """One merged observation per anchor and viewpoint, of those whose observations agree."""
         fallback = isotropic(self.config.position_sigma_m, self.config.rotation_sigma_rad)
         keys, merged = [], []
-        for key, group in self._memory.groups.items():
+        for key, group in groups.items():
             one = group.solve(self.config.noise, fallback, self.config.min_agreeing)
             if one is not None:
                 keys.append(key)
@@ -284,10 +296,10 @@ class AlignmentEstimator:
             advice = f"the error would be {error * 1e3:.0f} mm: step closer to the sheet, look at it from several sides"
         elif moved:
             advice = f"moved since it was measured: sheet {' and '.join(map(repr, moved))}; it is not used"
-        elif tilt > self.config.tilt_warning_rad:
+        elif tilt > self.config.tilt_warning_rad and self.config.dof == 4:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
-            advice = size_advice(self._memory.sightings(), self.config.size_tolerance) or self._misprint
+            advice = size_advice(self._memory.sightings(), self.config.size_tolerance) or self._misprint()
         return AlignmentEstimate(
             inverted(s.t, s.q),
             self.tracking_epoch,
@@ -314,7 +326,7 @@ class AlignmentEstimator:
         """Everything that `estimate` and `add` depend on but anchors, sizes and configuration."""
         counters = [getattr(self, name) for name in _COUNTERS]
         near = None if self._near is None else [part.tolist() for part in self._near]
-        plain = {"counters": counters, "misprint": self._misprint, "near": near}
+        plain = {"counters": counters, "misprints": self._misprints, "near": near}
         return json.dumps({**plain, **self._memory.snapshot()}).encode()
 
     def restore(self, snapshot: bytes) -> None:
@@ -322,13 +334,14 @@ class AlignmentEstimator:
         data = json.loads(snapshot)
         for name, value in zip(_COUNTERS, data["counters"], strict=True):
             setattr(self, name, int(value))
-        self._misprint, near = str(data["misprint"]), data["near"]
+        self._misprints, near = dict(data["misprints"]), data["near"]
         self._near = None if near is None else (np.array(near[0]), np.array(near[1]))
         self._memory.restore(data)
 
 
 _COUNTERS: Final = (
     *("tracking_epoch", "unknown_anchors", "stale_epochs", "invalid", "wrong_size", "against_gravity", "unmirrored"),
+    "_against_gravity",
 )
 
 
@@ -351,12 +364,6 @@ def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
         return T_tracking_anchor
     view: Quat = (0.0, x / n, y / n, z / n)
     return p, quat_normalize(quat_mul(quat_mul(view, q), (0.0, 0.0, 0.0, 1.0)))
-
-
-def _is_rigid(T: PoseTuple) -> bool:
-    p, q = T
-    norm = math.sqrt(sum(c * c for c in q))
-    return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= 1e3
 
 
 def _is_place(p: Vec3 | None) -> bool:

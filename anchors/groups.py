@@ -8,20 +8,22 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from anchors.lie import Array
-from anchors.noise import NoiseModel, stated
+from anchors.noise import NoiseModel
 from anchors.pose import Quat, Vec3
 from anchors.robust import Merged, merge, middle
 
 Key = tuple[str, int]
+_JUST_BEGUN: Final = 3  # fewer sightings cannot outvote one wrong detection among them
 
 
 class Sighting(NamedTuple):
-    """One observation `T_tracking_anchor` (`p`, unit `q`). `p_head`: where the observer was, tracking frame."""
+    """One observation `T_tracking_anchor` (`p`, unit `q`). `p_head`: where the observer was, tracking frame.
+    `covariance`: as stated by the observer and found valid (36 values), else empty."""
 
     capture_ns: int
     p: Vec3
@@ -51,9 +53,9 @@ class Group:
 
     def _noise(self, p: Array, noise: NoiseModel, fallback: Array) -> tuple[Array, Array]:
         """What the observers state comes first, then the model from where they stood, then the configured default."""
-        given = [C for s in self.sightings if s.covariance and (C := stated(s.covariance)) is not None]
+        given = [s.covariance for s in self.sightings if s.covariance]
         if given:
-            return noise.split(np.mean(given, axis=0))
+            return noise.split(np.mean(np.array(given), axis=0).reshape(6, 6))
         heads = [s.p_head for s in self.sightings if s.p_head is not None]
         if heads:
             return noise.seen_from(middle(np.array(heads)), middle(p))
@@ -71,6 +73,7 @@ class Memory:
     """Groups of one tracking epoch; the oldest observations go first."""
 
     max_observations: int
+    max_in_group: int
     max_groups: int
     max_age_ns: int
     forgotten: int = 0
@@ -89,6 +92,10 @@ class Memory:
             self._pop()
             self.forgotten += 1
         group = self.groups.setdefault(key, Group())
+        if len(group.sightings) >= self.max_in_group:  # a long look pushes out itself, not the other viewpoints
+            group.sightings.popleft()
+            self._order.remove(key)
+            self.forgotten += 1
         group.sightings.append(sighting)
         group.dirty = True
         self._order.append(key)
@@ -99,6 +106,13 @@ class Memory:
     def clear(self) -> None:
         self.groups.clear()
         self._order.clear()
+
+    def with_a_say(self, enough: int) -> dict[Key, Group]:
+        """Groups that count: one just begun does not outvote or contradict one that has `enough` sightings, for its
+        first detection may be a wrong one."""
+        if all(len(group.sightings) < enough for group in self.groups.values()):
+            return self.groups
+        return {key: group for key, group in self.groups.items() if len(group.sightings) >= _JUST_BEGUN}
 
     def sightings(self) -> Iterator[tuple[str, Sighting]]:
         for (anchor_id, _), group in self.groups.items():
@@ -124,7 +138,7 @@ class Memory:
             self.outdated += 1
 
     def _keep_only(self, now_ns: int) -> None:
-        kept = Memory(self.max_observations, self.max_groups, self.max_age_ns)
+        kept = Memory(self.max_observations, self.max_in_group, self.max_groups, self.max_age_ns)
         kept._last_ns = now_ns
         old = {key: deque(group.sightings) for key, group in self.groups.items()}
         for key in self._order:
@@ -134,6 +148,7 @@ class Memory:
             else:
                 self.outdated += 1
         self.groups, self._order = kept.groups, kept._order
+        self.outdated += kept.outdated
 
     def snapshot(self) -> dict[str, Any]:
         """Plain data; floats survive JSON exactly."""

@@ -59,13 +59,13 @@ def isotropic(position_sigma_m: float, rotation_sigma_rad: float) -> Array:
     return np.diag([position_sigma_m**2] * 3 + [rotation_sigma_rad**2] * 3)
 
 
-def stated(covariance: Sequence[float]) -> Array | None:
-    """The covariance that an observer sent with its observation; `None` when it is none (not finite, not symmetric and
-    positive)."""
+def stated(covariance: Sequence[float]) -> tuple[float, ...]:
+    """The covariance that an observer sent with its observation, made symmetric; empty when it is none (not finite,
+    not symmetric and positive)."""
     if len(covariance) != 36 or not all(map(math.isfinite, covariance)) or max(map(abs, covariance)) > 1e3:
-        return None
+        return ()
     C = np.array(covariance, dtype=np.float64).reshape(6, 6)
-    if not np.allclose(C, C.T, atol=1e-3 * float(np.max(np.abs(C)))):
-        return None
+    if not float(np.abs(C - C.T).max()) <= 1e-3 * float(np.abs(C).max()):
+        return ()
     C = 0.5 * (C + C.T)
-    return C if float(np.linalg.eigvalsh(C)[0]) > 0.0 else None
+    return tuple(C.ravel().tolist()) if float(np.linalg.eigvalsh(C)[0]) > 0.0 else ()
