@@ -62,6 +62,7 @@ class Keyring:
         self._signature = signature
         self._drops = drops or Drops()
         self._seen = signature()
+        self._said: object = None  # what was wrong with the list last
         self._keys = read()
         self.gone: dict[str, AllowedKey] = {}
         self.come: dict[str, AllowedKey] = {}
@@ -97,17 +98,24 @@ class Keyring:
         return True
 
     def look(self) -> None:
-        """Reads the list again if its file has changed. One that is damaged changes nothing, and is said."""
+        """Reads the list again if its file has changed. One that is damaged changes nothing, and is said.
+
+        One that the system does not let us read just now (no descriptor free, a network disk) is tried again.
+        """
         signature = self._signature()
         if signature == self._seen:
             return
-        self._seen = signature
         try:
             keys = self._read()
         except KeysError as error:
-            self._drops.count("allow_list_unreadable")
-            print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
+            if not isinstance(error.__cause__, OSError):
+                self._seen = signature
+            if (signature, str(error)) != self._said:
+                self._said = signature, str(error)
+                self._drops.count("allow_list_unreadable")
+                print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
             return
+        self._seen, self._said = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
             if new is None or new.roles != old.roles:
@@ -136,7 +144,13 @@ def open_keyring(config: FrontConfig, drops: Drops) -> Keyring:
 def _certificates(folder: Path) -> dict[str, AllowedKey]:
     """Every `*.key` certificate in a folder. A damaged one lets nobody in, and keeps nobody else out."""
     keys = {}
-    for path in sorted(folder.glob("*.key")):
+    try:
+        paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise KeysError(f"{folder} cannot be read: {error.strerror}") from error
+    for path in paths:
         try:
             public = load_public(path)
         except KeysError:

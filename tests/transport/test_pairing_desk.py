@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,6 +93,10 @@ class Desk:
         return message
 
 
+def _no_descriptor(*_args: object, **_more: object) -> None:
+    raise OSError(errno.EMFILE, "Too many open files")
+
+
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
@@ -168,6 +173,24 @@ def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(desk: Desk) -> Non
     assert desk.home.clients.revoke("ann") is not None
     desk.keyring.look()
     assert desk.answer(own).message == "this key was revoked just now"
+    assert desk.keyring.find(own.fingerprint) is None
+
+
+def test_a_list_that_could_not_be_read_just_then_is_read_again(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Revoked while the system had no descriptor to spare: it counts as soon as there is one."""
+    own = KeyPair.new()
+    desk.home.clients.allow("ann", own.public)
+    desk.keyring.look()
+    desk.home.clients.revoke("ann")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", _no_descriptor)
+        for _ in range(3):
+            desk.keyring.look()
+    assert desk.keyring.find(own.fingerprint) is not None
+    assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
+    desk.keyring.look()
     assert desk.keyring.find(own.fingerprint) is None
 
 
