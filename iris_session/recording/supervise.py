@@ -57,13 +57,15 @@ class RecorderProcess:
 
     @property
     def pid(self) -> int:
-        """Process id of the recorder, 0 when none was started."""
-        return 0 if self._process is None else self._process.pid
+        """Process id of the recorder, 0 when none was started. May be asked while another thread restarts it."""
+        process = self._process
+        return 0 if process is None else process.pid
 
     @property
     def alive(self) -> bool:
-        """False before the start and once the process has ended."""
-        return self._process is not None and self._process.poll() is None
+        """False before the start and once the process has ended. May be asked from another thread, as `pid`."""
+        process = self._process
+        return process is not None and process.poll() is None
 
     @property
     def failure(self) -> str:

@@ -17,6 +17,8 @@ RESTART_BACKOFF_NS: Final = (0, 500_000_000, 1_000_000_000, 2_000_000_000, 5_000
 HEALTHY_NS: Final = 30_000_000_000
 #: A recorder says something twice a second. It is not ended when it hangs: a slow disk would delay its successor too.
 HANGING_NS: Final = 5_000_000_000
+#: What a successor that is just being started gets at the end: a process more, unless the disk hangs.
+CLOSING_S: Final = 5.0
 
 
 class Backoff:
@@ -99,10 +101,10 @@ class RecorderSupervisor:
             self.failure = ""  # its successor writes
         return told
 
-    def close(self) -> None:
-        """Waits for the thread: the process is the caller's from here on."""
+    def close(self, patience_s: float = CLOSING_S) -> None:
+        """Waits for the thread: the process is the caller's from here on. One that a disk keeps is left to itself."""
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(patience_s)
             self._thread = None
 
     def _replace(self) -> None:

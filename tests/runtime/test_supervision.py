@@ -126,3 +126,13 @@ def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -
     recorder.disk.set()
     supervisor.close()
     assert recorder.alive
+
+
+def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
+    recorder = Recorder()
+    supervisor = RecorderSupervisor(recorder)
+    recorder.alive = False
+    supervisor.look(SECOND, 0)
+    supervisor.close(0.05)
+    assert not recorder.alive, "and its disk has not answered yet"
+    recorder.disk.set()
