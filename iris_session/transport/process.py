@@ -125,12 +125,15 @@ class FrontProcess:
         """Waits for `Ready`. Raises `FrontError` when the front fails, dies or says nothing for `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
-            running = self._process is not None and self._process.poll() is None
+            # In this order: once the thread has ended, the process is the new one.
+            replacing = self._replacing is not None and self._replacing.is_alive()
+            running = replacing or (self._process is not None and self._process.poll() is None)
             self.link.receive()
             if self.link.ports is not None:
                 return self.link.ports
             if self.link.failure or not running:
-                text = self.link.failure or "the front process ended at its start, see its messages above"
+                text = self.link.failure or str(self._failure or "")
+                text = text or "the front process ended at its start, see its messages above"
                 self.close()
                 raise FrontError(text)
             time.sleep(0.002)

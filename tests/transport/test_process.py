@@ -112,6 +112,16 @@ def test_keys_that_cannot_be_used_are_named(tmp_path: Path, secret_file: str, fo
         FrontProcess(config, scene()).start()
 
 
+def test_a_front_that_is_replaced_is_waited_for() -> None:
+    process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
+    ports = process.start()
+    os.kill(process.pid, signal.SIGKILL)
+    wait(lambda: not process.alive, "end")
+    process.restart()
+    assert process.wait_ready(60.0) == ports
+    process.close()
+
+
 def test_close_ends_the_process_and_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     process = FrontProcess(FrontConfig(control_port=0, state_port=0), scene())
