@@ -67,9 +67,14 @@ class Media:
     @abstractmethod
     def session_now_ns(self) -> int: ...
 
+    @property
+    @abstractmethod
+    def _polls_here(self) -> bool: ...
+
     def _init_media(self) -> None:
         self._feeds: dict[str, MediaFeed] = {}
         self._media_generation = -1
+        self._subscribed: set[str] = set()
         self._media_bytes = 0
         self._media_ages: list[int] = []
         self._media_since_ns = 0
@@ -85,14 +90,14 @@ class Media:
         with self._lock:
             if stream not in self._feeds:
                 self._feeds[stream] = MediaFeed(stream)
-                self._subscribe([stream])
+                self._subscribe_soon()
             return self._feeds[stream]
 
     def drop_media(self, stream: str) -> None:
         """Ends a subscription."""
         with self._lock:
             if self._feeds.pop(stream, None) is not None:
-                self._sockets.unsubscribe_media(media_topic(max(1, self.connection.connection_epoch), stream))
+                self._subscribe_soon()
 
     @property
     def delivery(self) -> DeliveryBudget | None:
@@ -130,6 +135,7 @@ class Media:
         if self._media_generation != self.connection.generation:
             self._media_generation = self.connection.generation
             self._sockets.close_media()
+            self._subscribed.clear()
             self.connection.latest.pop(DeliveryBudget, None)
         told = self.delivery
         if told is None or not self.connection.joined:
@@ -137,17 +143,31 @@ class Media:
         classes = {budget.stream: budget.budget_class for budget in told.streams}
         for feed in self._feeds.values():
             feed.budget_class = classes.get(feed.stream, told.budget_class)
-        if self._feeds and not self._sockets.has_media:
-            self._subscribe(list(self._feeds))
+        self._subscribe()
         return self._drain_media()
 
-    def _subscribe(self, streams: list[str]) -> None:
-        """Only now can the session know whose subscription it is: it has told us what we get."""
+    def _subscribe_soon(self) -> None:
+        """Here, or in the thread that polls: no two may use a socket."""
+        if self._polls_here:
+            self._subscribe()
+        else:
+            self._sockets.wake()
+
+    def _subscribe(self) -> None:
+        """To what is asked for, and to nothing else. The session has to tell first what we get: only then it knows
+        whose subscription it is."""
         welcome = self.connection.welcome
         if self.delivery is None or welcome is None or self._media_generation != self.connection.generation:
             return
-        topics = [media_topic(self.connection.connection_epoch, stream) for stream in streams]
-        self._sockets.subscribe_media(welcome.endpoints.media, topics)
+        if not self._sockets.has_media:
+            self._subscribed.clear()
+        for stream in self._subscribed - self._feeds.keys():
+            self._sockets.unsubscribe_media(media_topic(self.connection.connection_epoch, stream))
+        new = [stream for stream in self._feeds if stream not in self._subscribed]
+        if new:
+            topics = [media_topic(self.connection.connection_epoch, stream) for stream in new]
+            self._sockets.subscribe_media(welcome.endpoints.media, topics)
+        self._subscribed = set(self._feeds)
 
     def _drain_media(self) -> bool:
         messages = self._sockets.drain_media()

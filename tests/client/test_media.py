@@ -48,6 +48,33 @@ def test_the_newest_frame_is_taken_once(join: Callable[..., Client]) -> None:
 
 
 @pytest.mark.usefixtures("cloud")
+def test_only_the_thread_that_polls_touches_the_socket(
+    join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ann = join()
+    touched: list[tuple[str, threading.Thread]] = []
+    sockets = ann._sockets
+    real = {name: getattr(sockets, name) for name in ("subscribe_media", "unsubscribe_media")}
+
+    def watched(name: str) -> Callable[..., None]:
+        def call(*arguments: object) -> None:
+            touched.append((name, threading.current_thread()))
+            real[name](*arguments)
+
+        return call
+
+    for name in real:
+        monkeypatch.setattr(sockets, name, watched(name))
+    ann.start()
+    cloud, depth = ann.media("cloud"), ann.media("depth")
+    assert ann.wait_for(lambda _: cloud.received >= 1, DEADLINE_S)
+    ann.drop_media("depth")
+    assert ann.wait_for(lambda _: "unsubscribe_media" in dict(touched), DEADLINE_S)
+    assert {thread for _, thread in touched} == {ann._thread}
+    assert depth.newest is None
+
+
+@pytest.mark.usefixtures("cloud")
 def test_subscriptions_outlive_the_front(session: LiveSession, join: Callable[..., Client]) -> None:
     ann = join()
     feed = ann.media("cloud")
