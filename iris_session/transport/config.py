@@ -30,7 +30,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     messages of one TCP connection that are not taken, before it is cut off. An honest client with a fault in its loop
     is named by its rate limits long before. `strangers`: TCP connections that have not said hello, for at most
     `hello_timeout_ns` each; as many again to the state socket that have not subscribed. `subscribers`: TCP connections
-    to the state socket that have.
+    to the state socket that have, and to the media socket; `sources`: to the socket that takes media.
     `memory_bytes`: what all queues together may hold (see `memory.py`).
     """
 
@@ -54,6 +54,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     strangers: int = 1024
     hello_timeout_ns: int = 10 * SECOND
     subscribers: int = 512
+    sources: int = 64
     memory_bytes: int = 256 * MEBIBYTE
 
 

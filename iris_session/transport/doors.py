@@ -7,6 +7,7 @@ off and named. People who behave see none of it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import zmq
@@ -131,13 +132,17 @@ class Doors:
         self._next_ns = now_ns + LOOK_NS
         self._silent(now_ns)
 
-    def shed(self) -> str:
+    def shed(self, give_way: Callable[[], str] = lambda: "") -> str:
         """Makes room in memory: closes the client for which and from which most waits; when nobody stands out, a
-        quarter of those who said no hello. Says who it was, empty when nobody is there."""
+        quarter of those who said no hello. Says who it was, empty when nobody is there. `give_way`: lets go of
+        something else instead, where nobody holds much, and says of what."""
         owners = self._owners()
         strangers = [descriptor for descriptor in self._visitors if descriptor not in owners]
         held = {descriptor: self._traffic.held(descriptor) for descriptor in (*owners, *strangers)}
         of_strangers = sum(held[descriptor] for descriptor in strangers)
+        most = max((held[descriptor] for descriptor in owners), default=0)
+        if max(of_strangers, most) < HOG_BYTES and (what := give_way()):
+            return what
         hog = max(owners, key=lambda descriptor: (held[descriptor], owners[descriptor].number), default=None)
         if strangers and (hog is None or held[hog] < max(of_strangers, HOG_BYTES)):
             strangers.reverse()  # of equal ones the newest

@@ -70,12 +70,13 @@ class FrontSockets:
         try:
             self.state = self.open_state(config.state_port)
             media = open_media(self.context, config, key)
-            self.ingest = open_ingest(self.context, config, key)
+            ingest = open_ingest(self.context, config, key)
         except FrontError:
             for listener in self.listeners:
                 listener.close()
             raise
         self.media = Watched(media, watch_tcp(media, "media"))
+        self.ingest = Watched(ingest, watch_tcp(ingest, "ingest"))
         endpoint = config.media_endpoint
         self.local_ingest = open_local_ingest(self.context, endpoint) if endpoint else None
         self.control = Watched(control, watch_tcp(control, "control"))
@@ -86,7 +87,7 @@ class FrontSockets:
             key.fingerprint if key else "",
             hosts_to_tell(config),
             bound_port(media),
-            bound_port(self.ingest),
+            bound_port(ingest),
         )
 
     def open_state(self, port: int) -> Watched:

@@ -97,7 +97,7 @@ class Front:
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
         self._media = self._make_media()
         self._status.media_row = self._media.row
-        memory = MemoryWatch(config.limits.memory_bytes, doors.shed, self._shed)
+        memory = MemoryWatch(config.limits.memory_bytes, lambda: doors.shed(self._give_way), self._shed)
         self._services += [self._keyring, self._status, self._media, doors, memory]
         self._intake = Intake(
             config,
@@ -180,10 +180,17 @@ class Front:
 
     def _make_media(self) -> MediaDesk:
         sockets, encrypted = self._sockets, self._keyring.key is not None
-        doors = MediaDoors(sockets.media.monitor, self._config.limits)
+        limits = self._config.limits
         proxy = MediaProxy(
-            sockets.media.socket, doors, sockets.local_ingest, sockets.ingest, self._session_ns, encrypted=encrypted
+            sockets.media.socket,
+            MediaDoors(sockets.media.monitor, limits, limits.subscribers),
+            MediaDoors(sockets.ingest.monitor, limits, limits.sources),
+            sockets.local_ingest,
+            sockets.ingest.socket,
+            self._session_ns,
+            encrypted=encrypted,
         )
+        self._give_way = proxy.give_way
         return MediaDesk(
             proxy,
             self._clients,

@@ -8,7 +8,7 @@ dropped for that subscriber alone, and what somebody gets is decided here, not t
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import zmq
@@ -26,6 +26,8 @@ IDLE_MS: Final = 50
 ROUND: Final = 16
 #: Keys of sources that nobody has decided about yet.
 MAX_ASKING: Final = 64
+#: When memory runs short, nothing is taken for so long.
+PAUSE_NS: Final = 2_000_000_000
 _SUBSCRIBE: Final = 1
 
 
@@ -33,13 +35,14 @@ class MediaProxy:
     """`hub`, `sources` and `asking` belong to `lock`.
 
     `sources`: keys that may hand in frames (the empty one: who needs none). `asking`: keys that try to, and are not
-    among them.
+    among them. `doors`, `back_doors`: of `out` and of `remote`.
     """
 
     def __init__(
         self,
         out: zmq.Socket[bytes],
         doors: MediaDoors,
+        back_doors: MediaDoors,
         local: zmq.Socket[bytes] | None,
         remote: zmq.Socket[bytes],
         now_ns: Callable[[], int],
@@ -48,6 +51,7 @@ class MediaProxy:
     ) -> None:
         self._out = out
         self._doors = doors
+        self._back_doors = back_doors
         self._local = local
         self._remote = remote
         self._now_ns = now_ns
@@ -66,12 +70,18 @@ class MediaProxy:
     def start(self) -> None:
         self._thread.start()
 
+    def give_way(self) -> str:
+        """Memory runs short: media are the first to go. What was closed; empty when there was nothing to be had."""
+        with self.lock:
+            return "all media for 2 s" if self.hub.give_way(self._now_ns() + PAUSE_NS) else ""
+
     def close(self) -> None:
         """Waits for the end of the thread; the sockets are free then."""
         self._stopping = True
         if self._thread.ident is not None:
             self._thread.join()
         self._doors.close()
+        self._back_doors.close()
         for one in (self._out, self._local, self._remote):
             if one is not None:
                 one.close(linger=0)
@@ -84,16 +94,30 @@ class MediaProxy:
         waits = False
         while not self._stopping:
             ready = dict(poller.poll(RETRY_MS if waits else IDLE_MS))
-            closed = self._doors.turn(self._now_ns())  # before what they say: who has come
+            self._come_and_gone()
+            closed = [*self._doors.turn(self._now_ns()), *self._back_doors.turn(self._now_ns())]
             if self._out in ready:
                 self._take_subscriptions()
             for one in (self._local, self._remote):
                 if one is not None and one in ready:
                     self._take_frames(one)
             with self.lock:
-                for reason in closed:
-                    self.hub.count(reason)
+                closed += [self._doors.close_one(fd, "media_memory") for fd in self.hub.take_stuck()]
+                self._count(closed)
                 waits = self.hub.flush(self._send, self._now_ns())
+
+    def _come_and_gone(self) -> None:
+        now_ns = self._now_ns()
+        self._back_doors.read(now_ns)
+        changed = self._doors.read(now_ns)
+        if changed:
+            with self.lock:
+                for descriptor in changed:
+                    self.hub.left(descriptor)
+
+    def _count(self, reasons: Iterable[str]) -> None:
+        for reason in filter(None, reasons):
+            self.hub.count(reason)
 
     def _send(self, topic: bytes, header: bytes, frame: Any) -> bool:
         try:
@@ -112,16 +136,21 @@ class MediaProxy:
                 return
             data = frame.bytes
             wanted = parse_topic(data[1:]) if data[:1] in (b"\0", b"\1") else None
-            cut = self._doors.heard(_descriptor(frame), self._now_ns())
+            descriptor = _descriptor(frame)
+            if descriptor < 0:
+                continue  # libzmq takes back what a connection had that has ended: we noticed that end
+            self._come_and_gone()
+            user = self._user_of(frame)
+            cut = self._doors.heard(descriptor, user, counts=True)
             with self.lock:
                 if cut:
                     self.hub.count(cut)
                 elif wanted is None:
                     self.hub.count("media_topic_unknown")
                 elif data[0] != _SUBSCRIBE:
-                    self.hub.unsubscribe(*wanted)
+                    self.hub.unsubscribe(*wanted, descriptor)
                     self._out.setsockopt(zmq.UNSUBSCRIBE, data[1:])
-                elif self.hub.subscribe(*wanted, self._user_of(frame)):
+                elif self.hub.subscribe(*wanted, user, descriptor):
                     self._out.setsockopt(zmq.SUBSCRIBE, data[1:])
 
     def _user_of(self, frame: zmq.Frame) -> str:
@@ -140,7 +169,25 @@ class MediaProxy:
                 frame = socket.recv(zmq.DONTWAIT, copy=False)
                 if len(frames) <= len(CLASSES):
                     frames.append(frame)
-            self._take(frames, self._user_of(frames[0]) if socket is self._remote else "")
+            if socket is self._remote:
+                self._take_of_others(frames)
+            else:
+                self._take(frames, "")
+
+    def _take_of_others(self, frames: list[zmq.Frame]) -> None:
+        user = self._user_of(frames[0])
+        with self.lock:
+            welcome = not user or user in self.sources
+            if not welcome:
+                self.hub.count("media_source_refused")
+                if len(self.asking) < MAX_ASKING:
+                    self.asking.add(user)
+        self._back_doors.read(self._now_ns())
+        cut = self._back_doors.heard(_descriptor(frames[0]), user, counts=not welcome)
+        with self.lock:
+            self._count((cut,))
+        if welcome:
+            self._take(frames, user)
 
     def _take(self, frames: list[zmq.Frame], user: str) -> None:
         try:
@@ -148,18 +195,14 @@ class MediaProxy:
         except ProtocolError:
             push = None
         with self.lock:
-            if user and user not in self.sources:
-                self.hub.count("media_source_refused")
-                if len(self.asking) < MAX_ASKING:
-                    self.asking.add(user)
-            elif push is None:
+            if push is None:
                 self.hub.count("media_malformed")
             else:
                 self.hub.push(push, frames[1:], user, self._now_ns())
 
 
 def _descriptor(frame: zmq.Frame) -> int:
-    """Of the TCP connection that it came by, -1 where libzmq does not tell: its end was noticed."""
+    """Of the TCP connection that it came by, -1 where libzmq does not tell."""
     try:
         return int(frame.get(zmq.SRCFD))
     except zmq.ZMQError:

@@ -1,4 +1,4 @@
-"""TCP connections to the media socket: who subscribes to nothing for a while is closed, and so are too many."""
+"""TCP connections to a socket of media: who says nothing for a while is closed, and so are too many."""
 
 from __future__ import annotations
 
@@ -8,60 +8,79 @@ import zmq
 
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.sockets import close_tcp, next_tcp_event, peer_of, readable
+from iris_session.transport.visitors import crowd
 
 LOOK_NS: Final = 1_000_000_000
-#: Subscriptions of one connection, beyond which it is cut off: as many as a client has, over and over.
+#: Messages of one connection that count, beyond which it is cut off: as many subscriptions as a client has, over and
+#: over; frames of a source that nobody lets in.
 MAX_SAID: Final = 1024
 
 
 class _Guest:
-    """One TCP connection. `said`: messages of it that came through."""
+    """One TCP connection. `who`: whom it counts for. `inside`: something of it came through. `said`: messages of it
+    that count."""
 
-    __slots__ = ("address", "opened_ns", "said")
+    __slots__ = ("address", "inside", "opened_ns", "said", "who")
 
     def __init__(self, address: tuple[str, int], now_ns: int) -> None:
         self.address = address
+        self.who = address[0]
         self.opened_ns = now_ns
+        self.inside = False
         self.said = 0
 
 
 class MediaDoors:
-    """Belongs to the thread of the media proxy. `monitor`: of its socket. What it closes, it gives the reason of."""
+    """Belongs to the thread of the media proxy. `monitor`: of the socket. What it closes, it gives the reason of.
 
-    def __init__(self, monitor: zmq.Socket[bytes], limits: FrontLimits) -> None:
+    At most `most` connections that have said something, and as many that have not.
+    """
+
+    def __init__(self, monitor: zmq.Socket[bytes], limits: FrontLimits, most: int) -> None:
         self._monitor = monitor
         self._limits = limits
+        self._most = most
         self._guests: dict[int, _Guest] = {}
         self._next_ns = 0
 
-    def heard(self, descriptor: int, now_ns: int) -> str:
-        """A message came by a connection. Not empty: it was cut off, and why."""
-        if descriptor < 0:
-            return ""
-        guest = self._guests.setdefault(descriptor, _Guest(peer_of(descriptor), now_ns))
-        guest.said += 1
-        return self._close(descriptor, "media_flood") if guest.said > MAX_SAID else ""
-
-    def turn(self, now_ns: int) -> list[str]:
-        """Looks who came and went; the reasons of those that were closed."""
+    def read(self, now_ns: int) -> list[int]:
+        """Looks who came and went: the descriptors that are nobody's, or another's, from now on. To be called after a
+        message was received and before `heard`: libzmq told of its connection before."""
+        changed = []
         while readable(self._monitor):
             event, descriptor = next_tcp_event(self._monitor)
+            self._guests.pop(descriptor, None)
             if event == zmq.EVENT_ACCEPTED:
                 self._guests[descriptor] = _Guest(peer_of(descriptor), now_ns)
-            else:
-                self._guests.pop(descriptor, None)
+            changed.append(descriptor)
+        return changed
+
+    def heard(self, descriptor: int, user: str, *, counts: bool) -> str:
+        """A message came by a connection. Not empty: it was cut off, and why."""
+        guest = self._guests.get(descriptor)
+        if guest is None:
+            return ""
+        guest.inside, guest.who = True, user or guest.who
+        guest.said += counts
+        return self.close_one(descriptor, "media_flood") if guest.said > MAX_SAID else ""
+
+    def turn(self, now_ns: int) -> list[str]:
+        """The reasons of those that were closed now."""
         if now_ns < self._next_ns:
             return []
         self._next_ns = now_ns + LOOK_NS
-        silent = [fd for fd, guest in self._guests.items() if not guest.said]  # in the order in which they came
-        late = [fd for fd in silent if now_ns - self._guests[fd].opened_ns > self._limits.hello_timeout_ns]
-        many = silent[: max(0, len(self._guests) - self._limits.subscribers)]
-        closed = [self._close(fd, "media_silent") for fd in late]
-        return [reason for reason in (*closed, *(self._close(fd, "media_too_many") for fd in many)) if reason]
+        inside = [one for one in self._guests.items() if one[1].inside]
+        silent = [one for one in self._guests.items() if not one[1].inside]
+        oldest_ns = now_ns - self._limits.hello_timeout_ns
+        closed = [self.close_one(fd, "media_silent") for fd, guest in silent if guest.opened_ns < oldest_ns]
+        many = (*crowd(silent, self._most), *crowd(reversed(inside), self._most))
+        closed += [self.close_one(fd, "media_too_many") for fd in many]
+        return [reason for reason in closed if reason]
+
+    def close_one(self, descriptor: int, reason: str) -> str:
+        """Closes a connection. The reason; empty when it is gone already."""
+        guest = self._guests.pop(descriptor, None)
+        return reason if guest is not None and close_tcp(descriptor, guest.address) else ""
 
     def close(self) -> None:
         self._monitor.close(linger=0)
-
-    def _close(self, descriptor: int, reason: str) -> str:
-        guest = self._guests.pop(descriptor, None)
-        return reason if guest is not None and close_tcp(descriptor, guest.address) else ""

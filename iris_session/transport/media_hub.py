@@ -59,7 +59,7 @@ class _Wish:
 
     def __init__(self) -> None:
         self.pending = False
-        self.readers = 0
+        self.readers: set[int] = set()  # descriptors
         self.due = self.taken = self.dropped = self.bytes = 0
 
     @property
@@ -102,8 +102,11 @@ class MediaHub:
         self._streams: dict[str, _Stream] = {}
         self._listeners: dict[int, Listener] = {}
         self._wishes: dict[tuple[int, str], _Wish] = {}
+        self._readings: dict[int, set[tuple[int, str]]] = {}  # by descriptor
         self._ended: dict[int, Tally] = {}  # of subscriptions that were taken back
         self._pending: deque[tuple[int, str]] = deque()
+        self._closed_until_ns = 0
+        self._stuck: set[int] = set()
         #: What was thrown away since somebody emptied it, by reason; and of whose frames, by connection.
         self.drops: dict[str, int] = {}
         self.superseded: dict[int, int] = {}
@@ -118,8 +121,9 @@ class MediaHub:
         for number in [number for number in self._ended if number not in self._listeners]:
             del self._ended[number]
 
-    def subscribe(self, number: int, stream: str, user_id: str) -> bool:
-        """False: this key may not have what is sent to that connection, or it wants too much."""
+    def subscribe(self, number: int, stream: str, user_id: str, reader: int) -> bool:
+        """False: this key may not have what is sent to that connection, or it wants too much. `reader`: descriptor of
+        the TCP connection that asked."""
         listener = self._listeners.get(number)
         if listener is None or listener.user_id != user_id:
             self._drop("media_refused")
@@ -127,18 +131,25 @@ class MediaHub:
         if (number, stream) not in self._wishes and len(self.wanted(number)) >= MAX_STREAMS:
             self._drop("media_subscriptions_full")
             return False
-        self._wishes.setdefault((number, stream), _Wish()).readers += 1
+        self._wishes.setdefault((number, stream), _Wish()).readers.add(reader)
+        self._readings.setdefault(reader, set()).add((number, stream))
         return True
 
-    def unsubscribe(self, number: int, stream: str) -> None:
-        """One reader less: a client that connects again may have two for a while."""
+    def unsubscribe(self, number: int, stream: str, reader: int) -> None:
+        """One reader less: a client that connects again may have two for a while. Of others it takes nothing."""
+        self._readings.get(reader, set()).discard((number, stream))
         wish = self._wishes.get((number, stream))
-        if wish is None:
+        if wish is None or reader not in wish.readers:
             return
-        wish.readers -= 1
+        wish.readers.remove(reader)
         if not wish.readers:
             del self._wishes[number, stream]
             self._ended[number] = self._ended.get(number, Tally()).plus(wish.tally)
+
+    def left(self, reader: int) -> None:
+        """A TCP connection has ended, and its subscriptions with it."""
+        for number, stream in sorted(self._readings.pop(reader, ())):
+            self.unsubscribe(number, stream, reader)
 
     def wanted(self, number: int) -> list[str]:
         """The streams that a connection subscribed to."""
@@ -160,6 +171,9 @@ class MediaHub:
         fits = len(frames) == len(levels) == len(push.classes) == len(set(levels)) and 0 in levels
         if not fits or not is_stream_name(push.stream):
             self._drop("media_malformed")
+            return False
+        if now_ns < self._closed_until_ns:
+            self._drop("media_memory")
             return False
         stream = self._stream_of(push.stream, source, now_ns)
         if stream is None:
@@ -208,6 +222,27 @@ class MediaHub:
             wishes = sum(wanted == name for _, wanted in self._wishes)
             found[name] = StreamFacts(rates, hz, stream.source, wishes)
         return found
+
+    def give_way(self, until_ns: int) -> bool:
+        """Lets go of every frame, and takes none until then. False: there is none."""
+        held = [stream for stream in self._streams.values() if stream.frames]
+        for stream in held:
+            stream.push, stream.frames = None, {}
+        for key in self._pending:
+            wish = self._wishes.get(key)
+            if wish is not None and wish.pending:
+                wish.pending = False
+                self._stuck |= wish.readers
+                self._drop("media_memory")
+        self._pending.clear()
+        if held:
+            self._closed_until_ns = until_ns
+        return bool(held)
+
+    def take_stuck(self) -> set[int]:
+        """Descriptors of connections that did not take what was due when media gave way: frames wait in them."""
+        stuck, self._stuck = self._stuck, set()
+        return stuck
 
     def take_drops(self) -> tuple[dict[str, int], dict[int, int]]:
         """`drops` and `superseded`, which are empty then."""

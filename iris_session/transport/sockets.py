@@ -16,9 +16,11 @@ from iris_session.keys import KeyPair
 from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.transport.config import FrontConfig, FrontError, PortInUseError
 
-#: ZAP domains: keys that are not on the list may pair, on the control socket only.
+#: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
+#: when a key is revoked that came in there.
 ZAP_CONTROL = b"iris-control"
-ZAP_PRIVATE = b"iris-private"
+ZAP_STATE = b"iris-state"
+ZAP_MEDIA = b"iris-media"
 #: State sockets: two frames may wait for a client that is slow, then the newest is lost, not the oldest (libzmq).
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
@@ -224,7 +226,8 @@ def _prepare(bound: zmq.Socket[bytes], key: KeyPair | None, name: str) -> None:
     bound.setsockopt(zmq.HANDSHAKE_IVL, 5000)
     bound.setsockopt(zmq.BACKLOG, 512)
     if key is not None:
-        bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_CONTROL if name == "control" else ZAP_PRIVATE)
+        domains = {"control": ZAP_CONTROL, "state": ZAP_STATE}
+        bound.setsockopt(zmq.ZAP_DOMAIN, domains.get(name, ZAP_MEDIA))
         bound.setsockopt(zmq.CURVE_SERVER, 1)
         bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public.encode())
         bound.setsockopt(zmq.CURVE_SECRETKEY, key.secret.encode())

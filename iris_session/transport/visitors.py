@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Iterable, Iterator
+from typing import Protocol
 
 from iris_session.transport.limiter import Drops, TokenBucket
 from iris_session.transport.sockets import close_tcp, peer_of
@@ -68,7 +69,11 @@ class Visitors:
         del self._table[descriptor]
 
 
-def crowd(visitors: Iterable[tuple[int, Visitor]], limit: int) -> list[int]:
+class _Counted(Protocol):
+    who: str
+
+
+def crowd(visitors: Iterable[tuple[int, _Counted]], limit: int) -> list[int]:
     """Who has to go so that `limit` are left: one after the other, of whoever has most, in the given order."""
     queues: dict[str, deque[tuple[int, int]]] = {}
     n = 0

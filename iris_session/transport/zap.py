@@ -15,7 +15,7 @@ from zmq.utils import z85
 from iris_session.keys import fingerprint
 from iris_session.transport.keyring import STRANGER, Keyring
 from iris_session.transport.limiter import Drops
-from iris_session.transport.sockets import ZAP_CONTROL, readable
+from iris_session.transport.sockets import ZAP_CONTROL, ZAP_STATE, readable
 
 _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, mechanism, client key
 
@@ -66,7 +66,7 @@ class Authenticator:
             return ""
         mark = fingerprint(request[6])
         if self._keyring.find(mark) is not None and (request[2] == ZAP_CONTROL or not self.banned(mark)):
-            if request[2] != ZAP_CONTROL:
+            if request[2] == ZAP_STATE:
                 self._keyring.watching.add(mark)
             return mark  # a revoked one is told why it may not join, and gets no state
         self._drops.count("unknown_key")

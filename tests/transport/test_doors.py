@@ -203,6 +203,16 @@ def test_room_is_made_by_the_client_for_whom_most_waits_not_by_the_newest(hall: 
     assert hall.doors.barred("key1", hall.clients.by_number[1].last_heard_ns)
 
 
+def test_room_is_made_by_media_where_no_connection_holds_much(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(2)]
+    hall.hello(crowd[0][0])
+    assert hall.doors.shed(lambda: "media") == "media"
+    assert [is_closed(theirs) for _, theirs in crowd] == [False, False]
+    assert hall.doors.shed(lambda: "") == "connections without hello"
+    hall.traffic.handed(crowd[0][0].descriptor, [b"x" * 2 * HOG_BYTES])
+    assert hall.doors.shed(lambda: "media") == "Ann from 127.0.0.1"
+
+
 def test_room_is_made_by_strangers_who_hold_more_than_any_client(hall: Hall) -> None:
     crowd = [hall.open() for _ in range(3)]
     hall.hello(crowd[0][0])

@@ -155,12 +155,13 @@ def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) ->
     assert (bad.take(), other.take()) == (0, 0)
 
 
-def test_who_subscribes_to_nothing_is_closed_and_nobody_else(open_session: Open) -> None:
+@pytest.mark.parametrize("port", ["media", "media_ingest"])
+def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: str) -> None:
     session = open_session(limits=FrontLimits(hello_timeout_ns=500_000_000))
     media = Stage(session)
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
-    with socket.create_connection(("127.0.0.1", session.ports.media)) as silent:
+    with socket.create_connection(("127.0.0.1", getattr(session.ports, port))) as silent:
         media.drops("media_silent")
         silent.settimeout(30.0)
         while silent.recv(4096):
@@ -168,6 +169,20 @@ def test_who_subscribes_to_nothing_is_closed_and_nobody_else(open_session: Open)
     seen = viewer.take()
     media.until(lambda: viewer.take() > seen + 100, "ann goes on")
     assert session.process.link.status.drops["media_silent"] == 1
+    media.close()
+
+
+def test_too_many_who_subscribe_are_closed_and_the_first_stay(open_session: Open) -> None:
+    session = open_session(limits=FrontLimits(subscribers=2))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 1, "media")
+    for _ in range(4):
+        media.viewer(ann)
+    media.drops("media_too_many", 2)
+    seen = viewer.take()
+    media.until(lambda: viewer.take() > seen + 20, "ann goes on")
     media.close()
 
 
@@ -244,7 +259,14 @@ def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -
     stage.drops("media_refused")
     anns = stage.viewer(client, lab.curve(ann))
     stage.until(lambda: anns.take() >= 10, "media")
-    assert (eves.take(), bobs.take()) == (0, 0)
+    bobs.socket.unsubscribe(media_topic(client.epoch, "cloud"))
+    bobs.socket.subscribe(b"that was it")
+    stage.drops("media_topic_unknown")
+    bobs.socket.close()
+    seen = anns.take()
+    stage.until(lambda: anns.take() >= seen + 20, "what bob takes back is not ann's")
+    assert eves.take() == 0
+    assert bobs.got == []
 
 
 def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab, Stage]) -> None:

@@ -52,8 +52,8 @@ class Wire:
 
 def test_subscribers_get_what_their_level_says() -> None:
     wire = Wire(ann=0, bob=2)
-    assert wire.hub.subscribe(ANN, "cloud", "a")
-    assert wire.hub.subscribe(BOB, "cloud", "b")
+    assert wire.hub.subscribe(ANN, "cloud", "a", 1)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 2)
     wire.push(8)
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 2]
     header, frame = wire.got[BOB][-1]
@@ -66,8 +66,8 @@ def test_subscribers_get_what_their_level_says() -> None:
 
 def test_a_coarser_form_comes_at_full_rate() -> None:
     wire = Wire(ann=1, bob=2)
-    wire.hub.subscribe(ANN, "cloud", "a")
-    wire.hub.subscribe(BOB, "cloud", "b")
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
     wire.push(4, frames={"full": b"full", "half": b"half"})
     assert [frame for _, frame in wire.got[ANN]] == [b"half"] * 4
     assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
@@ -75,8 +75,8 @@ def test_a_coarser_form_comes_at_full_rate() -> None:
 
 def test_a_full_connection_gets_the_newest_later_and_delays_nobody() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a")
-    wire.hub.subscribe(BOB, "cloud", "b")
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
     wire.full = {BOB}
     wire.push(5)
     assert (len(wire.got[ANN]), len(wire.got[BOB])) == (5, 0)
@@ -91,15 +91,15 @@ def test_a_full_connection_gets_the_newest_later_and_delays_nobody() -> None:
 
 def test_only_the_key_of_a_connection_may_subscribe_to_it() -> None:
     wire = Wire()
-    assert not wire.hub.subscribe(ANN, "cloud", "b")
-    assert not wire.hub.subscribe(99, "cloud", "a")
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
+    assert not wire.hub.subscribe(99, "cloud", "a", 1)
     assert wire.hub.take_drops()[0] == {"media_refused": 2}
     assert wire.hub.wanted(ANN) == []
 
 
 def test_who_is_gone_gets_nothing_any_more() -> None:
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a")
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.full = {ANN}
     wire.push()
     wire.hub.allow({BOB: Listener("b", {})})
@@ -112,16 +112,46 @@ def test_who_is_gone_gets_nothing_any_more() -> None:
 def test_one_of_two_readers_of_a_client_leaves() -> None:
     """It has connected again; the end of the connection before is noticed later."""
     wire = Wire()
-    wire.hub.subscribe(ANN, "cloud", "a")
-    wire.hub.subscribe(ANN, "cloud", "a")
-    wire.hub.unsubscribe(ANN, "cloud")
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(ANN, "cloud", "a", 3)
+    wire.hub.left(1)
     wire.push()
     assert len(wire.got[ANN]) == 1
-    wire.hub.unsubscribe(ANN, "cloud")
-    wire.hub.unsubscribe(ANN, "cloud")
+    wire.hub.unsubscribe(ANN, "cloud", 3)
+    wire.hub.unsubscribe(ANN, "cloud", 3)
     wire.push()
     assert len(wire.got[ANN]) == 1
     assert wire.hub.tally(ANN).taken == 1
+
+
+def test_nobody_takes_back_a_subscription_of_another() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
+    wire.hub.unsubscribe(ANN, "cloud", 2)
+    wire.hub.left(2)
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+
+
+def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    assert not wire.hub.give_way(wire.now_ns + SECOND), "there is nothing"
+    wire.full = {BOB}
+    assert wire.push()
+    assert wire.hub.give_way(wire.now_ns + SECOND)
+    assert wire.hub.take_stuck() == {2}
+    assert wire.hub.take_stuck() == set()
+    wire.full = set()
+    assert not wire.push()
+    assert not wire.hub.give_way(wire.now_ns + SECOND)
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [1, 0]
+    assert wire.hub.take_drops()[0] == {"media_memory": 2}
+    wire.now_ns += SECOND
+    assert wire.push()
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [2, 1]
 
 
 @pytest.mark.parametrize(
@@ -147,7 +177,7 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     wire = Wire()
     for n in range(MAX_STREAMS + 1):
         assert wire.push(stream=f"s{n}") == (n < MAX_STREAMS)
-        assert wire.hub.subscribe(ANN, f"s{n}", "a") == (n < MAX_STREAMS)
+        assert wire.hub.subscribe(ANN, f"s{n}", "a", 1) == (n < MAX_STREAMS)
     assert wire.hub.take_drops()[0] == {"media_streams_full": 1, "media_subscriptions_full": 1}
     wire.now_ns += 100 * SECOND
     wire.hub.look(wire.now_ns)
@@ -178,8 +208,8 @@ def test_rates_are_those_of_the_last_seconds() -> None:
 
 def test_a_restarted_front_numbers_above_its_predecessor() -> None:
     wire, later = Wire(), Wire()
-    wire.hub.subscribe(ANN, "cloud", "a")
-    later.hub.subscribe(ANN, "cloud", "a")
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    later.hub.subscribe(ANN, "cloud", "a", 1)
     wire.push(30)
     later.now_ns = wire.now_ns
     later.push()
