@@ -16,7 +16,9 @@ from typing import NamedTuple
 WINDOW = 32  # exchanges; a quarter of a minute at two per second
 MAX_AGE_NS = 60_000_000_000  # older exchanges no longer count
 SETTLED = 4  # exchanges before the estimate is used: a single one may have met a busy machine
-SLEW = 0.01  # the estimate moves at most 10 ms per second: invisible in 150 ms freshness, monotonic
+SLEW = 0.01  # the estimate moves by 10 ms per second: invisible in 150 ms freshness, monotonic
+LARGE_NS = 5_000_000  # samples from so far in the future do not count: what is more moves ...
+SLEW_LARGE = 0.1  # ... by 100 ms per second, so that a busy link at the start keeps nobody from driving for seconds
 DRIFT = 100e-6  # two quartz clocks of +-50 ppm each
 JUMP = 4  # exchanges in a row that contradict all before: this clock has jumped, the old ones say nothing any more
 BURST = 8  # exchanges at the start and after a reset ...
@@ -144,8 +146,10 @@ class ClockSync:
         return max(high - offset, offset - low) + int(DRIFT * abs(local_ns - self._offset_at))
 
     def _slewed(self, local_ns: int) -> int:
-        room = int(SLEW * max(0, local_ns - self._offset_at))
-        return self._offset + max(-room, min(room, self._target - self._offset))
+        elapsed, way = max(0, local_ns - self._offset_at), self._target - self._offset
+        quick = min(elapsed, max(0, abs(way) - LARGE_NS) / SLEW_LARGE)  # nanoseconds of quick movement
+        room = int(SLEW_LARGE * quick + SLEW * (elapsed - quick))
+        return self._offset + max(-room, min(room, way))
 
 
 def _reach(exchange: Exchange, now_ns: int) -> int:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.clock import BURST, JUMP, SLEW, ClockSync
+from iris_session.client.clock import BURST, JUMP, LARGE_NS, SLEW, SLEW_LARGE, ClockSync
 
 SECOND = 1_000_000_000
 OFFSET = 5 * SECOND  # session time - local time
@@ -71,8 +71,26 @@ def test_a_wrong_start_is_slewed_not_stepped() -> None:
     before = clock.session_ns(local)
     for _ in range(8):
         local = exchange(clock, local, 100_000, 100_000)
-    assert abs(clock.session_ns(local) - before - 1_600_000) < SLEW * 1_700_000 + 10  # still nearly 30 ms off
+    assert abs(clock.session_ns(local) - before - 1_600_000) < SLEW_LARGE * 1_700_000 + 10  # still nearly 30 ms off
     assert abs(clock.session_ns(local + 4 * SECOND) - (local + 4 * SECOND + OFFSET)) < 1000
+
+
+def test_a_start_on_a_busy_link_does_not_leave_samples_in_the_future_for_seconds() -> None:
+    """An uplink with 40 ms of queue puts our stamps 20 ms ahead; once it is quick they have to fit within 5 ms."""
+    clock = ClockSync()
+    local = 0
+    for _ in range(BURST):
+        local = exchange(clock, local, 40_000_000, 0)
+    local = exchange(clock, local, 0, 0)
+
+    def ahead(after_ns: int) -> int:
+        return clock.session_ns(local + after_ns) - (local + after_ns + OFFSET)
+
+    assert ahead(0) == pytest.approx(20_000_000, abs=10)
+    assert ahead(SECOND // 10) == pytest.approx(10_000_000, abs=10)
+    assert ahead(SECOND * 3 // 20) == pytest.approx(LARGE_NS, abs=10)
+    assert ahead(SECOND // 4) == pytest.approx(LARGE_NS - SLEW * SECOND / 10, abs=10)
+    assert ahead(SECOND) == pytest.approx(0, abs=10)
 
 
 @pytest.mark.parametrize("stamps", [(10, 5, 5, 9), (0, 10, 5, 20), (0, 0, 30, 20)])
