@@ -264,7 +264,7 @@ class AlignmentEstimator:
         return keys, merged
 
     def _problem(self, keys: list[Key], merged: list[Merged], prior: Prior) -> Problem:
-        times = np.array([self._memory.groups[key].capture_ns for key in keys], dtype=np.int64)
+        times = [self._memory.groups[key].capture_ns for key in keys]
         newest = max(group.sightings[-1].capture_ns for group in self._memory.groups.values())
         poses = [self.anchors[anchor_id] for anchor_id, _ in keys]
         return problem(
@@ -272,7 +272,7 @@ class AlignmentEstimator:
             np.array([p for p, _ in poses]),
             np.array([q for _, q in poses]),
             merged,
-            np.minimum(times - newest, 0) * 1e-9,
+            np.array([min(ns - newest, 0) * 1e-9 for ns in times]),
             prior,
         )
 

@@ -16,6 +16,10 @@ from anchors.pose import quat_from_rotvec
 Array = NDArray[np.float64]
 
 _SMALL: Final = 1e-7  # [rad] below it the series of sine and cosine are exact to double precision
+_LEFT: Final = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_LEFT_SIGN: Final = np.array(
+    [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, -1.0, 1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0]]
+)
 _CONJUGATE: Final = np.array([1.0, -1.0, -1.0, -1.0])
 
 
@@ -24,17 +28,8 @@ def quat_multiply(a: Array, b: Array) -> Array:
     if b.ndim == 1:  # many by one: a product with a matrix is one call
         w, x, y, z = b.tolist()
         return np.asarray(a @ np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]))
-    aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
-    bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
-    return np.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        axis=-1,
-    )
+    left = a[..., _LEFT] * _LEFT_SIGN  # a * b is this matrix times b
+    return np.asarray((left @ b[..., None])[..., 0])
 
 
 def quat_conjugate(q: Array) -> Array:
@@ -54,12 +49,10 @@ def quat_exp(r: Array) -> Array:
 
 def quat_log(q: Array) -> Array:
     """Unit quaternions `(..., 4)` to their shortest rotation vectors `(..., 3)`, length at most pi, smooth at zero."""
-    q = np.where(q[..., :1] < 0.0, -q, q)
-    v = q[..., 1:]
-    n = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
-    safe = np.maximum(n, 1e-12)
-    scale = np.where(n < 1e-12, 2.0, 2.0 * np.arctan2(n, q[..., :1]) / safe)
-    return np.asarray(scale * v)
+    w, v = q[..., :1], q[..., 1:]
+    n = np.sqrt(np.add.reduce(v * v, axis=-1, keepdims=True))
+    half = np.arctan2(n, np.abs(w)) / np.maximum(n, 1e-150)  # half the angle over n, which tends to 1 / w
+    return np.asarray(np.copysign(2.0, w) * half * v)
 
 
 def quat_matrix(q: Array) -> Array:

@@ -39,19 +39,21 @@ class NoiseModel:
         ray = p_anchor - p_head
         d2 = float(ray @ ray)
         d = math.sqrt(d2)
-        view = np.outer(ray, ray) / max(d2, 1e-12)
+        view = ray[:, None] * ray / max(d2, 1e-12)
         along = self.along_m + self.along_m_per_m2 * d2
         noise = np.zeros((6, 6))
-        noise[:3, :3] = along**2 * (self.across**2 * np.eye(3) + (1.0 - self.across**2) * view)
-        noise[3:, 3:] = (self.rotation_rad_per_m * d) ** 2 * np.eye(3)
+        noise[:3, :3] = along**2 * (1.0 - self.across**2) * view
+        noise.flat[:21:7] += (along * self.across) ** 2
+        noise.flat[21::7] = (self.rotation_rad_per_m * d) ** 2
         common, each = self.split(noise)
         common[:3, :3] += (self.scale * d) ** 2 * view
         return common, each
 
     def split(self, noise: Array) -> tuple[Array, Array]:
         """A whole covariance as (common to the viewpoint, new in each observation)."""
-        common = self.viewpoint_share * (noise + FLOOR)
-        return common, (noise + FLOOR) - common
+        whole = noise + FLOOR
+        common = self.viewpoint_share * whole
+        return common, whole - common
 
 
 def isotropic(position_sigma_m: float, rotation_sigma_rad: float) -> Array:

@@ -40,26 +40,31 @@ def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -
     less than the share `min_agreeing` of them agree.
     """
     count = len(p)
-    centre = middle(np.where((q @ q[0])[:, None] < 0.0, -q, q))
+    towards = q @ q[0]
+    centre = middle(q if float(towards.min()) >= 0.0 else np.where(towards[:, None] < 0.0, -q, q))
     norm = math.sqrt(float(centre @ centre))
     if norm < 0.1:
         return None  # orientations all over the sphere
     centre = centre / norm
     x = np.empty((2, count, 3))  # positions, and turns from the median
     x[0], x[1] = p, quat_log(quat_multiply(q, quat_conjugate(centre)))
+    about = middle(x)
+    x -= about[:, None, :]
     information = np.linalg.inv(np.array([each[:3, :3], each[3:, 3:]]))
-    d2 = _distance2(x - middle(x)[:, None, :], information)
-    scatter = np.clip(middle(d2.T) / _CHI2_3_MEDIAN, 1.0, _MAX_SCATTER)
-    keep = np.all(d2 <= _CHI2_3_999 * scatter[:, None], axis=0)
-    n = int(np.count_nonzero(keep))
+    d2 = np.add.reduce((x @ information) * x, axis=2)  # (2, n)
+    bounds = [_CHI2_3_999 * min(max(m / _CHI2_3_MEDIAN, 1.0), _MAX_SCATTER) for m in middle(d2.T).tolist()]
+    keep = ((d2[0] <= bounds[0]) & (d2[1] <= bounds[1])).astype(np.float64)
+    n = int(keep.sum())
     if n == 0 or n < min_agreeing * count:
         return None
-    x = x[:, keep]
-    mean = np.add.reduce(x, axis=1) / n
-    wider = _excess(np.add.reduce(_distance2(x - mean[:, None, :], information), axis=1).tolist(), n)
+    mean = keep @ x / n
+    # About the mean, from that about the median.
+    chi2 = d2 @ keep - n * np.add.reduce((mean[:, None, :] @ information)[:, 0, :] * mean, axis=1)
+    wider = _excess(chi2.tolist(), n)
     covariance = common + each / n
     if wider is not None:
         covariance = covariance * wider[:, None] * wider
+    mean += about
     return Merged(mean[0], quat_multiply(quat_exp(mean[1]), centre), covariance, n, count)
 
 
@@ -68,11 +73,6 @@ def middle(x: Array) -> Array:
     n = x.shape[-2]
     x = np.sort(x, axis=-2)
     return np.asarray(0.5 * (x[..., (n - 1) // 2, :] + x[..., n // 2, :]))
-
-
-def _distance2(x: Array, information: Array) -> Array:
-    """Squared Mahalanobis distances (2, n) of rows (2, n, 3)."""
-    return np.asarray(np.add.reduce((x @ information) * x, axis=2))
 
 
 def _excess(chi2: list[float], n: int) -> Array | None:

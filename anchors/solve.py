@@ -90,8 +90,9 @@ def problem(
     p = np.array([m.p for m in merged])
     q = quat_multiply(np.array([m.q for m in merged]), quat_conjugate(q_world))
     covariance = np.array([m.covariance for m in merged])
-    walked = prior.walk_m_per_sqrt_s**2 * np.maximum(np.abs(age_s) - _STEADY_S, 0.0)
-    covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
+    if float(age_s.min()) < -_STEADY_S:
+        walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
+        covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
     return Problem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
 
 
@@ -160,20 +161,21 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         if prior.gravity:
             g[3:5] -= tilt_information * _tilt(q)
         g[6:] -= diagonal[6:] * drift
-        step = np.asarray(np.linalg.solve(H, g), dtype=np.float64)
+        inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
+        step = inverse @ g
         t, drift = t + step[:3], drift + step[6:]
         q = quat_multiply(quat_exp(step[3:6]), q)
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
     distance2 = np.add.reduce((b.information @ r[:, :, None])[:, :, 0] * r, axis=1)
-    chi2 = float(np.sum(distance2[inside])) + float(drift @ (diagonal[6:] * drift))
-    freedom = 6.0 * float(np.count_nonzero(inside)) - 6.0
+    chi2 = float(weights @ distance2) + float(drift @ (diagonal[6:] * drift))
+    freedom = 6.0 * float(weights.sum()) - 6.0
     if prior.gravity:
-        chi2 += tilt_information * float(np.sum(_tilt(q) ** 2))
+        tilt = _tilt(q)
+        chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    covariance = np.asarray(np.linalg.inv(H)[:6, :6], dtype=np.float64)
-    return Solution(t, q, covariance, inside, chi2, freedom, drift, distance2, r[:, 3:])
+    return Solution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
 
 
 def _tilt(q: Array) -> Array:

@@ -33,10 +33,11 @@ def length_p95(S: Array) -> float:
     The squared length is a weighted sum of chi-square variables, approximated by a scaled chi-square with the same mean
     and variance (Satterthwaite 1946).
     """
-    mean = float(np.trace(S))
+    elements = S.ravel().tolist()
+    mean = elements[0] + elements[4] + elements[8]
     if mean <= 0.0:
         return 0.0
-    freedom = mean * mean / float(np.sum(S * S))
+    freedom = mean * mean / sum([s * s for s in elements])
     return math.sqrt(mean / freedom * chi2_quantile(freedom, Z95))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.lie import quat_log, quat_multiply
-from anchors.pose import apply
+from anchors.pose import PoseTuple, apply
 from iris_session.bench.alignment import CASES, MARKS, run_alignment
 from iris_session.bench.alignment_world import PER_VIEWPOINT, TIP_SIGMA_M, Headset
 from iris_session.bench.contract import BenchReport, flat
@@ -74,6 +74,25 @@ def test_headsets_report_with_the_noise_that_is_fixed() -> None:
     assert wrong / n == pytest.approx(0.05, abs=0.015)
     assert np.std(turns) == pytest.approx(1.0, rel=0.1)
     assert np.std(errors) == pytest.approx(1.0, rel=0.15)
+
+
+def test_half_of_each_variance_is_constant_per_viewpoint_and_a_third_of_the_sigma_is_across() -> None:
+    """Variances of the means of looks and about them, along the view (without the error of scale) and across it."""
+    means, about = [], []
+    for seed in range(200):
+        headset = Headset(np.random.default_rng(seed))
+        T: PoseTuple = (tuple(headset.p0.tolist()), tuple(headset.q0.tolist()))
+        seen = headset.look("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        view = -np.median([apply(T, o.p_head) for o in seen], axis=0)
+        d = float(np.linalg.norm(view))
+        p = np.array([apply(T, o.pose[0]) for o in seen])
+        p = p[np.linalg.norm(p, axis=1) < 0.05]
+        across = np.array([-view[1], view[0], 0.0]) / math.hypot(view[0], view[1])
+        e = np.stack([p @ view / d, 3.0 * (p @ across)], axis=1) / (0.0004 + 0.0044 * d * d)
+        means.append(np.mean(e, axis=0))
+        about.append(np.var(e, axis=0, ddof=1))
+    assert np.median(about, axis=0) == pytest.approx([0.5, 0.5], rel=0.15)
+    assert np.var([m[1] for m in means]) == pytest.approx(0.5 + 0.5 / 19, rel=0.25)
 
 
 def test_a_touch_is_where_the_mark_is() -> None:
