@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from anchors.camera import Camera, pose_of, rvec_tvec
 from anchors.pose import PoseTuple
-from anchors.registration import register
+from anchors.registration import Registered, register
 from anchors.sheet import Sheet, dictionary
 
 Array = NDArray[np.float64]
@@ -31,11 +31,17 @@ MIN_MARKERS: Final = 2
 _MAX_CORNER_ERROR_PX: Final = 2.5
 #: Standard deviation of a corner as the detector finds it [px], where the print cannot be laid over the picture.
 _CORNER_SIGMA_PX: Final = 0.6
-_CODE_CORNER_SIGMA_PX: Final = 0.9  # of a bare code, whose corners are not refined
+_CODE_CORNER_SIGMA_PX: Final = 1.2  # of a bare code, whose corners are not refined
 _ENLARGE: Final = 2
-_MAX_ENLARGED_PIXELS: Final = 2_500_000
+_MIN_PERIMETER_PX: Final = 24.0  # smaller ones cannot be read
+_MAX_ENLARGED_PIXELS: Final = 5_000_000
 #: Where the mirrored pose fits the corners worse than by this factor it is not looked at any further.
 _CLEAR_RATIO: Final = 4.0
+#: Ratios of residuals below which both poses fit alike: of thousands of pixels, and of a few corners.
+_AMBIGUOUS_PRINT: Final = 1.05
+_AMBIGUOUS_CORNERS: Final = 2.0
+#: So many markers must agree where the print cannot be laid over the picture.
+_MIN_MARKERS_ALONE: Final = 3
 #: A registered print differs from the picture by at most this share of its contrast.
 _MAX_RMS: Final = 0.25
 
@@ -46,7 +52,7 @@ class Sighting:
 
     `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
     `mirrored`, `mirrored_ratio`: the other pose that a plane allows, and its residual over that of the result, at least
-    1: near 1 nobody can tell which is right; `AMBIGUOUS_RATIO` is a good bound. `reprojection_px`: rms of the corners
+    1: near 1 nobody can tell which is right (`ambiguous`). `reprojection_px`: rms of the corners
     that the detector found. `registered`: whether the whole print was used.
     """
 
@@ -63,10 +69,9 @@ class Sighting:
 
     @property
     def ambiguous(self) -> bool:
-        return self.mirrored is not None and self.mirrored_ratio < AMBIGUOUS_RATIO
-
-
-AMBIGUOUS_RATIO: Final = 1.03
+        """Whether nobody can tell which of the two poses is right; an estimator should not use such a sighting."""
+        bound = _AMBIGUOUS_PRINT if self.registered else _AMBIGUOUS_CORNERS
+        return self.mirrored is not None and self.mirrored_ratio < bound
 
 
 class DetectionError(ValueError):
@@ -82,14 +87,15 @@ class SheetDetector:
             raise DetectionError(f"two sheets have the same id: {', '.join(sorted(names))}")
         self.sheets = tuple(sheets)
         self.camera = camera
-        self._detector = _marker_detector()
+        longer = max(camera.width, camera.height)
+        self._detectors = {scale: _marker_detector(longer * scale) for scale in (1, _ENLARGE)}
 
     def detect(self, image: NDArray[Any]) -> list[Sighting]:
         """Sheets in one picture, shape (height, width) or (height, width, 3) uint8, by id."""
         grey = grey_of(image, self.camera)
         found = self._find(grey, 1)
         wanted = [sheet for sheet in self.sheets if sum(k in found for k in sheet.marker_ids) < len(sheet.marker_ids)]
-        if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS * 2:
+        if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS:
             for marker_id, corners in self._find(grey, _ENLARGE).items():
                 found.setdefault(marker_id, corners)
         sightings = [self._board(sheet, found, grey) for sheet in self.sheets]
@@ -102,7 +108,7 @@ class SheetDetector:
         picture: Any = grey
         if scale != 1:
             picture = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        corners, ids, _ = self._detector.detectMarkers(picture)
+        corners, ids, _ = self._detectors[scale].detectMarkers(picture)
         found: dict[int, list[Array]] = {}
         for marker_id, four in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
             found.setdefault(marker_id, []).append((four.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
@@ -164,12 +170,12 @@ def grey_of(image: NDArray[Any], camera: Camera) -> Image:
     return np.ascontiguousarray(grey)
 
 
-def _marker_detector() -> Any:
+def _marker_detector(longer_side_px: int) -> Any:
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    parameters.minMarkerPerimeterRate = 0.01  # of the longer side: 6 px a marker at 640
+    parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_side_px
     parameters.relativeCornerRefinmentWinSize = 0.2
     return cv2.aruco.ArucoDetector(dictionary(), parameters)
 
@@ -182,15 +188,15 @@ def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -
             points = sheet.marker_corners[list(numbers)].reshape(-1, 3)
             pixels = np.concatenate([seen[number] for number in numbers])
             poses = _plane_poses(points, pixels, camera, n)
-            if poses is not None and _largest_error(poses, camera) <= _MAX_CORNER_ERROR_PX:
+            if poses is not None and _largest_error(poses, poses.best[0], camera) <= _MAX_CORNER_ERROR_PX:
                 agreeing.append(poses)
         if agreeing:
             return min(agreeing, key=lambda poses: poses.best[1])
     return None
 
 
-def _largest_error(poses: _Poses, camera: Camera) -> float:
-    return float(np.linalg.norm(camera.project(poses.points, poses.best[0]) - poses.pixels, axis=1).max())
+def _largest_error(poses: _Poses, pose: PoseTuple, camera: Camera) -> float:
+    return float(np.linalg.norm(camera.project(poses.points, pose) - poses.pixels, axis=1).max())
 
 
 def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> _Poses | None:
@@ -236,23 +242,26 @@ def _differ(a: PoseTuple, b: PoseTuple) -> bool:
     return abs(sum(p * q for p, q in zip(a[1], b[1], strict=True))) < math.cos(0.5 * math.radians(0.5))
 
 
-def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighting:
+def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighting | None:
     """The better of both poses after the print was laid over the picture; by corners alone where that fails."""
     by_corners = _by_corners(sheet, poses, camera)
     starts = [poses.best[0]]
     if poses.mirrored is not None and by_corners.mirrored_ratio < _CLEAR_RATIO:
         starts.append(poses.mirrored[0])
-    tried = [(one, start) for start in starts if (one := register(grey, camera, sheet, start)) is not None]
-    tried = [one for one in tried if one[0].rms < _MAX_RMS]
-    if not tried:
-        return by_corners
-    tried.sort(key=lambda one: one[0].rms)
-    best = tried[0][0]
-    ratio, mirrored = by_corners.mirrored_ratio, by_corners.mirrored
-    if len(tried) > 1 and _differ(best.T_camera_sheet, tried[1][0].T_camera_sheet):
-        mirrored, ratio = tried[1][0].T_camera_sheet, tried[1][0].rms / max(best.rms, 1e-9)
-    elif len(starts) > 1:
-        mirrored, ratio = None, math.inf  # both starts lead to the same pose, or the other leads nowhere
+    tried = [register(grey, camera, sheet, start) for start in starts]
+    right = [
+        one
+        for one in tried
+        if one is not None
+        and one.rms < _MAX_RMS
+        and _largest_error(poses, one.T_camera_sheet, camera) <= _MAX_CORNER_ERROR_PX
+    ]
+    if not right:
+        return by_corners if poses.markers >= _MIN_MARKERS_ALONE else None
+    best = min(right, key=lambda one: one.rms)
+    mirrored, ratio = by_corners.mirrored, by_corners.mirrored_ratio
+    if len(starts) > 1:
+        mirrored, ratio = _compared(best, starts, tried)
     return replace(
         by_corners,
         T_camera_sheet=best.T_camera_sheet,
@@ -261,6 +270,18 @@ def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighti
         mirrored_ratio=ratio,
         registered=True,
     )
+
+
+def _compared(
+    best: Registered, starts: Sequence[PoseTuple], tried: Sequence[Registered | None]
+) -> tuple[PoseTuple | None, float]:
+    """The pose that the other start leads to, and how much worse it fits; none where both lead to the same one."""
+    for start, other in zip(starts, tried, strict=True):
+        if other is None:
+            return start, 1.0  # it leads nowhere: nothing was compared
+        if _differ(best.T_camera_sheet, other.T_camera_sheet):
+            return other.T_camera_sheet, other.rms / max(best.rms, 1e-9)
+    return None, math.inf
 
 
 def _by_corners(sheet: Sheet, poses: _Poses, camera: Camera, sigma_px: float = _CORNER_SIGMA_PX) -> Sighting:

@@ -30,10 +30,11 @@ _MAX_PIXELS: Final = 30_000  # of the part of the picture that is used; larger o
 #: Where a module is a few pixels, the print is rendered on a finer grid, each way, and averaged as a sensor does.
 _FINER: Final = 2
 _FINE_ENOUGH_PX: Final = 12.0  # per module
-_ITERATIONS: Final = 8
+_ITERATIONS: Final = 15
 #: Standard deviations of lens and sensor together that are tried [px].
 _BLURS: Final = (0.55, 0.85, 1.3, 2.0)
 _HUBER: Final = 2.0
+_MAX_TURN_RAD: Final = 0.1  # in one iteration: further away the picture is no longer linear in the pose
 #: What is left over is not white noise: neighbouring pixels err alike. Measured with `tools/detection_table.py`.
 _CORRELATED: Final = 3.0
 #: Error of camera and print that no picture shows, as if every corner were off by this [px].
@@ -99,7 +100,7 @@ def _view(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, pose: PoseTuple
         part = part[: part.shape[0] // n * n, : part.shape[1] // n * n]
         part = cv2.resize(part, (part.shape[1] // n, part.shape[0] // n), interpolation=cv2.INTER_AREA)
     small = camera.scaled(camera.width // n, camera.height // n) if n > 1 else camera
-    finer = _FINER if sheet.edge_m / 25.0 * small.fx < _FINE_ENOUGH_PX * pose[0][2] else 1
+    finer = _FINER if n > 1 or sheet.edge_m / 25.0 * small.fx < _FINE_ENOUGH_PX * pose[0][2] else 1
     return _View(
         part.astype(np.float32),
         _rays(camera, low, n, part.shape, 1),
@@ -138,10 +139,8 @@ def _fit(view: _View, sheet: Sheet, M: Array, blur: float, iterations: int) -> t
             step = np.linalg.solve(normal, J.T @ (weights * r))[6:]
         except np.linalg.LinAlgError:
             return None
-        if float(np.linalg.norm(step[3:])) > 0.2:
-            return None
-        M = _exp(step) @ M
-        if float(np.abs(step).max()) < 1e-7:
+        M = _exp(step * min(1.0, _MAX_TURN_RAD / max(float(np.linalg.norm(step[3:])), 1e-12))) @ M
+        if float(np.abs(step).max()) < 1e-6:  # a micrometre, a microradian
             break
     mean_contrast = float(np.mean(contrast))
     if mean_contrast <= 1.0:  # paper darker than ink, or nothing to see

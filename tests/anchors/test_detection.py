@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -63,10 +64,30 @@ def test_sheet_is_found_and_measured(
     assert position < mm
     assert angle < deg
     assert not seen.ambiguous
+    assert replace(seen, mirrored=true, mirrored_ratio=1.01).ambiguous
+    if distance_m == 2.0:  # far and tilted: the plane's other pose is worth looking at, and fits worse
+        assert seen.mirrored is not None
+        assert math.degrees(quat_angle(seen.mirrored[1], true[1])) > 20.0
+        assert 1.5 < seen.mirrored_ratio < 20.0
     covariance = np.reshape(seen.covariance, (6, 6))
     assert np.allclose(covariance, covariance.T)
     assert position < 4e3 * math.sqrt(np.trace(covariance[:3, :3]))
     assert math.sqrt(np.trace(covariance[:3, :3])) < 2e-3 * mm
+
+
+def test_what_is_found_from_afar_is_right(pages: dict[str, Page]) -> None:
+    """At the end of the range markers go missing and both poses of the plane fit the corners; the print decides."""
+    rng = np.random.default_rng(6)
+    found = 0
+    for distance_m, tilt in ((2.5, 20.0), (2.5, 40.0), (2.8, 30.0), (3.0, 10.0), (3.0, 25.0), (3.2, 20.0)):
+        true = _facing((0.1, 0.1, distance_m), tilt, float(rng.uniform(0.0, 360.0)))
+        picture = photograph([(pages["table"], true)], CAMERA, CONDITIONS, rng)
+        for seen in SheetDetector([TABLE], CAMERA).detect(picture):
+            if not seen.ambiguous:
+                found += 1
+                assert _off(seen, true)[0] < 15.0
+                assert _off(seen, true)[1] < 3.0
+    assert found >= 3
 
 
 def test_bare_code_is_read_from_near_only(pages: dict[str, Page]) -> None:

@@ -14,6 +14,7 @@ from anchors.robot_world import (
     Noise,
     Solved,
     T_world_base_of_twin,
+    _of_inverse,
     camera_on_hand,
     one_pose,
     solve,
@@ -106,6 +107,24 @@ def test_camera_on_the_hand() -> None:
     solved = camera_on_hand(robot, seen, covariance)
     assert distance(solved.T_ee_marker[0], T_ee_camera[0]) < 1e-7
     assert distance(solved.T_base_camera[0], T_base_sheet[0]) < 1e-7
+
+
+def test_covariance_of_the_inverse_is_that_of_inverted_samples() -> None:
+    rng = np.random.default_rng(11)
+    root = np.diag([1e-3, 2e-3, 4e-3, 2e-3, 5e-3, 1e-3])
+    samples = []
+    for _ in range(4000):
+        d = root @ rng.normal(size=6)
+        M = matrix_of(T_BASE_CAMERA)
+        M[:3, :3] = matrix_of(pose_of(d[3:], np.zeros(3)))[:3, :3] @ M[:3, :3]
+        M[:3, 3] += d[:3]
+        back, true = inverse(pose_of_matrix(M)), inverse(T_BASE_CAMERA)
+        turn = quat_to_rotvec(compose(back, inverse(true))[1])
+        samples.append([*np.subtract(back[0], true[0]), *turn])
+    wanted = np.cov(np.array(samples).T)
+    found = np.reshape(_of_inverse(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
+    scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    assert np.allclose(found / scale, wanted / scale, atol=0.08)
 
 
 def test_virtual_robot_over_its_twin() -> None:
