@@ -33,11 +33,12 @@ class Publishing:
         not given, clients get every second or fourth frame of the next better one. `capture_ns`: session time of its
         capture, as of `session.clock()` (default: now). `encoding`: what the bytes are, for those who read them.
 
-        False: the front takes nothing now, and the frame is dropped. Raises `ValueError` for a name that no stream can
-        have, other classes, or more than 8 MiB.
+        False: the frame is dropped, because the front takes nothing now or the session is being closed. Raises
+        `ValueError` for a name that no stream can have, other classes, or more than 8 MiB.
         """
         front = self._live().front
-        assert front is not None
+        if front is None:  # the session is being closed
+            return False
         last = None if self._stepper is None else self._stepper.last
         epoch = 0 if last is None else last.decision.scene_epoch
         return front.publish_media(stream, frames, self.clock() if capture_ns is None else capture_ns, epoch, encoding)

@@ -16,31 +16,48 @@ WAITING: Final = MAX_STREAMS
 
 
 class MediaSource:
-    """May be used by several threads. `endpoint`: of `FrontProcess.media_endpoint`; fronts may come and go."""
+    """May be used by several threads, also while it is closed by one of them. `endpoint`: of
+    `FrontProcess.media_endpoint`; fronts may come and go. Opens nothing before the first frame."""
 
     def __init__(self, endpoint: str) -> None:
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.PUSH)
-        self._socket.setsockopt(zmq.SNDHWM, WAITING)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.connect(endpoint)
+        self._endpoint = endpoint
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._socket: zmq.Socket[bytes] | None = None
         self._lock = threading.Lock()
+        self._closed = False
         self.dropped = 0
 
     def publish(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
-        """False: dropped, the front takes nothing now. Raises `ValueError` for what no front would take."""
+        """False: dropped, the front takes nothing now, or it is closed. Raises `ValueError` for what no front would
+        take."""
         message = encode_media_frames(stream, frames, capture_ns, scene_epoch, encoding)
         with self._lock:
             try:
-                self._socket.send_multipart(message, zmq.DONTWAIT)
+                socket = self._open()
+                if socket is not None:
+                    socket.send_multipart(message, zmq.DONTWAIT)
+                    return True
             except zmq.Again:
-                self.dropped += 1
-                return False
-        return True
+                pass
+            self.dropped += 1
+            return False
+
+    def _open(self) -> zmq.Socket[bytes] | None:
+        if self._socket is None and not self._closed:
+            self._context = zmq.Context()
+            self._socket = self._context.socket(zmq.PUSH)
+            self._socket.setsockopt(zmq.SNDHWM, WAITING)
+            self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+            self._socket.connect(self._endpoint)
+        return self._socket
 
     def close(self) -> None:
+        """May be called twice."""
         with self._lock:
-            self._socket.close(linger=0)
-            self._context.term()
+            self._closed = True
+            context, socket, self._context, self._socket = self._context, self._socket, None, None
+        if socket is not None and context is not None:
+            socket.close(linger=0)
+            context.term()

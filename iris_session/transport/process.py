@@ -51,7 +51,7 @@ class FrontProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
-        self._source: MediaSource | None = None
+        self._source = MediaSource(self.media_endpoint)
         self.link = FrontLink(config)
 
     @property
@@ -166,8 +166,6 @@ class FrontProcess:
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
     ) -> bool:
         """Hands a frame to whichever front there is; see `MediaSource.publish`."""
-        if self._source is None:
-            self._source = MediaSource(self.media_endpoint)
         return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _end_process(self, patience_s: float) -> None:
@@ -187,9 +185,7 @@ class FrontProcess:
     def close(self, timeout_s: float = 2.0) -> None:
         """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
         self._finish_replacing()
-        if self._source is not None:
-            self._source.close()
-            self._source = None
+        self._source.close()
         self.link.send_end()
         self._end_process(timeout_s if self.link.ports is not None else 0.0)
         self._process = None

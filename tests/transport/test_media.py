@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import zmq
@@ -15,6 +16,7 @@ from iris_session.protocol.media import MediaHeader, media_topic
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
 from iris_session.transport import FrontLimits
+from iris_session.transport.media_source import MediaSource
 from tests.transport.harness import FrontSession, RawClient
 from tests.transport.lab import Lab, Open
 
@@ -242,6 +244,15 @@ def test_what_no_front_would_take_is_said_where_it_is_handed_in(media: Stage) ->
         media.session.process.publish_media("a", {"half": b"x"}, 0, 0, "bytes")
     with pytest.raises(ValueError, match="at most 8388608 for each class"):
         media.session.process.publish_media("a", bytes(8_388_609), 0, 0, "bytes")
+
+
+def test_a_camera_thread_that_goes_on_when_the_session_ends_is_told_so(tmp_path: Path) -> None:
+    source = MediaSource(f"ipc://{tmp_path}/front")
+    assert source.publish("a", b"x", 0, 0, "bytes")
+    source.close()
+    source.close()
+    assert not source.publish("a", b"x", 0, 0, "bytes")
+    assert source.dropped == 1
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------
