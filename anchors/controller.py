@@ -15,7 +15,7 @@ import numpy as np
 
 from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
 from anchors.noise import isotropic
-from anchors.pose import PoseTuple, Vec3, compose, quat_normalize
+from anchors.pose import PoseTuple, Vec3, compose, is_rigid, quat_normalize
 
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _TRIM: Final = 4.0  # residuals beyond this many sigmas are wrong readings
@@ -62,8 +62,10 @@ def calibrate_tip(
     step).
 
     Each pose `T_tracking_controller` = (R, t) says R p_tip + t = p_pivot: linear in both unknown points. Readings far
-    off are left out. Refused when the turns do not fix all three coordinates, or when the tip slipped.
+    off, and what is no pose, are left out. Refused when the turns do not fix all three coordinates, or when the tip
+    slipped.
     """
+    poses = [T for T in poses if is_rigid(T)]
     if len(poses) < min_poses:
         return _refused(f"{len(poses)} poses of at least {min_poses}: keep the tip in place and go on turning")
     q = np.array([quat_normalize(T[1]) for T in poses])

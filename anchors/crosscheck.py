@@ -20,7 +20,7 @@ import numpy as np
 from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
 from anchors.noise import NoiseModel
-from anchors.pose import PoseTuple, Vec3, compose
+from anchors.pose import PoseTuple, Vec3, compose, is_rigid
 from anchors.uncertainty import length_p95
 
 
@@ -83,19 +83,31 @@ class CrossCheck:
         viewpoint_id: int = 0,
     ) -> None:
         """One detection of a sheet, or one tracked pose of a controller, on the session's clock."""
-        if tracking_epoch != self._epochs.setdefault(headset, tracking_epoch):
-            self.forget(headset)
-            self._epochs[headset] = tracking_epoch
         key = (headset, thing)
-        finite = all(map(math.isfinite, (*T_tracking_thing[0], *T_tracking_thing[1], *p_tracking_head)))
-        if not finite or (key not in self._looks and len(self._looks) >= self.config.max_things):
+        epoch = self._epochs.get(headset, tracking_epoch)
+        if not is_rigid(T_tracking_thing) or not all(map(math.isfinite, p_tracking_head)) or tracking_epoch < epoch:
             self.dropped += 1
             return
+        if tracking_epoch > epoch:
+            self.forget(headset)
+        if key not in self._looks and not self._room(capture_ns):
+            self.dropped += 1
+            return
+        self._epochs[headset] = tracking_epoch
         looks = self._looks.setdefault(key, deque(maxlen=self.config.max_seen))
         if looks and capture_ns <= looks[-1].capture_ns:
             self.dropped += 1  # out of order
             return
         looks.append(_Look(capture_ns, T_tracking_thing, p_tracking_head, viewpoint_id))
+
+    def _room(self, now_ns: int) -> bool:
+        """Whether one thing more can be kept; those that nobody saw for long make room."""
+        if len(self._looks) >= self.config.max_things:
+            fresh = {
+                k: looks for k, looks in self._looks.items() if looks[-1].capture_ns > now_ns - self.config.max_age_ns
+            }
+            self._looks = fresh
+        return len(self._looks) < self.config.max_things
 
     def forget(self, headset: str) -> None:
         """It left, or its tracking frame is a new one."""

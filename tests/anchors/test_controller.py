@@ -74,3 +74,10 @@ def test_a_holder_is_an_anchor() -> None:
     T = holder_anchor(T_world_holder, T_holder_controller)
     assert np.allclose(compose(inverse(T_world_holder), T)[0], T_holder_controller[0])
     assert len(controller_covariance()) == 36
+
+
+def test_readings_that_are_no_pose_are_left_out() -> None:
+    poses = _poses(_cone())
+    lost: list[PoseTuple] = [((math.nan, 0.0, 0.0), poses[0][1]), (poses[0][0], (0.0, 0.0, 0.0, 0.0))]
+    assert calibrate_tip([*lost, *poses]) == calibrate_tip(poses)
+    assert calibrate_tip(lost * 20).refused

@@ -106,3 +106,24 @@ def test_memory_is_bounded_and_what_is_of_no_use_is_counted() -> None:
     check.see("a", "thing0", ((math.nan, 0.0, 0.0), pose[1]), zero, 1000, 0)
     check.see("a", "thing0", pose, zero, 5, 0)
     assert check.dropped == 98 + 1 + 2
+
+
+def test_what_comes_late_of_an_earlier_frame_forgets_nothing() -> None:
+    rng = np.random.default_rng(2)
+    T, check = headset(rng), CrossCheck()
+    look = Look(rng, SHEET, around(rng, SHEET[0], 0.6))
+    alignments = {name: replace(_aligned(rng, T), tracking_epoch=1) for name in "ab"}
+    for name in "ab":
+        _see(check, name, look, T, epoch=1)
+        _see(check, name, look, T, n=1, epoch=0, start=30)
+    assert check.dropped == 2
+    assert len(check.compare(alignments, 30 * PERIOD)) == 1
+
+
+def test_what_nobody_sees_any_more_makes_room() -> None:
+    check = CrossCheck(config=CrossCheckConfig(max_things=2, max_age_ns=10 * PERIOD))
+    for i, thing in enumerate("abcd"):
+        check.see("h", thing, SHEET, (0.0, 0.0, 1.0), i, 0)
+    assert check.dropped == 2
+    check.see("h", "c", SHEET, (0.0, 0.0, 1.0), 20 * PERIOD, 0)
+    assert check.dropped == 2
