@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from typing import Final
 
 import msgspec
@@ -20,6 +21,8 @@ def trouble(text: str, error: msgspec.MsgspecError) -> str:
         return f"line {malformed.lineno}: {malformed.msg}"
     except RecursionError:
         return "nested too deep"
+    except ValueError as other:  # a number of thousands of digits
+        return str(other)
     found = _INDEX.search(str(error))
     if found is None:
         return str(error)
@@ -27,11 +30,12 @@ def trouble(text: str, error: msgspec.MsgspecError) -> str:
 
 
 def line_of(text: str, index: int) -> int:
-    """The line, from 1, in which entry `index` of a well-formed JSON list begins."""
+    """The line, from 1, in which entry `index` of a JSON list begins; of a list that is none, the last that is read."""
     decoder, at = json.JSONDecoder(), _skip(text, 0)
-    for _ in range(index):
-        _, end = decoder.raw_decode(text, at)
-        at = _skip(text, end)
+    with suppress(ValueError, RecursionError):  # somebody edits the file just now
+        for _ in range(index):
+            _, end = decoder.raw_decode(text, at)
+            at = _skip(text, end)
     return text.count("\n", 0, at) + 1
 
 

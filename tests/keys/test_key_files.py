@@ -183,3 +183,22 @@ def test_new_permissions_are_a_change(home: KeyHome) -> None:
         home.clients.read()
     path.chmod(0o600)
     assert home.clients.signature != before
+
+
+@pytest.mark.parametrize("saved", ["", "[", "[{}, nonsense", "[1" + 5000 * "0" + "]"])
+def test_a_file_that_an_editor_saves_while_it_is_read_is_still_only_damaged(
+    home: KeyHome, listed: Path, monkeypatch: pytest.MonkeyPatch, saved: str
+) -> None:
+    """The line is looked for in another file than the one that was wrong."""
+    entries = json.loads(listed.read_text())
+    listed.write_text(json.dumps([*entries, entries[0]]))
+    whole, reads = home.folder.read, iter([listed.read_bytes(), saved.encode()])
+    monkeypatch.setattr(home.folder, "read", lambda name: next(reads, None) or whole(name))
+    with pytest.raises(KeysError, match="is damaged"):
+        home.clients.read()
+
+
+def test_a_number_of_thousands_of_digits_is_damage(home: KeyHome, listed: Path) -> None:
+    listed.write_text('[{"name": 1' + 5000 * "0" + "}]")
+    with pytest.raises(KeysError, match="is damaged"):
+        home.clients.read()
