@@ -23,6 +23,8 @@ from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
 _CHI2_3_999: Final = 16.266
 _MAX_PERMUTED: Final = 6  # of more points only pairs are tried in exchange
 _MIN_WIDTH_M: Final = 0.05  # how far a point must lie beside the line through the others
+_REACH_M: Final = 1e3  # no tracking frame is larger
+_MAX_TOLD: Final = 5  # wrong distances that are listed, the largest first
 _NOWHERE: Final[PoseTuple] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -53,7 +55,7 @@ def register(
 ) -> Registration:
     """`T_world_tracking` from at least three touched points. `sigma_m`: noise of one touch per axis."""
     config = config or AlignmentConfig()
-    wrong = [t for t in touches if t.point not in points_world or not all(map(math.isfinite, t.p_tracking_tip))]
+    wrong = [t for t in touches if t.point not in points_world or not all(abs(c) <= _REACH_M for c in t.p_tracking_tip)]
     if wrong:
         known = ", ".join(sorted(points_world))
         return _refused(tracking_epoch, f"point '{wrong[0].point}' is not marked, or was not read; marked are {known}")
@@ -226,7 +228,8 @@ def _blame_distances(names: Sequence[str], world: Array, tip: Array, sigma: floa
     shared = [k for k in range(len(names)) if bad and all(k in (i, j) for i, j, _ in bad)]
     if len(bad) > 1 and len(shared) == 1:
         return f"point '{names[shared[0]]}' does not fit the others: touch it again", (names[shared[0]],)
-    told = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in bad)
+    worst = sorted(bad, key=lambda one: -abs(one[2]))[:_MAX_TOLD]
+    told = ", ".join(f"'{names[i]}'-'{names[j]}' by {off * 1e3:+.0f} mm" for i, j, off in worst)
     return (
         f"distances between points are wrong ({told or 'not any: the order is turned round'}): touch all of them again",
         tuple(names),

@@ -132,3 +132,21 @@ def test_marks_that_look_alike_turned_round_are_warned_about() -> None:
     assert not got.estimate.refused
     assert "look the same in another order" in got.estimate.advice
     assert register(MARKS, _touches("abcd")).estimate.advice == ""
+
+
+def test_of_many_wrong_distances_the_largest_are_told() -> None:
+    rng = np.random.default_rng(0)
+    marks = {f"mark {i}": (0.1 * i, 0.01 * i * i, 0.0) for i in range(9)}
+    places = rng.uniform(0.0, 1.0, (9, 2)).tolist()
+    touches = [Touch(name, (x, y, 0.0)) for name, (x, y) in zip(marks, places, strict=True)]
+    got = register(marks, touches)
+    assert got.estimate.refused
+    assert got.estimate.advice.count(" mm") == 5
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e308])
+def test_a_touch_nowhere_is_not_read(value: float) -> None:
+    marks = {"a": (0.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0), "c": (0.0, 1.0, 0.0)}
+    got = register(marks, [Touch(name, (value, 0.0, 0.0)) for name in marks])
+    assert got.estimate.refused
+    assert "was not read" in got.estimate.advice
