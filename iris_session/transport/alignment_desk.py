@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal
 
 #: What numbers of a stranger can make of linear algebra.
-_UNSOLVABLE = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+_UNSOLVABLE: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+#: The authority tells a wearer of at most one refusal a second: one that follows another sooner may not have been told.
+_CLOSE_NS: Final = 1_500_000_000
 
 
 class AlignmentDesk:
@@ -32,6 +35,8 @@ class AlignmentDesk:
         self._unknown: tuple[str, int] | None = None  # anchor and tracking epoch, to be told
         self._told: tuple[str, int] | None = None
         self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
+        self._refused_ns = -_CLOSE_NS
+        self._again = False  # the last refusal came too soon after another: it is said once more
 
     def observe(self, observation: Observation) -> bool:
         """Takes one observation. False: it is of no use (unknown anchor, old tracking epoch, not a rigid transform, a
@@ -61,7 +66,8 @@ class AlignmentDesk:
         return used
 
     def due(self, now_ns: int) -> bool:
-        return (self._pending or self._unknown is not None) and now_ns >= self._next_ns
+        unknown = self._unknown is not None and now_ns - self._refused_ns >= _CLOSE_NS
+        return (self._pending or unknown) and now_ns >= self._next_ns
 
     def propose(self, now_ns: int) -> AlignmentProposal | None:
         """Estimates from everything observed. `None`: the same refusal as before, for the same reason.
@@ -70,7 +76,7 @@ class AlignmentDesk:
         """
         self._next_ns = now_ns + self._period_ns
         if not self._pending and self._unknown is not None:
-            self._told, self._unknown = self._unknown, None
+            self._told, self._unknown, self._refused_ns = self._unknown, None, now_ns
             return self._unknown_anchor(*self._told)
         self._pending = False
         try:
@@ -79,8 +85,11 @@ class AlignmentDesk:
             text = "the observations of the anchor cannot be solved: look at it from elsewhere"
             proposal = _refusal(self._estimator.tracking_epoch, text)  # the authority ignores older epochs
         refused = (proposal.tracking_epoch, proposal.advice) if proposal.refused else None
-        if refused is not None and refused == self._refused:
-            return None
+        if refused is not None:
+            close = now_ns - self._refused_ns < _CLOSE_NS
+            if refused == self._refused and (close or not self._again):
+                return None
+            self._again, self._refused_ns = close, now_ns
         self._refused = refused
         return proposal
 

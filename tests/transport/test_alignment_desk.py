@@ -137,7 +137,8 @@ def test_an_unknown_sheet_beside_a_known_one_replaces_no_estimate_and_is_told_on
     desk.observe(seen(9, anchor="poster"))
     assert not desk.due(2 * PERIOD)
     desk.observe(seen(10, anchor="poster", epoch=2))
-    assert desk.due(2 * PERIOD), "in a new tracking frame it is worth a word again"
+    assert not desk.due(2 * PERIOD), "the authority would leave out a second refusal within a second"
+    assert desk.due(9 * PERIOD), "in a new tracking frame it is worth a word again"
 
 
 def test_advice_that_names_many_sheets_still_fits_into_a_proposal() -> None:
@@ -167,3 +168,18 @@ def test_what_cannot_be_solved_is_refused_in_the_epoch_it_was_seen_in(monkeypatc
     proposal = desk.propose(0)
     assert proposal is not None
     assert (proposal.refused, proposal.tracking_epoch) == (True, 3)
+
+
+def test_a_refusal_soon_after_another_is_said_once_more() -> None:
+    """The authority tells one a second: else the second reason would never be told."""
+    desk = AlignmentDesk(ANCHORS, PERIOD, {"table": 0.16})
+    desk.observe(seen(0))
+    assert desk.propose(0) is not None
+    said = []
+    for i in range(1, 40):
+        desk.observe(msgspec.structs.replace(seen(i), size_m=0.2))
+        proposal = desk.propose(i * PERIOD)
+        if proposal is not None:
+            assert "measures 200 mm" in proposal.advice
+            said.append(i)
+    assert said == [1, 9]
