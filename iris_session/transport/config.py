@@ -30,7 +30,8 @@ class FrontLimits(msgspec.Struct, frozen=True):
     messages of one TCP connection that are not taken, before it is cut off. An honest client with a fault in its loop
     is named by its rate limits long before. `strangers`: TCP connections that have not said hello, for at most
     `hello_timeout_ns` each; as many again to the state socket that have not subscribed. `subscribers`: TCP connections
-    to the state socket that have, and to the media socket; `sources`: to the socket that takes media.
+    to the state socket that have, and to the media socket; `sources`: to the socket that takes media, of
+    each of which `source_bytes` may wait.
     `memory_bytes`: what all queues together may hold (see `memory.py`).
     """
 
@@ -55,6 +56,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     hello_timeout_ns: int = 10 * SECOND
     subscribers: int = 512
     sources: int = 64
+    source_bytes: int = 64 * MEBIBYTE
     memory_bytes: int = 256 * MEBIBYTE
 
 

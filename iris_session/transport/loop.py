@@ -55,6 +55,8 @@ SEQ_NS = MILLISECOND
 #: Between the last message and the end of the connections: libzmq throws away what a client (with `IMMEDIATE`) has
 #: not read when its connection closes.
 FAREWELL_S = 0.1
+#: Of one subscriber to media, that wait to be read: far more than all its topics have.
+SUBSCRIBER_BYTES = 65_536
 ENDED = "closed by its owner"
 ORPHANED = "its process is gone"
 
@@ -183,8 +185,8 @@ class Front:
         limits = self._config.limits
         proxy = MediaProxy(
             sockets.media.socket,
-            MediaDoors(sockets.media.monitor, limits, limits.subscribers),
-            MediaDoors(sockets.ingest.monitor, limits, limits.sources),
+            MediaDoors(sockets.media.monitor, limits, limits.subscribers, SUBSCRIBER_BYTES, curve=encrypted),
+            MediaDoors(sockets.ingest.monitor, limits, limits.sources, limits.source_bytes, curve=encrypted),
             sockets.local_ingest,
             sockets.ingest.socket,
             self._session_ns,

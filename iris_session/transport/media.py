@@ -141,7 +141,7 @@ class MediaProxy:
                 continue  # libzmq takes back what a connection had that has ended: we noticed that end
             self._come_and_gone()
             user = self._user_of(frame)
-            cut = self._doors.heard(descriptor, user, counts=True)
+            cut = self._doors.heard(descriptor, user, (len(data),), counts=True)
             with self.lock:
                 if cut:
                     self.hub.count(cut)
@@ -164,17 +164,18 @@ class MediaProxy:
                 frame = socket.recv(zmq.DONTWAIT, copy=False)
             except zmq.Again:
                 return
-            frames = [frame]
+            frames, lengths = [frame], [len(frame)]
             while frame.more:
                 frame = socket.recv(zmq.DONTWAIT, copy=False)
+                lengths.append(len(frame))
                 if len(frames) <= len(CLASSES):
                     frames.append(frame)
             if socket is self._remote:
-                self._take_of_others(frames)
+                self._take_of_others(frames, lengths)
             else:
                 self._take(frames, "")
 
-    def _take_of_others(self, frames: list[zmq.Frame]) -> None:
+    def _take_of_others(self, frames: list[zmq.Frame], lengths: list[int]) -> None:
         user = self._user_of(frames[0])
         with self.lock:
             welcome = not user or user in self.sources
@@ -183,7 +184,7 @@ class MediaProxy:
                 if len(self.asking) < MAX_ASKING:
                     self.asking.add(user)
         self._back_doors.read(self._now_ns())
-        cut = self._back_doors.heard(_descriptor(frames[0]), user, counts=not welcome)
+        cut = self._back_doors.heard(_descriptor(frames[0]), user, lengths, counts=not welcome)
         with self.lock:
             self._count((cut,))
         if welcome:

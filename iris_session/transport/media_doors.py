@@ -1,16 +1,19 @@
-"""TCP connections to a socket of media: who says nothing for a while is closed, and so are too many."""
+"""TCP connections to a socket of media: who says nothing for a while is closed, and so are too many, and who hands in
+more than is taken: of a message libzmq collects all frames, however many, before it shows the first."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 import zmq
 
-from iris_session.transport.config import FrontLimits
+from iris_session.transport.config import MILLISECOND, FrontLimits
 from iris_session.transport.sockets import close_tcp, next_tcp_event, peer_of, readable
+from iris_session.transport.traffic import Traffic
 from iris_session.transport.visitors import crowd
 
-LOOK_NS: Final = 1_000_000_000
+LOOK_NS: Final = 250 * MILLISECOND
 #: Messages of one connection that count, beyond which it is cut off: as many subscriptions as a client has, over and
 #: over; frames of a source that nobody lets in.
 MAX_SAID: Final = 1024
@@ -33,13 +36,18 @@ class _Guest:
 class MediaDoors:
     """Belongs to the thread of the media proxy. `monitor`: of the socket. What it closes, it gives the reason of.
 
-    At most `most` connections that have said something, and as many that have not.
+    At most `most` connections that have said something, and as many that have not; at most `waiting` bytes that came by
+    one of them and were not taken. `curve`: whether it is encrypted.
     """
 
-    def __init__(self, monitor: zmq.Socket[bytes], limits: FrontLimits, most: int) -> None:
+    def __init__(
+        self, monitor: zmq.Socket[bytes], limits: FrontLimits, most: int, waiting: int, *, curve: bool
+    ) -> None:
         self._monitor = monitor
         self._limits = limits
         self._most = most
+        self._waiting = waiting
+        self._traffic = Traffic(curve=curve)
         self._guests: dict[int, _Guest] = {}
         self._next_ns = 0
 
@@ -50,16 +58,19 @@ class MediaDoors:
         while readable(self._monitor):
             event, descriptor = next_tcp_event(self._monitor)
             self._guests.pop(descriptor, None)
+            self._traffic.begin(descriptor)
             if event == zmq.EVENT_ACCEPTED:
                 self._guests[descriptor] = _Guest(peer_of(descriptor), now_ns)
             changed.append(descriptor)
         return changed
 
-    def heard(self, descriptor: int, user: str, *, counts: bool) -> str:
-        """A message came by a connection. Not empty: it was cut off, and why."""
+    def heard(self, descriptor: int, user: str, lengths: Iterable[int], *, counts: bool) -> str:
+        """A message with frames of these lengths came by a connection. Not empty: it was cut off, and why."""
         guest = self._guests.get(descriptor)
         if guest is None:
             return ""
+        for length in lengths:
+            self._traffic.taken(descriptor, length)
         guest.inside, guest.who = True, user or guest.who
         guest.said += counts
         return self.close_one(descriptor, "media_flood") if guest.said > MAX_SAID else ""
@@ -72,7 +83,9 @@ class MediaDoors:
         inside = [one for one in self._guests.items() if one[1].inside]
         silent = [one for one in self._guests.items() if not one[1].inside]
         oldest_ns = now_ns - self._limits.hello_timeout_ns
-        closed = [self.close_one(fd, "media_silent") for fd, guest in silent if guest.opened_ns < oldest_ns]
+        flooding = [fd for fd in self._guests if self._traffic.held(fd) > self._waiting]
+        closed = [self.close_one(fd, "media_flood") for fd in flooding]
+        closed += [self.close_one(fd, "media_silent") for fd, guest in silent if guest.opened_ns < oldest_ns]
         many = (*crowd(silent, self._most), *crowd(reversed(inside), self._most))
         closed += [self.close_one(fd, "media_too_many") for fd in many]
         return [reason for reason in closed if reason]

@@ -174,6 +174,27 @@ def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: st
     media.close()
 
 
+def test_a_message_without_end_is_cut_off(open_session: Open) -> None:
+    """libzmq would collect it in memory; its own sockets cannot send one."""
+    session = open_session(limits=FrontLimits(source_bytes=1 << 20))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x04PUSH"
+    frame = b"\x03" + (100_000).to_bytes(8, "big") + bytes(100_000)  # and more of the same message
+    with socket.create_connection(("127.0.0.1", session.ports.media_ingest)) as source:
+        source.settimeout(30.0)
+        source.sendall(greeting + b"\x04" + bytes([len(ready)]) + ready)
+        answer = b""
+        while b"PULL" not in answer:
+            answer += source.recv(4096)
+        source.sendall(20 * frame)
+        media.drops("media_flood")
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 20, "ann gets media")
+    media.close()
+
+
 def test_too_many_who_subscribe_are_closed_and_the_first_stay(open_session: Open) -> None:
     session = open_session(limits=FrontLimits(subscribers=2))
     media = Stage(session)
