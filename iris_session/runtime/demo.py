@@ -28,6 +28,8 @@ from iris_session.runtime.verification import verify_recording
 
 #: How often the reports of the emulated people are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
+#: Until the session that the demo itself started lets its people in: a busy machine may take its time.
+JOIN_TIMEOUT_S: Final = 60.0
 #: People who work share a process in pairs, people who only look in fours.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
@@ -38,6 +40,7 @@ class EmulatorProcess:
 
     def __init__(self, address: str, specs: Sequence[HeadsetSpec], seconds: float) -> None:
         command = [sys.executable, "-m", "iris_session.emulator", "--address", address, "--specs", "-", "--json"]
+        command += ["--join-timeout", str(JOIN_TIMEOUT_S)]
         self._process = subprocess.Popen(
             [*command, "--seconds", str(seconds)],
             stdin=subprocess.PIPE,

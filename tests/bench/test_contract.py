@@ -66,7 +66,7 @@ def test_state(tmp_path: Path, crypto: str) -> None:
 
 @pytest.mark.e2e
 def test_input(tmp_path: Path) -> None:
-    result = _bench(tmp_path, "input", "--operators", "1", "--robots", "1", "--observers", "1", "--seconds", "1")
+    result = _bench(tmp_path, "input", "--operators", "1", "--robots", "1", "--observers", "1", "--seconds", "3")
     _check(result, "input", INPUT_KEYS)
     assert {"operators": 1, "robots": 1, "observers": 1}.items() <= result["params"].items()
     got = result["results"]
