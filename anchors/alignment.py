@@ -286,8 +286,9 @@ class AlignmentEstimator:
 
     def _result(self, b: Problem, s: Solution, tilt: float, moved: tuple[str, ...]) -> AlignmentEstimate:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
-        pivot = b.p_world[s.inside].mean(axis=0)
-        pivot_world = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
+        pivot = s.inside @ b.p_world / float(s.inside.sum())
+        x, y, z = pivot.tolist()
+        pivot_world = (x, y, z)
         in_the_world = in_world(s.q, s.covariance, pivot) * wider
         covariance = tuple(in_the_world.ravel().tolist())
         error = length_p95(in_the_world[:3, :3])

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, turned
 from anchors.uncertainty import Z999, chi2_quantile
 
 _CHI2_3_MEDIAN: Final = 2.366
@@ -65,7 +65,7 @@ def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -
     if wider is not None:
         covariance = covariance * wider[:, None] * wider
     mean += about
-    return Merged(mean[0], quat_multiply(quat_exp(mean[1]), centre), covariance, n, count)
+    return Merged(mean[0], turned(centre, mean[1]), covariance, n, count)
 
 
 def middle(x: Array) -> Array:

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, skew
+from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, turned
 from anchors.pose import PoseTuple, quat_normalize
 from anchors.robust import Merged, circular_median
 
@@ -25,7 +25,8 @@ _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
-_CONVERGED: Final = 1e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
+_CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
+_EYE: Final = np.eye(6)
 Mask = NDArray[np.bool_]
 
 
@@ -142,7 +143,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
     q, t = start
     drift = np.zeros(3)
     J = np.zeros((b.size, 6, 9))
-    J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = J[:, 3, 3] = J[:, 4, 4] = J[:, 5, 5] = 1.0
+    J[:, :, :6] = _EYE
     J[:, 0, 6] = J[:, 1, 7] = J[:, 2, 8] = b.age_s
     weights = inside.astype(np.float64)
     tilt_information = 1.0 / prior.tilt_sigma_rad**2 if prior.gravity else 0.0
@@ -150,10 +151,10 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
     diagonal[3:5] = tilt_information
     diagonal[6:] = 1.0 / max(prior.drift_m_per_s, 1e-9) ** 2
     for _ in range(_ITERATIONS):
-        r, turned = _residuals(b, q, t, drift)
-        J[:, 0, 4], J[:, 0, 5] = turned[:, 2], -turned[:, 1]  # minus the cross-product matrix of the turned anchor
-        J[:, 1, 3], J[:, 1, 5] = -turned[:, 2], turned[:, 0]
-        J[:, 2, 3], J[:, 2, 4] = turned[:, 1], -turned[:, 0]
+        r, P = _residuals(b, q, t, drift)
+        J[:, 0, 4], J[:, 0, 5] = P[:, 2], -P[:, 1]  # minus the cross-product matrix of the turned anchor
+        J[:, 1, 3], J[:, 1, 5] = -P[:, 2], P[:, 0]
+        J[:, 2, 3], J[:, 2, 4] = P[:, 1], -P[:, 0]
         A = (b.information @ J * weights[:, None, None]).reshape(-1, 9)
         g = A.T @ r.ravel()
         H = A.T @ J.reshape(-1, 9)
@@ -164,7 +165,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
         t, drift = t + step[:3], drift + step[6:]
-        q = quat_multiply(quat_exp(step[3:6]), q)
+        q = turned(q, step[3:6])
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
@@ -192,11 +193,11 @@ def _tilt(q: Array) -> Array:
 
 def _residuals(b: Problem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
     """Observed minus predicted, positions then rotation vectors (G, 6); and the turned anchor positions (G, 3)."""
-    turned = b.p_world @ quat_matrix(q).T
+    P = b.p_world @ quat_matrix(q).T
     r = np.empty((b.size, 6))
-    r[:, :3] = b.p - turned - t - b.age_s[:, None] * drift
+    r[:, :3] = b.p - P - t - b.age_s[:, None] * drift
     r[:, 3:] = quat_log(quat_multiply(b.q, quat_conjugate(q)))
-    return r, turned
+    return r, P
 
 
 def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
