@@ -101,8 +101,10 @@ class Doors:
             _remember(self._barred, connection.key_id, now_ns + BARRED_NS)
         return True
 
-    def flood(self, address: str, what: str, now_ns: int, connection: Connection | None = None) -> None:
-        """Names somebody who sends more than its limits."""
+    def flood(
+        self, address: str, what: str, now_ns: int, connection: Connection | None = None, warning: str = ""
+    ) -> None:
+        """Names somebody who sends more than its limits. `warning`: what the status says instead of that."""
         name = subject = ""
         if connection is not None:
             name, subject = connection.hello.name, connection.participant_id
@@ -112,7 +114,7 @@ class Doors:
         while len(self._shown) >= MAX_SHOWN:
             del self._shown[next(iter(self._shown))]
         who = " ".join(part for part in (address, f"({name})" if name else "") if part) or "an address that is gone"
-        self._shown[address, what] = (now_ns, f"flood from {who}: {what}")
+        self._shown[address, what] = (now_ns, warning or f"flood from {who}: {what}")
 
     def barred(self, key_id: str, now_ns: int) -> bool:
         """Whether this key was cut off a moment ago."""

@@ -210,7 +210,7 @@ class Front:
         return state.socket
 
     def _shed(self, whom: str, now_ns: int) -> None:
-        self._doors.flood("", f"memory: closed {whom}", now_ns)
+        self._doors.flood("", f"memory: closed {whom}", now_ns, warning=f"memory ran short: closed {whom}")
 
     def _session_ns(self) -> int:
         return time.monotonic_ns() - self._config.origin_ns

@@ -178,6 +178,8 @@ def test_what_is_remembered_of_floods_is_bounded(hall: Hall) -> None:
     for i in range(1000):
         hall.doors.flood(f"10.0.{i // 250}.{i % 250}", "sample", hall.now_ns)
     assert len(hall.doors.warnings(hall.now_ns)) == MAX_SHOWN
+    hall.doors.flood("", "memory: closed Ann", hall.now_ns, warning="memory ran short: closed Ann")
+    assert hall.doors.warnings(hall.now_ns)[-1] == "memory ran short: closed Ann"
 
 
 def test_room_is_made_by_the_newest_strangers_when_nobody_stands_out_then_by_the_newest_client(hall: Hall) -> None:

@@ -11,6 +11,7 @@ import pytest
 import zmq
 
 from iris_session.keys import KeyPair
+from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.media import MediaHeader, media_topic
 from iris_session.protocol.names import BudgetClass
@@ -45,17 +46,23 @@ class Viewer:
 
 
 class Stage:
-    """Somebody who publishes `cloud` at every step, and those who watch."""
+    """Somebody who publishes `cloud` at every step, and those who watch, whom no slow machine silences."""
 
     def __init__(self, session: FrontSession) -> None:
         self.session = session
         self.viewers: list[Viewer] = []
         self.size = 500
         self.publishing = True
+        self._here: list[RawClient] = []
+        self._beat_s = 0.0
         self._once, session.once = session.once, self._step  # type: ignore[method-assign,assignment]
 
     def _step(self, *arguments: object) -> None:
         self._once(*arguments)  # type: ignore[arg-type]
+        if time.monotonic() > self._beat_s + 0.3:
+            self._beat_s = time.monotonic()
+            for client in self._here:
+                client.send(Heartbeat(True))
         if self.publishing:
             now_ns = self.session.process.link.now_ns
             self.session.process.publish_media("cloud", b"c" * self.size, now_ns, 1, "bytes")
@@ -66,6 +73,7 @@ class Stage:
     def joined(self, client: RawClient, name: str = "ann") -> RawClient:
         if client.welcome is None:
             client.join("observer", name)
+        self._here.append(client)
         client.wait_for(DeliveryBudget)
         return client
 
@@ -159,7 +167,7 @@ def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) ->
 
 @pytest.mark.parametrize("port", ["media", "media_ingest"])
 def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: str) -> None:
-    session = open_session(limits=FrontLimits(hello_timeout_ns=500_000_000))
+    session = open_session(limits=FrontLimits(hello_timeout_ns=1_500_000_000))
     media = Stage(session)
     ann = media.joined(session.client())
     viewer = media.viewer(ann)
