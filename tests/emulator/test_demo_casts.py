@@ -14,16 +14,17 @@ from tests.models import robot_models
 __all__ = ["robot_models"]
 
 
+@pytest.mark.e2e  # without the recorder of coverage, with which it takes twice as long
 @pytest.mark.usefixtures("robot_models")
-@pytest.mark.parametrize(("name", "operators"), [("iiwa", 2), ("iiwa", 4), ("aloha", 2)])
-def test_everything_changes_hands(name: str, operators: int) -> None:
-    """By friction, in mid-air, and ends on a table. ALOHA: all four arms at the same time."""
-    rig = demo(make_play(name, operators), seed=0)
+def test_everything_changes_hands() -> None:
+    """By friction, in mid-air, and ends on a table. Two iiwa, and ALOHA: `tests/e2e/test_demos_paper.py`."""
+    rig = demo(make_play("iiwa", 4), seed=0)
     rig.run(60.0, until=over)
     assert demo_verdict(rig) == ""
     assert rig.fastest_hand < 0.5
 
 
+@pytest.mark.e2e
 def test_eight_arms_around_a_table() -> None:
     rig = demo(make_play("handover", 8), seed=3)
     rig.run(40.0, until=over)
