@@ -188,6 +188,25 @@ class PlaceAlignment(Message, frozen=True, tag="place_alignment"):
     offset: bool = False
 
 
+class Align(Message, frozen=True, tag="align"):
+    """Starts or stops the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
+
+    A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
+    """
+
+    request_id: Count
+    action: Name
+    participant: Name = ""
+
+
+class MoveAnchor(Message, frozen=True, tag="move_anchor"):
+    """A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it."""
+
+    request_id: Count
+    anchor_id: Name
+    T_world_anchor: Pose
+
+
 class TrackingEpoch(Message, frozen=True, tag="tracking_epoch"):
     """The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void."""
 
@@ -244,6 +263,8 @@ ClientMessage = (
     | Grasp
     | Observation
     | PlaceAlignment
+    | Align
+    | MoveAnchor
     | TrackingEpoch
     | Episode
     | EStop

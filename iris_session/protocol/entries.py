@@ -12,6 +12,7 @@ import msgspec
 
 from iris_session.protocol.client_messages import (
     Acquire,
+    Align,
     Assign,
     Bye,
     ClearEStop,
@@ -23,6 +24,7 @@ from iris_session.protocol.client_messages import (
     Grasp,
     Heartbeat,
     Marker,
+    MoveAnchor,
     Observation,
     PlaceAlignment,
     Release,
@@ -31,7 +33,7 @@ from iris_session.protocol.client_messages import (
     SetScale,
     TrackingEpoch,
 )
-from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text
+from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
 from iris_session.protocol.decoding import decoder
 from iris_session.protocol.security import RemoveParticipant
 
@@ -83,6 +85,33 @@ class AlignmentProposal(Message, frozen=True, tag="alignment_proposal"):
     n_viewpoints: Count = 0
     refused: bool = False
     advice: Text = ""
+
+
+class AlignmentAlarm(Message, frozen=True, tag="alignment_alarm"):
+    """The front's watch over the alignment of this entry's connection found it wrong (`AlarmKind`) by `size_m`.
+
+    `anchor_id`: where it was seen, empty for the head's own motion. `beside`: anchors that stayed where they were
+    meanwhile: then `anchor_id` was moved, not the headset.
+    """
+
+    kind: Name
+    tracking_epoch: Count
+    anchor_id: Name = ""
+    size_m: float = 0.0
+    capture_ns: Nanoseconds = 0
+    beside: Names = ()
+
+
+class CrossChecked(Message, frozen=True, tag="cross_checked"):
+    """Two headsets saw the same thing: this entry's connection and `other`. Fields as in `HeadsetsCompared`."""
+
+    other: Count
+    anchor_id: Name
+    error_m: float
+    error_rad: float
+    expected_p95_m: float
+    p_world: Vec3
+    n: Count
 
 
 class ExternalReset(Message, frozen=True, tag="external_reset"):
@@ -139,6 +168,10 @@ EntryMessage = (
     | Observation
     | AlignmentProposal
     | PlaceAlignment
+    | Align
+    | MoveAnchor
+    | AlignmentAlarm
+    | CrossChecked
     | TrackingEpoch
     | Episode
     | EStop

@@ -14,6 +14,7 @@ import msgspec
 
 from iris_session.protocol.client_messages import (
     Acquire,
+    Align,
     Assign,
     Bye,
     ClearEStop,
@@ -27,6 +28,7 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Hello,
     Marker,
+    MoveAnchor,
     Observation,
     PlaceAlignment,
     Release,
@@ -82,6 +84,8 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         Grasp: _REQUEST,
         Observation: Limit(2_000, 60, 120),
         PlaceAlignment: _REQUEST,
+        Align: _REQUEST,
+        MoveAnchor: _REQUEST,
         TrackingEpoch: Limit(512, 5, 10),
         Episode: Limit(4_000, 5, 10),
         EStop: Limit(4_000, 20, 40),

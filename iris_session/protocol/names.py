@@ -99,6 +99,24 @@ class AlignmentKind:
     NOT_NEEDED: Final = "not_needed"
 
 
+class AlignAction:
+    """What `align` asks for. `start`: measure anew, from nothing; `stop`: keep what is in force, whatever is seen."""
+
+    START: Final = "start"
+    STOP: Final = "stop"
+    ALL: Final = frozenset({"start", "stop"})
+
+
+class AlarmKind:
+    """How an alignment was found to be wrong. `changed`: an anchor is seen elsewhere than seconds ago; `differs`: and
+    elsewhere than the alignment says; `jump`: the tracking frame moved at once, which voids the alignment."""
+
+    CHANGED: Final = "changed"
+    DIFFERS: Final = "differs"
+    JUMP: Final = "jump"
+    ALL: Final = frozenset({"changed", "differs", "jump"})
+
+
 class AnchorKind:
     QR: Final = "qr"
     BOARD: Final = "board"

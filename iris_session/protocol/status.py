@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 import msgspec
 
-from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Text
+from iris_session.protocol.common import Count, Message, Name, Nanoseconds, Pose, Text
 from iris_session.protocol.media import StreamBudget
 
 
@@ -70,6 +70,61 @@ def quantiles(durations_ns: Iterable[int]) -> Quantiles | None:
     return Quantiles(ordered[last // 2] * 1e-6, ordered[-(-last * 99 // 100)] * 1e-6)
 
 
+class AnchorSeen(msgspec.Struct, frozen=True):
+    """One anchor as a headset saw it: how often in this run, and how long ago."""
+
+    anchor_id: Name
+    observations: Count
+    age_ns: Nanoseconds
+
+
+class AlignmentReport(msgspec.Struct, frozen=True):
+    """How the alignment of one participant stands, beyond what `AlignmentChanged` tells.
+
+    `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: how far a correction that waits, or
+    slides in, is away. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new
+    alignment has answered yet, `alarm_ns` ago. `unusable`: observations that were of no use, since the run began.
+    """
+
+    version: Count = 0
+    running: bool = True
+    offset: bool = False
+    error_at_anchor_m: float = 0.0
+    error_at_robot_m: float = 0.0
+    residual_tilt_rad: float = 0.0
+    observations: Count = 0
+    viewpoints: Count = 0
+    unusable: Count = 0
+    pending_m: float = 0.0
+    pending_rad: float = 0.0
+    advice: Text = ""
+    alarm: Name = ""
+    alarm_size_m: float = 0.0
+    alarm_ns: Nanoseconds = -1
+    seen: tuple[AnchorSeen, ...] = ()
+
+
+class CrossCheckReport(msgspec.Struct, frozen=True):
+    """The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`."""
+
+    a: Name
+    b: Name
+    anchor_id: Name
+    error_m: float
+    error_rad: float
+    expected_p95_m: float
+    age_ns: Nanoseconds
+    n: Count = 0
+
+
+class AnchorReport(msgspec.Struct, frozen=True):
+    """One anchor of the session. `size_m`: edge of the printed sheet, 0 for not known."""
+
+    anchor_id: Name
+    T_world_anchor: Pose
+    size_m: float = 0.0
+
+
 class ParticipantReport(msgspec.Struct, frozen=True):
     """One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
 
@@ -110,6 +165,7 @@ class ParticipantReport(msgspec.Struct, frozen=True):
     media: tuple[StreamBudget, ...] = ()
     media_bytes_per_s: float = 0.0
     media_drops: Count = 0
+    alignment_report: AlignmentReport | None = None
 
 
 class RobotReport(msgspec.Struct, frozen=True):
@@ -189,3 +245,5 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     warnings: tuple[Text, ...] = ()
     authority_silent_ns: Nanoseconds = -1
     media: tuple[MediaStreamReport, ...] = ()
+    anchors: tuple[AnchorReport, ...] = ()
+    cross_checks: tuple[CrossCheckReport, ...] = ()

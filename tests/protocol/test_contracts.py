@@ -63,7 +63,7 @@ def test_internal_messages_survive_as_entries(message: entries.EntryMessage) -> 
 
 def test_every_internal_message_was_tried() -> None:
     names = {"Join", "Lost", "AlignmentProposal", "ExternalReset", "StalledGap", "FrontRestarted", "RecordingGap"}
-    names |= {"Audit", "SessionResumed"}
+    names |= {"Audit", "SessionResumed", "AlignmentAlarm", "CrossChecked"}
     assert {kind.__name__ for kind in INTERNAL} == names
 
 

@@ -105,6 +105,25 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// What align asks for. start: measure anew, from nothing; stop: keep what is in force, whatever is seen.
+    /// </summary>
+    public static class AlignAction
+    {
+        public const string Start = "start";
+        public const string Stop = "stop";
+    }
+
+    /// <summary>
+    /// How an alignment was found to be wrong. changed: an anchor is seen elsewhere than seconds ago; differs: and
+    /// </summary>
+    public static class AlarmKind
+    {
+        public const string Changed = "changed";
+        public const string Differs = "differs";
+        public const string Jump = "jump";
+    }
+
+    /// <summary>
     /// Values of an open enumeration: AnchorKind.
     /// </summary>
     public static class AnchorKind
@@ -740,7 +759,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 26 messages, told apart by the field "type".</summary>
+    /// <summary>One of 28 messages, told apart by the field "type".</summary>
     public abstract class ClientMessage : WireValue
     {
         public abstract string Tag { get; }
@@ -766,6 +785,8 @@ namespace IrisSession.Protocol
                 case Grasp.TagName: return Grasp.Read(reader);
                 case Observation.TagName: return Observation.Read(reader);
                 case PlaceAlignment.TagName: return PlaceAlignment.Read(reader);
+                case Align.TagName: return Align.Read(reader);
+                case MoveAnchor.TagName: return MoveAnchor.Read(reader);
                 case TrackingEpoch.TagName: return TrackingEpoch.Read(reader);
                 case Episode.TagName: return Episode.Read(reader);
                 case EStop.TagName: return EStop.Read(reader);
@@ -807,7 +828,7 @@ namespace IrisSession.Protocol
         }
     }
 
-    /// <summary>One of 20 messages, told apart by the field "event".</summary>
+    /// <summary>One of 24 messages, told apart by the field "event".</summary>
     public abstract class EventKind : WireValue
     {
         public abstract string Tag { get; }
@@ -826,6 +847,10 @@ namespace IrisSession.Protocol
                 case EngagementChanged.TagName: return EngagementChanged.Read(reader);
                 case ScaleChanged.TagName: return ScaleChanged.Read(reader);
                 case AlignmentChanged.TagName: return AlignmentChanged.Read(reader);
+                case AlignmentRun.TagName: return AlignmentRun.Read(reader);
+                case AlignmentAlarmed.TagName: return AlignmentAlarmed.Read(reader);
+                case AnchorMoved.TagName: return AnchorMoved.Read(reader);
+                case HeadsetsCompared.TagName: return HeadsetsCompared.Read(reader);
                 case SceneChanged.TagName: return SceneChanged.Read(reader);
                 case EStopChanged.TagName: return EStopChanged.Read(reader);
                 case PauseChanged.TagName: return PauseChanged.Read(reader);
@@ -1384,6 +1409,236 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// One anchor as a headset saw it: how often in this run, and how long ago.
+    /// </summary>
+    public sealed class AnchorSeen : WireValue
+    {
+        public string AnchorId = "";
+        public long Observations = 0;
+        public long AgeNs = 0;
+
+        public static AnchorSeen Read(WireReader reader)
+        {
+            AnchorSeen value = new AnchorSeen();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 1u; break;
+                    case "observations": value.Observations = reader.ReadLong(); seen |= 2u; break;
+                    case "age_ns": value.AgeNs = reader.ReadLong(); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of AnchorSeen");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("observations");
+            writer.Write(Observations);
+            writer.Write("age_ns");
+            writer.Write(AgeNs);
+        }
+    }
+
+    /// <summary>
+    /// How the alignment of one participant stands, beyond what AlignmentChanged tells.
+    ///
+    /// error_at_anchor_m, error_at_robot_m: stated p95. pending_m, pending_rad: how far a correction that waits, or
+    /// slides in, is away. advice: why the estimator refuses, or warns. alarm: the last AlarmKind that no new
+    /// alignment has answered yet, alarm_ns ago. unusable: observations that were of no use, since the run began.
+    /// </summary>
+    public sealed class AlignmentReport : WireValue
+    {
+        public long Version = 0;
+        public bool Running = true;
+        public bool Offset = false;
+        public double ErrorAtAnchorM = 0.0;
+        public double ErrorAtRobotM = 0.0;
+        public double ResidualTiltRad = 0.0;
+        public long Observations = 0;
+        public long Viewpoints = 0;
+        public long Unusable = 0;
+        public double PendingM = 0.0;
+        public double PendingRad = 0.0;
+        public string Advice = "";
+        public string Alarm = "";
+        public double AlarmSizeM = 0.0;
+        public long AlarmNs = -1;
+        public AnchorSeen[] Seen = new AnchorSeen[0];
+
+        public static AlignmentReport Read(WireReader reader)
+        {
+            AlignmentReport value = new AlignmentReport();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "version": value.Version = reader.ReadLong(); break;
+                    case "running": value.Running = reader.ReadBool(); break;
+                    case "offset": value.Offset = reader.ReadBool(); break;
+                    case "error_at_anchor_m": value.ErrorAtAnchorM = reader.ReadDouble(); break;
+                    case "error_at_robot_m": value.ErrorAtRobotM = reader.ReadDouble(); break;
+                    case "residual_tilt_rad": value.ResidualTiltRad = reader.ReadDouble(); break;
+                    case "observations": value.Observations = reader.ReadLong(); break;
+                    case "viewpoints": value.Viewpoints = reader.ReadLong(); break;
+                    case "unusable": value.Unusable = reader.ReadLong(); break;
+                    case "pending_m": value.PendingM = reader.ReadDouble(); break;
+                    case "pending_rad": value.PendingRad = reader.ReadDouble(); break;
+                    case "advice": value.Advice = reader.ReadString(); break;
+                    case "alarm": value.Alarm = reader.ReadString(); break;
+                    case "alarm_size_m": value.AlarmSizeM = reader.ReadDouble(); break;
+                    case "alarm_ns": value.AlarmNs = reader.ReadLong(); break;
+                    case "seen": value.Seen = reader.ReadArray(Protocol.AnchorSeen.Read); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(16);
+            writer.Write("version");
+            writer.Write(Version);
+            writer.Write("running");
+            writer.Write(Running);
+            writer.Write("offset");
+            writer.Write(Offset);
+            writer.Write("error_at_anchor_m");
+            writer.Write(ErrorAtAnchorM);
+            writer.Write("error_at_robot_m");
+            writer.Write(ErrorAtRobotM);
+            writer.Write("residual_tilt_rad");
+            writer.Write(ResidualTiltRad);
+            writer.Write("observations");
+            writer.Write(Observations);
+            writer.Write("viewpoints");
+            writer.Write(Viewpoints);
+            writer.Write("unusable");
+            writer.Write(Unusable);
+            writer.Write("pending_m");
+            writer.Write(PendingM);
+            writer.Write("pending_rad");
+            writer.Write(PendingRad);
+            writer.Write("advice");
+            writer.Write(Advice);
+            writer.Write("alarm");
+            writer.Write(Alarm);
+            writer.Write("alarm_size_m");
+            writer.Write(AlarmSizeM);
+            writer.Write("alarm_ns");
+            writer.Write(AlarmNs);
+            writer.Write("seen");
+            writer.Write(Seen);
+        }
+    }
+
+    /// <summary>
+    /// The newest comparison of two headsets, age_ns ago; fields as in HeadsetsCompared.
+    /// </summary>
+    public sealed class CrossCheckReport : WireValue
+    {
+        public string A = "";
+        public string B = "";
+        public string AnchorId = "";
+        public double ErrorM = 0.0;
+        public double ErrorRad = 0.0;
+        public double ExpectedP95M = 0.0;
+        public long AgeNs = 0;
+        public long N = 0;
+
+        public static CrossCheckReport Read(WireReader reader)
+        {
+            CrossCheckReport value = new CrossCheckReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "a": value.A = reader.ReadString(); seen |= 1u; break;
+                    case "b": value.B = reader.ReadString(); seen |= 2u; break;
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 4u; break;
+                    case "error_m": value.ErrorM = reader.ReadDouble(); seen |= 8u; break;
+                    case "error_rad": value.ErrorRad = reader.ReadDouble(); seen |= 16u; break;
+                    case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
+                    case "age_ns": value.AgeNs = reader.ReadLong(); seen |= 64u; break;
+                    case "n": value.N = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 127u) != 127u) throw new WireException("missing field of CrossCheckReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(8);
+            writer.Write("a");
+            writer.Write(A);
+            writer.Write("b");
+            writer.Write(B);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("error_m");
+            writer.Write(ErrorM);
+            writer.Write("error_rad");
+            writer.Write(ErrorRad);
+            writer.Write("expected_p95_m");
+            writer.Write(ExpectedP95M);
+            writer.Write("age_ns");
+            writer.Write(AgeNs);
+            writer.Write("n");
+            writer.Write(N);
+        }
+    }
+
+    /// <summary>
+    /// One anchor of the session. size_m: edge of the printed sheet, 0 for not known.
+    /// </summary>
+    public sealed class AnchorReport : WireValue
+    {
+        public string AnchorId = "";
+        public Pose T_world_anchor = new Pose();
+        public double SizeM = 0.0;
+
+        public static AnchorReport Read(WireReader reader)
+        {
+            AnchorReport value = new AnchorReport();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 1u; break;
+                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
+                    case "size_m": value.SizeM = reader.ReadDouble(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorReport");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(3);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("T_world_anchor");
+            writer.Write(T_world_anchor);
+            writer.Write("size_m");
+            writer.Write(SizeM);
+        }
+    }
+
+    /// <summary>
     /// One participant, as the session sees it. Times in *_ns are durations until now, -1 for never.
     ///
     /// capture_to_receive: device to front. state_age: end of tick to application, as its client reports it.
@@ -1424,6 +1679,7 @@ namespace IrisSession.Protocol
         public StreamBudget[] Media = new StreamBudget[0];
         public double MediaBytesPerS = 0.0;
         public long MediaDrops = 0;
+        public AlignmentReport AlignmentReport = null;
 
         public static ParticipantReport Read(WireReader reader)
         {
@@ -1462,6 +1718,7 @@ namespace IrisSession.Protocol
                     case "media": value.Media = reader.ReadArray(Protocol.StreamBudget.Read); break;
                     case "media_bytes_per_s": value.MediaBytesPerS = reader.ReadDouble(); break;
                     case "media_drops": value.MediaDrops = reader.ReadLong(); break;
+                    case "alignment_report": value.AlignmentReport = reader.TryReadNil() ? null : AlignmentReport.Read(reader); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -1471,7 +1728,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(29);
+            writer.WriteMapHeader(30);
             writer.Write("id");
             writer.Write(Id);
             writer.Write("name");
@@ -1530,6 +1787,8 @@ namespace IrisSession.Protocol
             writer.Write(MediaBytesPerS);
             writer.Write("media_drops");
             writer.Write(MediaDrops);
+            writer.Write("alignment_report");
+            writer.Write(AlignmentReport);
         }
     }
 
@@ -2465,6 +2724,94 @@ namespace IrisSession.Protocol
             writer.Write(T_world_tracking);
             writer.Write("offset");
             writer.Write(Offset);
+        }
+    }
+
+    /// <summary>
+    /// Starts or stops the alignment run of a participant (AlignAction); participant empty: the sender's own.
+    ///
+    /// A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
+    /// </summary>
+    public sealed class Align : ClientMessage
+    {
+        public const string TagName = "align";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string Action = "";
+        public string Participant = "";
+
+        public static Align Read(WireReader reader)
+        {
+            Align value = new Align();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); seen |= 1u; break;
+                    case "action": value.Action = reader.ReadString(); seen |= 2u; break;
+                    case "participant": value.Participant = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of Align");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("action");
+            writer.Write(Action);
+            writer.Write("participant");
+            writer.Write(Participant);
+        }
+    }
+
+    /// <summary>
+    /// A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+    /// </summary>
+    public sealed class MoveAnchor : ClientMessage
+    {
+        public const string TagName = "move_anchor";
+        public override string Tag { get { return TagName; } }
+        public long RequestId = 0;
+        public string AnchorId = "";
+        public Pose T_world_anchor = new Pose();
+
+        public static MoveAnchor Read(WireReader reader)
+        {
+            MoveAnchor value = new MoveAnchor();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "request_id": value.RequestId = reader.ReadLong(); seen |= 1u; break;
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 2u; break;
+                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 4u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of MoveAnchor");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("type");
+            writer.Write(TagName);
+            writer.Write("request_id");
+            writer.Write(RequestId);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("T_world_anchor");
+            writer.Write(T_world_anchor);
         }
     }
 
@@ -3453,6 +3800,8 @@ namespace IrisSession.Protocol
         public string[] Warnings = new string[0];
         public long AuthoritySilentNs = -1;
         public MediaStreamReport[] Media = new MediaStreamReport[0];
+        public AnchorReport[] Anchors = new AnchorReport[0];
+        public CrossCheckReport[] CrossChecks = new CrossCheckReport[0];
 
         public static StatusReport Read(WireReader reader)
         {
@@ -3491,6 +3840,8 @@ namespace IrisSession.Protocol
                     case "warnings": value.Warnings = reader.ReadStrings(); break;
                     case "authority_silent_ns": value.AuthoritySilentNs = reader.ReadLong(); break;
                     case "media": value.Media = reader.ReadArray(Protocol.MediaStreamReport.Read); break;
+                    case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorReport.Read); break;
+                    case "cross_checks": value.CrossChecks = reader.ReadArray(Protocol.CrossCheckReport.Read); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3500,7 +3851,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(30);
+            writer.WriteMapHeader(32);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -3561,6 +3912,10 @@ namespace IrisSession.Protocol
             writer.Write(AuthoritySilentNs);
             writer.Write("media");
             writer.Write(Media);
+            writer.Write("anchors");
+            writer.Write(Anchors);
+            writer.Write("cross_checks");
+            writer.Write(CrossChecks);
         }
     }
 
@@ -3980,6 +4335,213 @@ namespace IrisSession.Protocol
             writer.Write(Participant);
             writer.Write("alignment");
             writer.Write(Alignment);
+        }
+    }
+
+    /// <summary>
+    /// The alignment run of a participant was started anew (running), or stopped. run counts the starts.
+    /// </summary>
+    public sealed class AlignmentRun : EventKind
+    {
+        public const string TagName = "alignment_run";
+        public override string Tag { get { return TagName; } }
+        public string Participant = "";
+        public bool Running = false;
+        public long Run = 0;
+        public string By = "";
+
+        public static AlignmentRun Read(WireReader reader)
+        {
+            AlignmentRun value = new AlignmentRun();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "participant": value.Participant = reader.ReadString(); seen |= 1u; break;
+                    case "running": value.Running = reader.ReadBool(); seen |= 2u; break;
+                    case "run": value.Run = reader.ReadLong(); seen |= 4u; break;
+                    case "by": value.By = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 7u) != 7u) throw new WireException("missing field of AlignmentRun");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(5);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("running");
+            writer.Write(Running);
+            writer.Write("run");
+            writer.Write(Run);
+            writer.Write("by");
+            writer.Write(By);
+        }
+    }
+
+    /// <summary>
+    /// The alignment of a participant was found wrong by size_m (AlarmKind); a jump has voided it. beside:
+    /// anchors that stayed where they were meanwhile: then the anchor was moved, not the headset.
+    /// </summary>
+    public sealed class AlignmentAlarmed : EventKind
+    {
+        public const string TagName = "alignment_alarmed";
+        public override string Tag { get { return TagName; } }
+        public string Participant = "";
+        public string Kind = "";
+        public string AnchorId = "";
+        public double SizeM = 0.0;
+        public string[] Beside = new string[0];
+
+        public static AlignmentAlarmed Read(WireReader reader)
+        {
+            AlignmentAlarmed value = new AlignmentAlarmed();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "participant": value.Participant = reader.ReadString(); seen |= 1u; break;
+                    case "kind": value.Kind = reader.ReadString(); seen |= 2u; break;
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 4u; break;
+                    case "size_m": value.SizeM = reader.ReadDouble(); seen |= 8u; break;
+                    case "beside": value.Beside = reader.ReadStrings(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 15u) != 15u) throw new WireException("missing field of AlignmentAlarmed");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(6);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("participant");
+            writer.Write(Participant);
+            writer.Write("kind");
+            writer.Write(Kind);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("size_m");
+            writer.Write(SizeM);
+            writer.Write("beside");
+            writer.Write(Beside);
+        }
+    }
+
+    /// <summary>
+    /// A director moved an anchor: alignments to it follow.
+    /// </summary>
+    public sealed class AnchorMoved : EventKind
+    {
+        public const string TagName = "anchor_moved";
+        public override string Tag { get { return TagName; } }
+        public string AnchorId = "";
+        public Pose T_world_anchor = new Pose();
+        public string By = "";
+
+        public static AnchorMoved Read(WireReader reader)
+        {
+            AnchorMoved value = new AnchorMoved();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 1u; break;
+                    case "T_world_anchor": value.T_world_anchor = Pose.Read(reader); seen |= 2u; break;
+                    case "by": value.By = reader.ReadString(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 3u) != 3u) throw new WireException("missing field of AnchorMoved");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(4);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("T_world_anchor");
+            writer.Write(T_world_anchor);
+            writer.Write("by");
+            writer.Write(By);
+        }
+    }
+
+    /// <summary>
+    /// Measured: participants a and b put the same thing (anchor_id) error_m and error_rad apart, at p_world.
+    ///
+    /// expected_p95_m: what 95 % of such pairs stay below by their stated errors and the noise of these n looks.
+    /// </summary>
+    public sealed class HeadsetsCompared : EventKind
+    {
+        public const string TagName = "headsets_compared";
+        public override string Tag { get { return TagName; } }
+        public string A = "";
+        public string B = "";
+        public string AnchorId = "";
+        public double ErrorM = 0.0;
+        public double ErrorRad = 0.0;
+        public double ExpectedP95M = 0.0;
+        public double[] PWorld = new double[3];
+        public long N = 0;
+
+        public static HeadsetsCompared Read(WireReader reader)
+        {
+            HeadsetsCompared value = new HeadsetsCompared();
+            uint seen = 0;
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "a": value.A = reader.ReadString(); seen |= 1u; break;
+                    case "b": value.B = reader.ReadString(); seen |= 2u; break;
+                    case "anchor_id": value.AnchorId = reader.ReadString(); seen |= 4u; break;
+                    case "error_m": value.ErrorM = reader.ReadDouble(); seen |= 8u; break;
+                    case "error_rad": value.ErrorRad = reader.ReadDouble(); seen |= 16u; break;
+                    case "expected_p95_m": value.ExpectedP95M = reader.ReadDouble(); seen |= 32u; break;
+                    case "p_world": value.PWorld = reader.ReadDoubles(3); seen |= 64u; break;
+                    case "n": value.N = reader.ReadLong(); seen |= 128u; break;
+                    default: reader.Skip(); break;
+                }
+            }
+            if ((seen & 255u) != 255u) throw new WireException("missing field of HeadsetsCompared");
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(9);
+            writer.Write("event");
+            writer.Write(TagName);
+            writer.Write("a");
+            writer.Write(A);
+            writer.Write("b");
+            writer.Write(B);
+            writer.Write("anchor_id");
+            writer.Write(AnchorId);
+            writer.Write("error_m");
+            writer.Write(ErrorM);
+            writer.Write("error_rad");
+            writer.Write(ErrorRad);
+            writer.Write("expected_p95_m");
+            writer.Write(ExpectedP95M);
+            writer.Write("p_world");
+            writer.Write(PWorld);
+            writer.Write("n");
+            writer.Write(N);
         }
     }
 

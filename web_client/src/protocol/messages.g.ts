@@ -81,6 +81,21 @@ export const AlignmentKind = {
 } as const;
 export type AlignmentKind = (typeof AlignmentKind)[keyof typeof AlignmentKind] | (string & {});
 
+/** What `align` asks for. `start`: measure anew, from nothing; `stop`: keep what is in force, whatever is seen. */
+export const AlignAction = {
+  START: "start",
+  STOP: "stop",
+} as const;
+export type AlignAction = (typeof AlignAction)[keyof typeof AlignAction] | (string & {});
+
+/** How an alignment was found to be wrong. `changed`: an anchor is seen elsewhere than seconds ago; `differs`: and */
+export const AlarmKind = {
+  CHANGED: "changed",
+  DIFFERS: "differs",
+  JUMP: "jump",
+} as const;
+export type AlarmKind = (typeof AlarmKind)[keyof typeof AlarmKind] | (string & {});
+
 export const AnchorKind = {
   QR: "qr",
   BOARD: "board",
@@ -394,6 +409,58 @@ export interface StreamBudget {
   mbit_per_s?: number;
 }
 
+/** One anchor as a headset saw it: how often in this run, and how long ago. */
+export interface AnchorSeen {
+  anchor_id: string;
+  observations: number;
+  age_ns: number;
+}
+
+/**
+ * How the alignment of one participant stands, beyond what `AlignmentChanged` tells.
+ *
+ * `error_at_anchor_m`, `error_at_robot_m`: stated p95. `pending_m`, `pending_rad`: how far a correction that waits, or
+ * slides in, is away. `advice`: why the estimator refuses, or warns. `alarm`: the last `AlarmKind` that no new
+ * alignment has answered yet, `alarm_ns` ago. `unusable`: observations that were of no use, since the run began.
+ */
+export interface AlignmentReport {
+  version?: number;
+  running?: boolean;
+  offset?: boolean;
+  error_at_anchor_m?: number;
+  error_at_robot_m?: number;
+  residual_tilt_rad?: number;
+  observations?: number;
+  viewpoints?: number;
+  unusable?: number;
+  pending_m?: number;
+  pending_rad?: number;
+  advice?: string;
+  alarm?: AlarmKind;
+  alarm_size_m?: number;
+  alarm_ns?: number;
+  seen?: AnchorSeen[];
+}
+
+/** The newest comparison of two headsets, `age_ns` ago; fields as in `HeadsetsCompared`. */
+export interface CrossCheckReport {
+  a: string;
+  b: string;
+  anchor_id: string;
+  error_m: number;
+  error_rad: number;
+  expected_p95_m: number;
+  age_ns: number;
+  n?: number;
+}
+
+/** One anchor of the session. `size_m`: edge of the printed sheet, 0 for not known. */
+export interface AnchorReport {
+  anchor_id: string;
+  T_world_anchor: Pose;
+  size_m?: number;
+}
+
 /**
  * One participant, as the session sees it. Times in `*_ns` are durations until now, -1 for never.
  *
@@ -434,6 +501,7 @@ export interface ParticipantReport {
   media?: StreamBudget[];
   media_bytes_per_s?: number;
   media_drops?: number;
+  alignment_report?: AlignmentReport | null;
 }
 
 /** One robot: who has it, what it does, and why it holds. */
@@ -646,6 +714,26 @@ export interface PlaceAlignment {
   participant: string;
   T_world_tracking: Pose;
   offset?: boolean;
+}
+
+/**
+ * Starts or stops the alignment run of a participant (`AlignAction`); `participant` empty: the sender's own.
+ *
+ * A director may do so for everyone, others for themselves. The alignment in force stays until there is a better one.
+ */
+export interface Align {
+  type: "align";
+  request_id: number;
+  action: AlignAction;
+  participant?: string;
+}
+
+/** A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it. */
+export interface MoveAnchor {
+  type: "move_anchor";
+  request_id: number;
+  anchor_id: string;
+  T_world_anchor: Pose;
 }
 
 /** The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void. */
@@ -900,6 +988,8 @@ export interface StatusReport {
   warnings?: string[];
   authority_silent_ns?: number;
   media?: MediaStreamReport[];
+  anchors?: AnchorReport[];
+  cross_checks?: CrossCheckReport[];
 }
 
 /**
@@ -981,6 +1071,53 @@ export interface AlignmentChanged {
   event: "alignment_changed";
   participant: string;
   alignment: Alignment;
+}
+
+/** The alignment run of a participant was started anew (`running`), or stopped. `run` counts the starts. */
+export interface AlignmentRun {
+  event: "alignment_run";
+  participant: string;
+  running: boolean;
+  run: number;
+  by?: string;
+}
+
+/**
+ * The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
+ * anchors that stayed where they were meanwhile: then the anchor was moved, not the headset.
+ */
+export interface AlignmentAlarmed {
+  event: "alignment_alarmed";
+  participant: string;
+  kind: AlarmKind;
+  anchor_id: string;
+  size_m: number;
+  beside?: string[];
+}
+
+/** A director moved an anchor: alignments to it follow. */
+export interface AnchorMoved {
+  event: "anchor_moved";
+  anchor_id: string;
+  T_world_anchor: Pose;
+  by?: string;
+}
+
+/**
+ * Measured: participants `a` and `b` put the same thing (`anchor_id`) `error_m` and `error_rad` apart, at `p_world`.
+ *
+ * `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
+ */
+export interface HeadsetsCompared {
+  event: "headsets_compared";
+  a: string;
+  b: string;
+  anchor_id: string;
+  error_m: number;
+  error_rad: number;
+  expected_p95_m: number;
+  p_world: [number, number, number];
+  n: number;
 }
 
 /** `cause`: reset, new_scene, patch, external (the user's loop went back in time). */
@@ -1211,6 +1348,8 @@ export type ClientMessage =
   | Grasp
   | Observation
   | PlaceAlignment
+  | Align
+  | MoveAnchor
   | TrackingEpoch
   | Episode
   | EStop
@@ -1245,6 +1384,10 @@ export type EventKind =
   | EngagementChanged
   | ScaleChanged
   | AlignmentChanged
+  | AlignmentRun
+  | AlignmentAlarmed
+  | AnchorMoved
+  | HeadsetsCompared
   | SceneChanged
   | EStopChanged
   | PauseChanged
@@ -1275,6 +1418,8 @@ export const DEFAULTS = {
   grasp: {},
   observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [] },
   place_alignment: { offset: false },
+  align: { participant: "" },
+  move_anchor: {},
   tracking_epoch: {},
   episode: { label: "" },
   estop: { reason: "" },
@@ -1294,7 +1439,7 @@ export const DEFAULTS = {
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [] },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [] },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},
@@ -1305,6 +1450,10 @@ export const DEFAULTS = {
   engagement_changed: { reason: "" },
   scale_changed: {},
   alignment_changed: {},
+  alignment_run: { by: "" },
+  alignment_alarmed: { beside: [] },
+  anchor_moved: { by: "" },
+  headsets_compared: {},
   scene_changed: {},
   estop_changed: { reason: "" },
   pause_changed: { participant: "" },
