@@ -239,7 +239,7 @@ class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):
 
 
 class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
-    """Measured: participants `a` and `b` put the same thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
+    """Measured: participants `a` and `b` put one thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
 
     `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
     """
