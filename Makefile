@@ -53,18 +53,17 @@ test: check
 	$(MAKE) --no-print-directory test-e2e
 	$(MAKE) --no-print-directory coverage
 
-# Real processes and real time: a machine that was taken away for a second can fail a test. What failed is judged once more,
-# one test after the other, and named; what fails twice fails.
-AGAIN = { echo "FAILED AT FIRST, judged once more alone:"; $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures none
-
 test-unit: install-dev
-	$(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report= $(T) \
-	  || $(AGAIN) -v -m "not e2e" --cov --cov-append --cov-report= $(T); }
+	$(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report= $(T)
 
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
+# These tests run real processes in real time: a machine that is taken away for a second can fail one. When the run was
+# whole and tests failed (status 1), they are named and judged once more, alone; what fails twice fails.
 test-e2e: install-dev
-	$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T) \
-	  || $(AGAIN) -v -m e2e $(T); }
+	@$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T); status=$$?; \
+	if [ $$status -ne 1 ]; then exit $$status; fi; \
+	echo "FAILED AT FIRST, judged once more, alone:"; \
+	$(BIN)/python -m pytest -v -m e2e --last-failed --last-failed-no-failures none $(T)
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)
