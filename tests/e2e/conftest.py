@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
 import signal
@@ -54,6 +55,13 @@ def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE
         if time.monotonic() > deadline:
             pytest.fail(f"not within {timeout_s:g} s: {what}")
         time.sleep(0.005)
+
+
+def unavailable(what: str) -> None:
+    """This machine cannot run a test: skipped for a person, who is told why; where everything must run, a failure."""
+    if os.environ.get("CI"):
+        pytest.fail(what)
+    pytest.skip(what)
 
 
 def iris(*arguments: str, cwd: Path, timeout_s: float = COMMAND_S) -> subprocess.CompletedProcess[str]:
@@ -269,6 +277,12 @@ class Stage:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.step()
+
+    def height(self, name: str, body: str) -> float:
+        """Where `name` sees a body [m]; 0 before the first picture."""
+        watcher = next(client for client in self.clients if client.name == name)
+        state = watcher.state
+        return 0.0 if state is None else float(state.poses[watcher.mirror.body_index[body]][2])
 
     def bodies(self, name: str) -> list[str]:
         """Tags of the events that `name` has seen."""

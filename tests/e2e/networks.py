@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import psutil
-import pytest
 
-from tests.e2e.conftest import COMMAND, DEADLINE_S, none_left, relatives, wait
+from tests.e2e.conftest import COMMAND, DEADLINE_S, none_left, relatives, unavailable, wait
 
 #: Frames of state after which somebody has seen enough.
 SEEN: Final = 20
@@ -183,4 +182,4 @@ class Network:
 def require_namespaces() -> None:
     """Only root can make another machine; as root it must work."""
     if sys.platform != "linux" or os.geteuid() != 0:
-        pytest.skip("network namespaces need Linux and root")
+        unavailable("network namespaces need Linux and root")

@@ -12,7 +12,7 @@ import pytest
 
 from iris_session.client import Client
 from tests.e2e.clinic import doctor
-from tests.e2e.conftest import Server, end_all, serve_command, wait
+from tests.e2e.conftest import Server, end_all, serve_command, unavailable, wait
 
 pytestmark = pytest.mark.e2e
 
@@ -59,7 +59,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(folder)], capture_output=True, text=True, check=False
     )
     if mounted.returncode:
-        pytest.skip(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
+        unavailable(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
     yield folder
     subprocess.run(["umount", "--lazy", str(folder)], check=True)  # what ends a moment later may still use it
 

@@ -22,8 +22,7 @@ def test_operators_finish_though_recorder_and_front_were_killed(
     )
 
     def hammer() -> float:
-        state = watcher.state
-        return 0.0 if state is None else float(state.poses[watcher.mirror.body_index["hammer"]][2])
+        return stage.height("watcher", "hammer")
 
     stage.run(lambda: hammer() > 0.0, "a first picture")
     table = hammer()

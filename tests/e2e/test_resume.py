@@ -77,8 +77,7 @@ def test_operators_finish_the_handover_though_the_authority_was_killed(
     )
 
     def hammer() -> float:
-        state = watcher.state
-        return 0.0 if state is None else float(state.poses[watcher.mirror.body_index["hammer"]][2])
+        return stage.height("watcher", "hammer")
 
     stage.run(lambda: hammer() > 0.0, "a first picture")
     table = hammer()
