@@ -76,6 +76,9 @@ class BenchReport(msgspec.Struct, frozen=True):
             held = [f"   bar {b.op} {b.bound:g}  {'ok' if b.ok else 'MISSED'}" for b in self.bars if b.key == key]
             note = "".join(held)
             rows.append(f"  {key:<{width}}  {value}{note}")
+        if self.reference:
+            rows.append("reference, in the same run:")
+            rows += [f"  {key:<{width}}  {value}" for key, value in self.reference.items()]
         return "\n".join(rows)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from iris_session.bench.arena import Measured, grouped, linked, measure
+from iris_session.bench.bare import bare
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import NO_BARS, BenchReport, bar
 from iris_session.physics.scenes import n_arms_scene
@@ -31,12 +32,15 @@ def run_input(
     """`operators` drive one arm each (3 devices x 72 Hz), `observers` look on, 500 Hz physics.
 
     `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
+    Reference: `bare`.
     """
     model = n_arms_scene(robots).compile()
     arms = arm_names(robots)
     specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
     specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
     specs, links = linked(specs, profile)
+    progress("the machine by itself: an empty loop that publishes to as many receivers")
+    reference = None if profile else bare(operators + observers)
     got = measure(model, grouped(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
     responses = response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
@@ -72,7 +76,7 @@ def run_input(
     }
     if profile:
         params |= {"profile": profile, "seed": seed, "bars": NO_BARS}
-    return BenchReport("input", params, results, () if profile else tuple(bars))
+    return BenchReport("input", params, results, () if profile else tuple(bars), reference)
 
 
 def response_ms(got: Measured, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:

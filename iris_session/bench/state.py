@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from iris_session.bench.arena import Measured, grouped, linked, measure
+from iris_session.bench.bare import bare
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import NO_BARS, BenchReport, bar
 from iris_session.physics.scenes import free_bodies_scene
@@ -28,10 +29,13 @@ def run_state(
     """`bodies` free bodies in motion without contact, `clients` observers, 60 Hz.
 
     `profile`: everybody joins over a link of this kind of their own; figures then include the link, and no bar applies.
+    Reference: `bare`.
     """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
     specs, links = linked(specs, profile)
+    progress("the machine by itself: an empty loop that publishes to as many receivers")
+    reference = None if profile else bare(clients)
     got = measure(
         model, grouped(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
     )
@@ -80,7 +84,7 @@ def run_state(
     }
     if profile:
         params |= {"profile": profile, "bars": NO_BARS}
-    return BenchReport("state", params, results, () if profile else tuple(bars))
+    return BenchReport("state", params, results, () if profile else tuple(bars), reference)
 
 
 def errors(got: Measured) -> tuple[float, float]:
