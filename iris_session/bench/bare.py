@@ -70,7 +70,7 @@ def _receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
 
 def _ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
     out, _ = process.communicate(timeout=_JOIN_S)
-    ages: NDArray[np.float64] = np.frombuffer(out, np.int64) * 1e-6
+    ages = np.frombuffer(out, np.int64).astype(np.float64) * 1e-6
     if process.returncode or not len(ages):
         raise BenchError(f"a receiver of the reference failed with status {process.returncode}")
     return ages
