@@ -23,7 +23,18 @@ from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, upright
 from anchors.groups import Group, Key, Memory, Sighting
 from anchors.lie import Array
 from anchors.noise import NoiseModel, isotropic, stated
-from anchors.pose import PoseTuple, Quat, Vec3, compose, inverse, is_rigid, quat_mul, quat_normalize, quat_rotate
+from anchors.pose import (
+    PoseTuple,
+    Quat,
+    Vec3,
+    compose,
+    inverse,
+    is_place,
+    is_rigid,
+    quat_mul,
+    quat_normalize,
+    quat_rotate,
+)
 from anchors.robust import Merged
 from anchors.solve import Prior, Problem, Solution, agreeing_anchors, in_world, inverted, problem, solve
 from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
@@ -175,13 +186,12 @@ class AlignmentEstimator:
         if tracking_epoch < self.tracking_epoch:
             self.stale_epochs += 1
             return False
-        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not _is_place(p_tracking_head):
+        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not is_place(p_tracking_head):
             self.invalid += 1
             return False
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
-            self._memory.clear()
-            self._against_gravity, self._misprints, self._near = 0, {}, None
+            self.start_anew()
         if not self._is_of_size(anchor_id, size_m):
             return False
         pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
@@ -194,6 +204,15 @@ class AlignmentEstimator:
             Sighting(capture_ns, pose[0], pose[1], p_tracking_head, stated(covariance), quality, size_m),
         )
         return True
+
+    def start_anew(self) -> None:
+        """What was observed holds no more: the tracking frame is another one."""
+        self._memory.clear()
+        self._against_gravity, self._misprints, self._near = 0, {}, None
+
+    def anchors_moved(self) -> None:
+        """The `T_world_anchor` of some were changed: what was observed still holds, the last solution does not."""
+        self._near = None
 
     def _upright(
         self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
@@ -365,10 +384,6 @@ def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
         return T_tracking_anchor
     view: Quat = (0.0, x / n, y / n, z / n)
     return p, quat_normalize(quat_mul(quat_mul(view, q), (0.0, 0.0, 0.0, 1.0)))
-
-
-def _is_place(p: Vec3 | None) -> bool:
-    return p is None or (all(map(math.isfinite, p)) and max(map(abs, p)) <= 1e3)
 
 
 def _tilt(T_world_anchor: PoseTuple, T_tracking_anchor: PoseTuple) -> float:

@@ -19,8 +19,8 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
-from anchors.noise import NoiseModel
-from anchors.pose import PoseTuple, Vec3, compose, is_rigid
+from anchors.noise import NoiseModel, isotropic
+from anchors.pose import PoseTuple, Vec3, compose, is_place, is_rigid
 from anchors.uncertainty import length_p95
 
 
@@ -58,16 +58,19 @@ class CrossCheckConfig:
 class _Look(NamedTuple):
     capture_ns: int
     pose: PoseTuple  # T_tracking_thing
-    p_head: Vec3
+    p_head: Vec3 | None
     viewpoint_id: int
 
 
 @dataclass
 class CrossCheck:
-    """Keeps what each headset saw of each thing. Alignments are passed in when asked, so one that improved counts."""
+    """Keeps what each headset saw of each thing. Alignments are passed in when asked, so one that improved counts.
+
+    `unseen_sigma_m`: noise per axis of looks from where nobody knows."""
 
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
+    unseen_sigma_m: float = 0.005
     dropped: int = 0
     _looks: dict[tuple[str, str], deque[_Look]] = field(default_factory=dict)
     _epochs: dict[str, int] = field(default_factory=dict)
@@ -77,7 +80,7 @@ class CrossCheck:
         headset: str,
         thing: str,
         T_tracking_thing: PoseTuple,
-        p_tracking_head: Vec3,
+        p_tracking_head: Vec3 | None,
         capture_ns: int,
         tracking_epoch: int,
         viewpoint_id: int = 0,
@@ -85,7 +88,7 @@ class CrossCheck:
         """One detection of a sheet, or one tracked pose of a controller, on the session's clock."""
         key = (headset, thing)
         epoch = self._epochs.get(headset, tracking_epoch)
-        if not is_rigid(T_tracking_thing) or not all(map(math.isfinite, p_tracking_head)) or tracking_epoch < epoch:
+        if not is_rigid(T_tracking_thing) or not is_place(p_tracking_head) or tracking_epoch < epoch:
             self.dropped += 1
             return
         if tracking_epoch > epoch:
@@ -183,8 +186,12 @@ class CrossCheck:
     def _look_noise(self, estimate: AlignmentEstimate, looks: list[_Look]) -> Array:
         """Covariance of where these looks put the thing, seen in the world: what viewpoints share counts once each."""
         viewpoints = len({k.viewpoint_id for k in looks})
-        head, p = np.median([k.p_head for k in looks], axis=0), np.median([k.pose[0] for k in looks], axis=0)
-        common, each = self.noise.seen_from(head, p)
+        heads = [k.p_head for k in looks if k.p_head is not None]
+        if heads:
+            p = np.median([k.pose[0] for k in looks], axis=0)
+            common, each = self.noise.seen_from(np.median(heads, axis=0), p)
+        else:
+            common, each = self.noise.split(isotropic(self.unseen_sigma_m, 0.01))
         C = common[:3, :3] / viewpoints + each[:3, :3] * (math.pi / 2.0 / len(looks))
         R = quat_matrix(np.array(estimate.T_world_tracking[1]))
         return np.asarray(R @ C @ R.T)

@@ -19,12 +19,13 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate
 from anchors.lie import Array, quat_matrix
-from anchors.noise import NoiseModel
-from anchors.pose import PoseTuple, Vec3, apply, distance, is_rigid, quat_angle
+from anchors.noise import NoiseModel, isotropic
+from anchors.pose import PoseTuple, Vec3, apply, distance, is_place, is_rigid, quat_angle
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
 _CHI2_3_ONE_IN_A_MILLION: Final = 30.66
+_ENOUGH_BESIDE: Final = 2  # looks at another anchor: one alone may be a wrong detection
 _MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaussian noise
 
 
@@ -49,7 +50,8 @@ class DriftConfig:
     """`window_ns`: what counts as now; `reference_ns`: what counts as before, summed up anew every
     `reference_every_ns`. `min_change_m`: less is left to smooth
     updates. `jump_m`: detections that far away, three in a row, are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`:
-    no head is faster. `quiet_ns`: an anchor that raised an alarm raises no other for so long."""
+    no head is faster. `quiet_ns`: an anchor that raised an alarm raises no other for so long. `unseen_sigma_m`: noise
+    per axis of detections from where nobody knows."""
 
     window_ns: int = 1_000_000_000
     reference_ns: int = 10_000_000_000
@@ -57,18 +59,19 @@ class DriftConfig:
     min_in_window: int = 8
     min_change_m: float = 0.005
     min_difference_m: float = 0.010
-    jump_m: float = 0.05
+    jump_m: float = 0.03
     jump_in_a_row: int = 3
     max_speed_m_per_s: float = 6.0
     max_turn_rad_per_s: float = 20.0
     quiet_ns: int = 2_000_000_000
     max_seen: int = 600
+    unseen_sigma_m: float = 0.005
 
 
 class _Seen(NamedTuple):
     capture_ns: int
     p: Vec3
-    p_head: Vec3
+    p_head: Vec3 | None
     viewpoint_id: int
 
 
@@ -115,14 +118,14 @@ class DriftMonitor:
         self,
         anchor_id: str,
         p_tracking_anchor: Vec3,
-        p_tracking_head: Vec3,
+        p_tracking_head: Vec3 | None,
         capture_ns: int,
         tracking_epoch: int,
         viewpoint_id: int = 0,
         alignment: AlignmentEstimate | None = None,
     ) -> Alarm | None:
         """One detection, and the alignment in force (`None`: none). Says at most one thing at a time."""
-        if not all(map(math.isfinite, (*p_tracking_anchor, *p_tracking_head))):
+        if not is_place(p_tracking_anchor) or not is_place(p_tracking_head):
             return None
         alarm = self._epoch(capture_ns, tracking_epoch)
         if alarm is not None or tracking_epoch < self.tracking_epoch or anchor_id not in self.anchors:
@@ -137,34 +140,62 @@ class DriftMonitor:
 
     def _judge(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
         seen = self._seen[anchor_id]
-        new = [
-            s for s in seen if now_ns - s.capture_ns < self.config.window_ns and s.viewpoint_id == seen[-1].viewpoint_id
-        ]
+        new = self._newest(seen, now_ns)
         reference = self._before(anchor_id, now_ns, new[-1].viewpoint_id)
-        if reference is not None:
-            jumped = self._jump(new, reference)
-            if jumped:
-                self._forget()
-                return Alarm("jump", anchor_id, jumped, now_ns)
+        jumped = self._jump(new, reference)
+        if jumped:
+            beside = self._stayed_beside(anchor_id, new[-self.config.jump_in_a_row].capture_ns, jumped)
+            if beside:
+                return self._alarm("changed", anchor_id, jumped, now_ns, beside)
+            self._forget()
+            return Alarm("jump", anchor_id, jumped, now_ns)
         if len(new) < self.config.min_in_window:
             return None
-        now = self._window(new, new[-1].viewpoint_id)
-        assert now is not None
-        change = self._change(now, reference)
-        if change is None:
-            change = self._difference(anchor_id, now, alignment)
-        if change is None:
-            self._steady_ns[anchor_id] = now_ns
-            return None
+        now = self._summary(new)
+        changed = self._change(now, reference)
+        if changed:
+            beside = self._stayed_beside(anchor_id, new[len(new) // 2].capture_ns, changed)
+            return self._alarm("changed", anchor_id, changed, now_ns, beside)
+        differs = self._difference(anchor_id, now, alignment)
+        if differs:
+            return self._alarm("differs", anchor_id, differs, now_ns, self._steady_beside(anchor_id, now_ns))
+        self._steady_ns[anchor_id] = now_ns
+        return None
+
+    def _newest(self, seen: deque[_Seen], now_ns: int) -> list[_Seen]:
+        """Of the last window, those from where it is seen now; oldest first."""
+        new = []
+        for s in reversed(seen):
+            if now_ns - s.capture_ns >= self.config.window_ns:
+                break
+            if s.viewpoint_id == seen[-1].viewpoint_id:
+                new.append(s)
+        return new[::-1]
+
+    def _alarm(self, kind: AlarmKind, anchor_id: str, size_m: float, now_ns: int, beside: tuple[str, ...]) -> Alarm:
+        """From here on the new place is what was seen before."""
         self._quiet_until_ns[anchor_id] = now_ns + self.config.quiet_ns
         self._references.pop(anchor_id, None)
-        seen.clear()  # from here on the new place is what was seen before
-        beside = tuple(
-            other
-            for other in sorted(self._steady_ns)
-            if other != anchor_id and abs(now_ns - self._steady_ns[other]) < self.config.window_ns
-        )
-        return Alarm(change[0], anchor_id, change[1], now_ns, beside)
+        self._steady_ns.pop(anchor_id, None)
+        self._seen[anchor_id].clear()
+        return Alarm(kind, anchor_id, size_m, now_ns, beside)
+
+    def _stayed_beside(self, anchor_id: str, since_ns: int, size_m: float) -> tuple[str, ...]:
+        """Other anchors that are seen where they were, after this one was seen to be off by `size_m`."""
+        stayed = []
+        for other in sorted(self._seen):
+            kept = self._references.get(other)
+            later = [s.p for s in self._seen[other] if s.capture_ns >= since_ns]
+            if other == anchor_id or kept is None or kept[2] is None or len(later) < _ENOUGH_BESIDE:
+                continue
+            if float(np.linalg.norm(np.median(later, axis=0) - kept[2].p)) < 0.5 * size_m:
+                stayed.append(other)
+        return tuple(stayed)
+
+    def _steady_beside(self, anchor_id: str, now_ns: int) -> tuple[str, ...]:
+        """Other anchors that are seen where the alignment says."""
+        window_ns = self.config.window_ns
+        return tuple(o for o, ns in sorted(self._steady_ns.items()) if o != anchor_id and abs(now_ns - ns) < window_ns)
 
     def _before(self, anchor_id: str, now_ns: int, viewpoint_id: int) -> _Window | None:
         kept = self._references.get(anchor_id)
@@ -185,42 +216,48 @@ class DriftMonitor:
         rows = [s for s in seen if s.viewpoint_id == viewpoint_id]
         if len(rows) < self.config.min_in_window:
             return None
-        p = np.median([s.p for s in rows], axis=0)
-        common, each = self.noise.seen_from(np.array(rows[len(rows) // 2].p_head), p)
-        return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], viewpoint_id)
+        return self._summary(rows)
 
-    def _change(self, now: _Window, before: _Window | None) -> tuple[AlarmKind, float] | None:
+    def _summary(self, rows: list[_Seen]) -> _Window:
+        p = np.median([s.p for s in rows], axis=0)
+        p_head = rows[len(rows) // 2].p_head
+        if p_head is None:
+            common, each = self.noise.split(isotropic(self.config.unseen_sigma_m, 0.0))
+        else:
+            common, each = self.noise.seen_from(np.array(p_head), p)
+        return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], rows[-1].viewpoint_id)
+
+    def _change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
+        """How far it is from where it was, 0 for as good as not."""
         if before is None:
-            return None
+            return 0.0
         C = now.own + before.own
         if now.viewpoint_id != before.viewpoint_id:
             C = C + now.common + before.common
-        size = _significant(now.p - before.p, C, self.config.min_change_m)
-        return ("changed", size) if size else None
+        return _significant(now.p - before.p, C, least_m or self.config.min_change_m)
 
-    def _difference(
-        self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None
-    ) -> tuple[AlarmKind, float] | None:
+    def _difference(self, anchor_id: str, now: _Window, alignment: AlignmentEstimate | None) -> float:
+        """How far it is from where the alignment says, 0 for as good as not."""
         if alignment is None or alignment.refused or alignment.tracking_epoch != self.tracking_epoch:
-            return None
+            return 0.0
         p_world = self.anchors[anchor_id][0]
         placed = apply(alignment.T_world_tracking, (float(now.p[0]), float(now.p[1]), float(now.p[2])))
         R = quat_matrix(np.array(alignment.T_world_tracking[1]))
         C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
-        size = _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
-        return ("differs", size) if size else None
+        return _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
 
-    def _jump(self, new: list[_Seen], reference: _Window) -> float:
+    def _jump(self, new: list[_Seen], reference: _Window | None) -> float:
         """The last few detections, far from the reference and near to each other: one alone is a wrong detection."""
         last = new[-self.config.jump_in_a_row :]
-        if len(last) < self.config.jump_in_a_row:
+        if reference is None or len(last) < self.config.jump_in_a_row:
             return 0.0
         away = np.array([s.p for s in last]) - reference.p
-        sizes = np.linalg.norm(away, axis=1)
+        if not float(np.min(np.linalg.norm(away, axis=1))) > self.config.jump_m:
+            return 0.0
         together = float(np.max(np.linalg.norm(away - away.mean(axis=0), axis=1)))
-        if float(np.min(sizes)) > self.config.jump_m and together < 0.5 * self.config.jump_m:
-            return float(np.median(sizes))
-        return 0.0
+        if together > max(0.5 * self.config.jump_m, 0.1 * float(np.linalg.norm(away[0]))):
+            return 0.0
+        return self._change(self._summary(last), reference, self.config.jump_m)
 
     def _epoch(self, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         if tracking_epoch <= self.tracking_epoch:

@@ -171,9 +171,9 @@ def _blame(
 ) -> tuple[str, tuple[str, ...]]:
     """What went wrong where the points do not fit: another order, or one of them touched elsewhere."""
     n = len(names)
-    fits = [(order, _fit(world[list(order)], tip, sigma, config)) for order in _orders(n)]
-    order, best = min(fits, key=lambda one: one[1].chi2)
-    if best.good:
+    fits = [(order, _fit(world[list(order)], tip, sigma, config)) for order in _likely_orders(world, tip, sigma)]
+    order, best = min(fits, key=lambda one: one[1].chi2, default=((), None))
+    if best is not None and best.good:
         mixed = [i for i in range(n) if order[i] != i]
         told = ", ".join(f"'{names[i]}' was touched at '{names[order[i]]}'" for i in mixed)
         return f"points are mixed up: {told}; touch them again by their names", tuple(names[i] for i in mixed)
@@ -195,13 +195,25 @@ def _blame(
 def _alike(names: Sequence[str], world: Array, sigma_m: float) -> str:
     """A layout that looks the same in another order when turned about the vertical: that order would not be noticed."""
     fine = np.full(len(names), sigma_m)
-    for order in _orders(len(names)):
+    for order in _likely_orders(world, world, fine):
         moved = world[list(order)]
         sides = np.linalg.norm(world - world.mean(axis=0), axis=1) - np.linalg.norm(moved - world.mean(axis=0), axis=1)
         if float(np.max(np.abs(sides))) < 4.0 * sigma_m and _fit(world, moved, fine, AlignmentConfig()).good:
             mixed = ", ".join(f"'{names[i]}'" for i in range(len(names)) if order[i] != i)
             return f"the marks {mixed} look the same in another order: move one by 50 mm, else a mix-up goes unnoticed"
     return ""
+
+
+def _likely_orders(world: Array, tip: Array, sigma: Array) -> list[tuple[int, ...]]:
+    """Other orders in which all distances between points are right, as far as noise goes: no other can fit, for no
+    turn changes a distance. To fit them all would take seconds."""
+    n = len(world)
+    orders = np.array(_orders(n), dtype=np.int64).reshape(-1, n)
+    marks = np.linalg.norm(world[:, None] - world, axis=2)
+    tips = np.linalg.norm(tip[:, None] - tip, axis=2)
+    slack = math.sqrt(_CHI2_3_999) * (sigma[:, None] + sigma)  # each may miss its mark by so much, see `_fit`
+    off = np.abs(marks[orders[:, :, None], orders[:, None, :]] - tips)
+    return [tuple(order) for order in orders[np.all(off <= slack, axis=(1, 2))].tolist()]
 
 
 def _orders(n: int) -> list[tuple[int, ...]]:

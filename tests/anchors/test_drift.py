@@ -181,3 +181,58 @@ def test_a_clock_that_was_set_back_after_an_alarm_does_not_silence_the_next_one(
     assert _watch(monitor, look, shifted(T, (0.03, 0.0, 0.0)), range(late + 40, late + 60))
     assert _watch(monitor, look, shifted(T, (0.03, 0.0, 0.0)), range(40)) == []
     assert _watch(monitor, look, T, range(40, 60))
+
+
+def _watch_both(
+    monitor: DriftMonitor, rng: np.random.Generator, frame: PoseTuple, bump: Vec3 = (0.0, 0.0, 0.0), moved: float = 0.0
+) -> list[tuple[int, Alarm]]:
+    """Both sheets at 10 Hz, one after the other; from the 30th look on the frame is bumped, or a sheet moved."""
+    looks, alarms = {name: Look(rng, T, around(rng, T[0], 0.6)) for name, T in ANCHORS.items()}, []
+    for i in range(60):
+        now = shifted(frame, bump) if i >= 30 else frame
+        for k, (name, look) in enumerate(looks.items()):
+            place = shifted(SHEET, (moved, 0.0, 0.0)) if name == "sheet" and i >= 30 else None
+            p = look.new(now, place)[0]
+            alarm = monitor.observe(name, p, look.head(now), i * PERIOD + k * PERIOD // 2, 0)
+            alarms += [(i, alarm)] if alarm is not None else []
+    return alarms
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bump_of_5_cm_is_a_jump_at_the_third_look(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frame = headset(rng)
+    look, monitor = Look(rng, SHEET, around(rng, SHEET[0], 0.7)), DriftMonitor(ANCHORS)
+    assert _watch(monitor, look, frame, range(30)) == []
+    way = rng.normal(size=3)
+    x, y, z = (0.05 * way / np.linalg.norm(way)).tolist()
+    (alarm,) = _watch(monitor, look, shifted(frame, (x, y, z)), range(30, 33))
+    assert (alarm.kind, alarm.capture_ns) == ("jump", 32 * PERIOD)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sheet_that_was_carried_away_is_no_jump_of_the_headset(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    alarms = _watch_both(DriftMonitor(ANCHORS), rng, headset(rng), moved=0.3)
+    assert [(a.kind, a.anchor_id, a.beside) for _, a in alarms] == [("changed", "sheet", ("other",))]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bump_in_sight_of_two_sheets_is_no_moved_sheet(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    jump, *_ = _watch_both(DriftMonitor(ANCHORS), rng, headset(rng), bump=(0.03, 0.03, 0.03))
+    assert (jump[0] <= 32, jump[1].kind) == (True, "jump")
+    rng = np.random.default_rng(seed)
+    alarms = _watch_both(DriftMonitor(ANCHORS), rng, headset(rng), bump=(0.012, 0.0, 0.0))
+    assert {(a.kind, a.beside) for _, a in alarms} == {("changed", ())}
+
+
+def test_without_a_head_changes_must_be_larger_to_be_told() -> None:
+    rng = np.random.default_rng(2)
+    frame, monitor = headset(rng), DriftMonitor(ANCHORS)
+    look, alarms = Look(rng, SHEET, around(rng, SHEET[0], 0.6)), []
+    for i in range(80):
+        p = look.new(shifted(frame, (0.025 if i >= 40 else 0.0, 0.0, 0.0)))[0]
+        alarm = monitor.observe("sheet", p, None, i * PERIOD, 0)
+        alarms += [alarm] if alarm is not None else []
+    assert [a.kind for a in alarms] == ["changed"]

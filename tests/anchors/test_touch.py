@@ -150,3 +150,21 @@ def test_a_touch_nowhere_is_not_read(value: float) -> None:
     got = register(marks, [Touch(name, (value, 0.0, 0.0)) for name in marks])
     assert got.estimate.refused
     assert "was not read" in got.estimate.advice
+
+
+@pytest.mark.parametrize("n", [6, 8])
+def test_orders_that_no_distance_allows_are_not_fitted(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All 719 other orders of six points would take a second."""
+    import anchors.touch
+
+    fits, fit = [], anchors.touch._fit
+    monkeypatch.setattr(anchors.touch, "_fit", lambda *args: fits.append(1) or fit(*args))
+    rng = np.random.default_rng(4)
+    marks = {c: _at(rng.uniform(-0.5, 0.5, 3)) for c in "abcdefgh"[:n]}
+    wrong = [Touch(c, _at(rng.uniform(-1.0, 1.0, 3))) for c in marks]
+    assert register(marks, wrong).estimate.refused
+    assert len(fits) <= n + 1
+
+
+def _at(p: np.ndarray) -> Vec3:
+    return (float(p[0]), float(p[1]), float(p[2]))
