@@ -17,6 +17,7 @@ from iris_session.client.driving import DEFAULT_TIMEOUT_S, Driving
 from iris_session.client.errors import NotConnectedError
 from iris_session.client.identity import Identity
 from iris_session.client.joining import wanted
+from iris_session.client.looking import Looking
 from iris_session.client.reporting import ArrivalMeter, Reporting
 from iris_session.client.requests import Requests
 from iris_session.client.sampling import Sampling
@@ -33,7 +34,7 @@ from iris_session.protocol.server_messages import Event, Feedback
 UNALIGNED_ROLES = frozenset({Role.AGENT, Role.LEADER, Role.GATEWAY, Role.RECORDER, Role.CAMERA, Role.SOURCE})
 
 
-class Client(Driving, Requests, Sampling, Reporting):
+class Client(Driving, Requests, Looking, Sampling, Reporting):
     """A participant of a session.
 
     `address`: `HOST:PORT` of the control channel, or the `iris://` URI of a pairing code; `session`: name of a session
@@ -104,6 +105,7 @@ class Client(Driving, Requests, Sampling, Reporting):
         self._generation = 0
         self._sockets = ClientSockets()
         self._init_media()
+        self._init_looking()
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None

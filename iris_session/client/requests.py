@@ -11,9 +11,10 @@ import msgspec
 
 from iris_session.client.connection import Connection
 from iris_session.client.errors import DeniedError, InvalidMessageError, NotConnectedError, RequestTimeoutError
-from iris_session.client.values import PoseLike, names_of, pose_of, text_of
+from iris_session.client.values import Numbers, PoseLike, names_of, numbers, pose_of, text_of
 from iris_session.protocol.client_messages import (
     Acquire,
+    Align,
     Assign,
     ClearEStop,
     ClientMessage,
@@ -23,6 +24,7 @@ from iris_session.protocol.client_messages import (
     EStop,
     Grasp,
     Marker,
+    MoveAnchor,
     Observation,
     PlaceAlignment,
     Release,
@@ -166,6 +168,17 @@ class Requests:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""
         self.request(PlaceAlignment(0, participant, pose_of("T_world_tracking", T_world_tracking), offset))
 
+    def align(self, action: str, participant: str = "") -> None:
+        """`start`: measures the alignment anew, from nothing; `stop`: keeps what is in force, whatever is seen.
+
+        Our own; a director may do so for every `participant`. What is in force stays until there is a better one.
+        """
+        self.request(Align(0, action, participant))
+
+    def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike) -> None:
+        """Director: says where an anchor of the session is; the scene moves for everyone who is aligned to it."""
+        self.request(MoveAnchor(0, anchor_id, pose_of("T_world_anchor", T_world_anchor)))
+
     def estop(self, reason: object = "") -> bool:
         """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop.
 
@@ -210,8 +223,16 @@ class Requests:
         size_m: float = 0.0,
         quality: float = 1.0,
         device: str = "head",
+        covariance: Numbers = (),
     ) -> None:
-        """Reports that a device saw an anchor, in the tracking frame."""
+        """Reports that a device saw an anchor, in the tracking frame.
+
+        `viewpoint_id`: the same for what was seen from one place. `covariance`: 36 values, 6x6 row-major, (x, y, z [m],
+        rx, ry, rz [rad]), tracking axes; without it the session assumes that of a headset's camera.
+        """
+        stated = numbers("covariance", covariance)
+        if len(stated) not in (0, 36):
+            raise InvalidMessageError(f"covariance: expected 36 numbers, 6x6 row-major, or none, got {len(stated)}")
         self.send(
             Observation(
                 anchor_id=anchor_id,
@@ -223,5 +244,6 @@ class Requests:
                 size_m=size_m,
                 quality=quality,
                 device=device,
+                covariance=stated,
             )
         )
