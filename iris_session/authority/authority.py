@@ -6,7 +6,6 @@ Reads no clock, random source or set order; equal calls give equal decisions, an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -14,7 +13,9 @@ import msgspec
 
 from iris_session.authority import (
     alignment,
+    anchoring,
     arbitration,
+    corrections,
     episodes,
     feedback,
     grasps,
@@ -26,17 +27,15 @@ from iris_session.authority import (
     scaling,
     stops,
 )
-from iris_session.authority.config import POSITIVE, AuthorityConfig
+from iris_session.authority.config import AuthorityConfig, check_config
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, LeaseState, Participant, State
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
-from iris_session.protocol.common import Denial
+from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.entries import HOST, URGENT, Entry
 from iris_session.protocol.names import (
-    AssignmentPolicy,
     DenialReason,
-    Device,
     LeaseMode,
     RejectReason,
     Role,
@@ -45,10 +44,19 @@ from iris_session.protocol.names import (
 from iris_session.protocol.security import Audited, RemoveParticipant
 from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply, Snapshot
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
 
 #: Requests that only a director (or the host) may make.
-DIRECTING: Final = (cm.Assign, cm.SetMode, cm.Control, cm.ClearEStop, cm.PlaceAlignment, RemoveParticipant)
+DIRECTING: Final = (
+    cm.Assign,
+    cm.SetMode,
+    cm.Control,
+    cm.ClearEStop,
+    cm.PlaceAlignment,
+    cm.MoveAnchor,
+    RemoveParticipant,
+)
 #: Entries that only the process that owns the session may make.
 HOST_ONLY: Final = (
     em.ExternalReset,
@@ -58,6 +66,8 @@ HOST_ONLY: Final = (
     em.Audit,
     em.SessionResumed,
 )
+#: Entries that the front makes of its own, for the participant of a connection: no envelope, quota or sign of life.
+FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
 
 NOT_JOINED: Final = Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first")
 
@@ -76,6 +86,7 @@ class Authority:
             robots={r.name: LeaseState(r.name, TargetKind.ROBOT, modes[r.name]) for r in robots},
             objects={o.name: LeaseState(o.name, TargetKind.OBJECT, LeaseMode.SHARED) for o in objects},
             participants={HOST_ID: roster.host()},
+            anchors={name: corrections.clean(T) for name, T in config.anchors.items()},
         )
         self._ctx = Context(config, robots, objects, state)
         self._commands = arbitration.Commands()
@@ -102,6 +113,7 @@ class Authority:
                 arbitration.sample(ctx, entry, entry.message)
         roster.expire(ctx)
         arbitration.expire_samples(ctx)
+        corrections.advance(ctx)
         if ctx.state.queue or ctx.state.consents:
             requests.advance(ctx)
         handover.observe(ctx)
@@ -157,6 +169,20 @@ class Authority:
         """Session time of the newest step, 0 before the first."""
         return self._ctx.state.now_ns or 0
 
+    @property
+    def anchors(self) -> dict[str, Pose]:
+        """`T_world_anchor` by id, as they are now."""
+        return dict(self._ctx.state.anchors)
+
+    def alignment_reports(self) -> dict[str, AlignmentReport]:
+        """How the alignments of those who need one stand, by participant."""
+        people = self._ctx.state.participants.values()
+        return {p.id: anchoring.alignment_report(self._ctx, p) for p in people if p.needs_alignment}
+
+    def cross_check_reports(self) -> tuple[CrossCheckReport, ...]:
+        """The newest comparisons of headsets."""
+        return anchoring.cross_check_reports(self._ctx)
+
     # --- phases of a step ---
 
     def _begin(
@@ -188,6 +214,9 @@ class Authority:
         for index, entry in enumerate(entries):
             m = entry.message
             if isinstance(m, URGENT):
+                continue
+            if isinstance(m, FRONT_MADE):
+                others.append(entry)
                 continue
             n = spent.get(entry.connection, 0) + 1
             spent[entry.connection] = n
@@ -261,10 +290,13 @@ class Authority:
                 roster.join(ctx, entry.connection, m)
             return
         p = ctx.by_connection.get(entry.connection)
+        ctx.entry_ns = entry.receive_ns
         if p is None:
+            if isinstance(m, FRONT_MADE):
+                return  # the connection was lost meanwhile
             samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
             self._deny(entry, NOT_JOINED)
-        elif entry.connection_epoch != entry.connection and not isinstance(m, em.AlignmentProposal):
+        elif entry.connection_epoch != entry.connection and not isinstance(m, FRONT_MADE):
             samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
             denial = Denial(DenialReason.NOT_JOINED, "the envelope names another connection", "use the latest welcome")
             self._deny(entry, denial)
@@ -287,7 +319,8 @@ class Authority:
         elif isinstance(m, em.Audit):
             ctx.emit(Audited(m.kind, m.subject, m.name, m.address, m.detail, m.count))
         elif isinstance(m, em.SessionResumed):
-            roster.lose_everyone_for_a_while(ctx, "session_resumed")
+            roster.lose_everyone(ctx, "session_resumed")
+            anchoring.give_anew(ctx, m.anchors)
             stops.gap(ctx, m.gap_ns, "resumed")
             roster.begin_grace_anew(ctx)
         elif isinstance(m, em.StalledGap) and not self._gap_seen:
@@ -319,34 +352,6 @@ def _resumes(entry: Entry) -> bool:
     return entry.connection == HOST and isinstance(entry.message, em.SessionResumed)
 
 
-def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
-    """Raises `ValueError` that says what would have been right."""
-    names = [r.name for r in robots]
-    for kind, all_names in (("robot", names), ("object", [o.name for o in objects])):
-        if len(set(all_names)) != len(all_names):
-            raise ValueError(f"{kind} names must differ: {all_names}")
-    for mode in (config.default_mode or LeaseMode.EXCLUSIVE, *(r.mode for r in robots)):
-        if mode not in LeaseMode.ALL:
-            raise ValueError(f"unknown lease mode {mode!r}, known: {sorted(LeaseMode.ALL)}")
-    if config.policy not in AssignmentPolicy.ALL:
-        raise ValueError(f"unknown assignment policy {config.policy!r}, known: {sorted(AssignmentPolicy.ALL)}")
-    unknown = [r for given in config.assignments.values() for r in given if r not in names]
-    if unknown:
-        raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
-    if config.leader_apart not in ("ramp", "refuse"):
-        raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
-    missing = sorted(Device.ALL - config.speed_limits.keys())
-    if missing:
-        raise ValueError(f"speed_limits lacks {', '.join(missing)}; it must have every device")
-    for name in POSITIVE:
-        if not getattr(config, name) > 0:
-            raise ValueError(f"{name} is {getattr(config, name)}; it must be positive")
-    if not 0.0 < config.min_scale <= config.max_scale < math.inf:
-        raise ValueError(
-            f"min_scale {config.min_scale} and max_scale {config.max_scale} must be positive, finite and in this order"
-        )
-
-
 def _heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:
     roster.set_worn(ctx, p, m.worn)
 
@@ -375,7 +380,11 @@ _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
     cm.Grasp: requests.grasp,
     cm.Observation: _observation,
     em.AlignmentProposal: alignment.propose,
+    em.AlignmentAlarm: anchoring.alarm,
+    em.CrossChecked: anchoring.cross_checked,
     cm.PlaceAlignment: alignment.place,
+    cm.Align: anchoring.align,
+    cm.MoveAnchor: anchoring.move_anchor,
     cm.TrackingEpoch: alignment.tracking_epoch,
     cm.Episode: episodes.episode,
     cm.ClearEStop: stops.clear_estop,

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 
-from iris_session.protocol.common import Name
-from iris_session.protocol.names import AssignmentPolicy, Device
+from anchors.pose import is_rigid
+from iris_session.protocol.common import Name, Pose
+from iris_session.protocol.names import AssignmentPolicy, Device, LeaseMode
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 MS: Final = 1_000_000
 SECOND: Final = 1_000_000_000
@@ -45,6 +49,9 @@ POSITIVE: Final = (
     "max_sub_holders",
     "max_step_ticks",
     "contact_step_n",
+    "slide_ns",
+    "slide_m_per_s",
+    "slide_rad_per_s",
 )
 
 
@@ -88,6 +95,14 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
     min_change_rad: float = 0.002
+    anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
+    settle_ns: int = 15 * SECOND  # after the first alignment of a run; from then on corrections come gently
+    slide_ns: int = 500 * MS  # between two parts of a correction that slides in
+    slide_m_per_s: float = 0.004  # slow enough not to be noticed in a headset
+    slide_rad_per_s: float = 0.00524  # 0.3 degrees
+    announce_m: float = 0.010  # larger corrections are announced, and come in one go
+    announce_rad: float = 0.0349  # 2 degrees
+    announce_ns: int = 2 * SECOND  # from the announcement to the correction
     # handover: contact flickers for a few ticks at every change of grip
     handover_hold_ns: int = 100 * MS  # giver must have held it alone this long; receiver afterwards too
     handover_flicker_ns: int = 50 * MS
@@ -98,3 +113,34 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contact_step_n: float = 0.5  # contact force is reported in steps of this size [N]
     max_step_ticks: int = 10_000
     user_owned_loop: bool = False
+
+
+def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
+    """Raises `ValueError` that says what would have been right."""
+    names = [r.name for r in robots]
+    for kind, all_names in (("robot", names), ("object", [o.name for o in objects])):
+        if len(set(all_names)) != len(all_names):
+            raise ValueError(f"{kind} names must differ: {all_names}")
+    for mode in (config.default_mode or LeaseMode.EXCLUSIVE, *(r.mode for r in robots)):
+        if mode not in LeaseMode.ALL:
+            raise ValueError(f"unknown lease mode {mode!r}, known: {sorted(LeaseMode.ALL)}")
+    if config.policy not in AssignmentPolicy.ALL:
+        raise ValueError(f"unknown assignment policy {config.policy!r}, known: {sorted(AssignmentPolicy.ALL)}")
+    unknown = [r for given in config.assignments.values() for r in given if r not in names]
+    if unknown:
+        raise ValueError(f"assignments name unknown robots {unknown}, robots: {names}")
+    if config.leader_apart not in ("ramp", "refuse"):
+        raise ValueError(f"leader_apart is {config.leader_apart!r}, must be 'ramp' or 'refuse'")
+    missing = sorted(Device.ALL - config.speed_limits.keys())
+    if missing:
+        raise ValueError(f"speed_limits lacks {', '.join(missing)}; it must have every device")
+    for name in POSITIVE:
+        if not getattr(config, name) > 0:
+            raise ValueError(f"{name} is {getattr(config, name)}; it must be positive")
+    for name, T in config.anchors.items():
+        if not (is_rigid((T.p, T.q), config.reach_m)):
+            raise ValueError(f"anchor {name!r}: {T} is not finite with a unit quaternion, within {config.reach_m:g} m")
+    if not 0.0 < config.min_scale <= config.max_scale < math.inf:
+        raise ValueError(
+            f"min_scale {config.min_scale} and max_scale {config.max_scale} must be positive, finite and in this order"
+        )

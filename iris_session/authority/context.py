@@ -44,6 +44,8 @@ class Context:
         self.view: WorldView = FixedView()
         self.control: Sequence[ControlStatus] = ()
         self.now_ns = 0
+        #: When the front stamped the entry that is being handled.
+        self.entry_ns = 0
         self.adopt(state)
         self.clear_effects()
 

@@ -29,6 +29,7 @@ def begin(ctx: Context, lease: LeaseState, g: Grant, p: Participant, device: str
     ctx.state.next_engagement += 1
     g.device = device
     g.hold = ""
+    p.in_use = True
     if p.alignment is not None:
         g.alignment_version = p.alignment.version
         g.T_world_tracking = p.alignment.T_world_tracking

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from iris_session.authority import assignment, engagement, leases
+from iris_session.authority import anchoring, assignment, corrections, engagement, leases
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, KEPT, NO_CONNECTION, Participant
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
@@ -75,7 +75,8 @@ def _resume(ctx: Context, connection: int, m: Join, p: Participant) -> None:
     needs_alignment = m.alignment == AlignmentKind.MEASURED
     if not p.run or p.run not in _runs(m) or needs_alignment != p.needs_alignment:
         p.tracking_epoch = 0
-        p.alignment = p.offset = p.T_world_tracking_measured = None
+        p.aligning = True
+        corrections.void(p)
     p.name, p.needs_alignment = m.name, needs_alignment
     p.seen.clear()
     return _admit(ctx, p, connection, m, resumed=True)
@@ -176,28 +177,26 @@ def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
     for tracked in ctx.state.feedback.values():
         tracked.sent.pop(p.id, None)
     del ctx.state.participants[p.id]
+    anchoring.forget(ctx, p)
     assignment.settle_names(ctx)
     ctx.emit(ParticipantLeft(p.id, reason or cause))
 
 
 def lose_everyone(ctx: Context, reason: str) -> None:
-    """The front was replaced: every connection is lost."""
+    """The front was replaced, or the session goes on after it was down: every connection is lost.
+
+    Who waited for a robot keeps the place, as nobody could choose to leave it.
+    """
+    places, ctx.state.queue = ctx.state.queue, []
     for p in tuple(ctx.state.participants.values()):
         lose(ctx, p, reason)
-
-
-def lose_everyone_for_a_while(ctx: Context, reason: str) -> None:
-    """The session goes on after it was down: that time counts against nobody, grace begins anew, and who waited for a
-    robot keeps the place, as nobody could choose to leave it."""
-    places, ctx.state.queue = ctx.state.queue, []
-    lose_everyone(ctx, reason)
     ctx.state.queue = places
     for pending in places:
         pending.request_id = KEPT
 
 
 def begin_grace_anew(ctx: Context) -> None:
-    """After `lose_everyone_for_a_while`, and for those who were away before."""
+    """The time that the session was down counts against nobody, those who were away before included."""
     for p in ctx.state.participants.values():
         if p.connection == NO_CONNECTION:
             p.spared = False

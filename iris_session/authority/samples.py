@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from anchors.pose import distance, quat_angle
-from iris_session.authority import alignment, engagement
+from iris_session.authority import alignment, engagement, stated_error
 from iris_session.authority.context import Context, find_grant
 from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
@@ -159,7 +159,7 @@ def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> s
             if not apart <= ctx.config.leader_apart_rad:  # a robot that is nowhere is not near its leader
                 return RejectReason.LEADER_APART
         if s.kind != SampleKind.JOINTS and p.needs_alignment:
-            error = alignment.error_at(ctx, p, lease.target)
+            error = stated_error.at_robot(ctx, p, lease.target)
             if error > ctx.config.max_error_at_robot_m:
                 alignment.refuse_at_robot(ctx, p, lease.target, error)
                 return RejectReason.UNALIGNED

@@ -56,13 +56,49 @@ class Warned(msgspec.Struct):
     left_out: int = 0
 
 
+class Correction(msgspec.Struct):
+    """A measured alignment (without the director's offset) that is not wholly in force yet.
+
+    `T_told`: what it was when its wearer was told, at `told_ns`; it may go on changing. `slides_ns`: when the next part
+    of it may come.
+    """
+
+    T_world_tracking: Pose
+    covariance: tuple[float, ...]
+    pivot_world: Vec3
+    error_at_anchor_m: float
+    slides_ns: int
+    T_told: Pose | None = None
+    told_ns: int = 0
+
+
+class Placing(msgspec.Struct):
+    """A director's word that waits until the clutch of its wearer opens."""
+
+    T_world_tracking: Pose
+    offset: bool
+
+
+class Alarmed(msgspec.Struct):
+    """The last alarm about an alignment that nothing has answered yet (`AlarmKind`)."""
+
+    kind: str
+    anchor_id: str
+    size_m: float
+    beside: tuple[str, ...]
+    raised_ns: int
+
+
 class Participant(msgspec.Struct):
     """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
 
     `spared`: a gap has put off its expiry, and the gaps that follow that one at once do not put it off again.
     `run`: value of the capability `run:<id>`; a resumed connection with the same one continues the same tracking frame.
-    `T_world_tracking_measured` is the last measured alignment without the director's `offset`; `pivot_world` the point
-    at which its covariance is stated. `devices` empty: none declared, all known ones are taken.
+    `T_world_tracking_measured`: of the alignment in force, what was measured, without the director's `offset`; None for
+    one that was placed. `pivot_world`: the point at which its covariance is stated. `aligning`: its alignment run goes
+    on, `alignment_run` counts the starts. `placed`: a director's word stands, so measurements do not count. `in_use`:
+    it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that were made at
+    `proposals_from_ns` or before do not count. `devices` empty: none declared, all known ones are taken.
     """
 
     id: str
@@ -84,6 +120,15 @@ class Participant(msgspec.Struct):
     T_world_tracking_measured: Pose | None = None
     offset: Pose | None = None
     pivot_world: Vec3 = (0.0, 0.0, 0.0)
+    alignment_run: int = 0
+    aligning: bool = True
+    placed: bool = False
+    in_use: bool = False
+    aligned_ns: int | None = None
+    proposals_from_ns: int = -1
+    correction: Correction | None = None
+    placing: Placing | None = None
+    alarm: Alarmed | None = None
     refused_ns: int | None = None
     warnings: dict[str, Warned] = {}
     seen: dict[str, DeviceState] = {}
@@ -178,9 +223,23 @@ class FeedbackState(msgspec.Struct):
     sent: dict[str, Feedback] = {}
 
 
+class Compared(msgspec.Struct):
+    """The newest comparison of two headsets; fields as in `HeadsetsCompared`."""
+
+    a: str
+    b: str
+    anchor_id: str
+    error_m: float
+    error_rad: float
+    expected_p95_m: float
+    n: int
+    compared_ns: int
+
+
 class State(msgspec.Struct):
     """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
 
+    `anchors`: `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b".
     `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
     """
 
@@ -208,3 +267,6 @@ class State(msgspec.Struct):
     feedback: dict[str, FeedbackState] = {}
     unattributed: dict[str, Rejections] = {}
     name_owners: dict[str, str] = {}
+    anchors: dict[str, Pose] = {}
+    anchors_ns: int = -1
+    cross_checks: dict[str, Compared] = {}

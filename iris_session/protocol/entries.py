@@ -146,9 +146,11 @@ class Audit(Message, frozen=True, tag="audit"):
 
 
 class SessionResumed(Message, frozen=True, tag="session_resumed"):
-    """The session goes on from a keyframe of an earlier recording, after `gap_ns` (host only)."""
+    """The session goes on from a keyframe of an earlier recording, after `gap_ns` (host only). `anchors`: all of them,
+    when they were given anew; empty: as they were."""
 
     gap_ns: Nanoseconds
+    anchors: dict[Name, Pose] = msgspec.field(default_factory=dict)
 
 
 EntryMessage = (

@@ -1,0 +1,182 @@
+"""Alignment runs, moved anchors, alarms of the front's watch, comparisons of headsets, and how all of it stands."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from iris_session.authority import alignment, corrections, telling
+from iris_session.authority.context import Context, some
+from iris_session.authority.state import HOST_ID, Alarmed, Compared, Participant
+from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
+from iris_session.protocol.common import Denial, Pose
+from iris_session.protocol.entries import AlignmentAlarm, CrossChecked
+from iris_session.protocol.names import AlarmKind, AlignAction, AlignmentKind, DenialReason, Role
+from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
+    AlignmentRun,
+    AnchorMoved,
+    HeadsetsCompared,
+)
+from iris_session.protocol.status import AlignmentReport, CrossCheckReport
+
+#: Comparisons in a report: of 64 people there are 2,016 pairs.
+MAX_REPORTED: Final = 64
+
+
+def align(ctx: Context, p: Participant, m: Align) -> None:
+    """Starts or stops an alignment run: a director's (or the host's) for everybody, others for themselves."""
+    if m.action not in AlignAction.ALL:
+        known = f"actions: {', '.join(sorted(AlignAction.ALL))}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+    person = ctx.person(m.participant) if m.participant else p
+    if person is not p and p.role != Role.DIRECTOR:
+        text = f"role {p.role} may align only itself"
+        return ctx.deny(
+            p, m.request_id, Denial(DenialReason.ROLE, text, "leave `participant` empty, or ask a director")
+        )
+    if person is None:
+        text = f"no participant {m.participant}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
+    if not person.needs_alignment:
+        return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, f"{person.name} needs no alignment"))
+    if m.action == AlignAction.START:
+        _start(ctx, person)
+    elif person.aligning:
+        person.aligning, person.correction = False, None
+    else:
+        return ctx.accept(p, m.request_id)
+    ctx.emit(AlignmentRun(person.id, person.aligning, person.alignment_run, p.id))
+    return ctx.accept(p, m.request_id)
+
+
+def _start(ctx: Context, p: Participant) -> None:
+    """Measures anew: what is in force stays until then, a director's word and offset do not outlive it."""
+    p.alignment_run += 1
+    p.aligning, p.placed, p.in_use, p.aligned_ns = True, False, False, None
+    p.correction = p.placing = p.offset = None
+    p.proposals_from_ns = ctx.now_ns
+    if p.alignment is not None and p.alignment.kind == AlignmentKind.MEASURED:
+        p.T_world_tracking_measured = p.alignment.T_world_tracking
+    _clear(ctx, p)
+
+
+def move_anchor(ctx: Context, p: Participant, m: MoveAnchor) -> None:
+    """A director says where an anchor is: what was measured to its old place counts no more."""
+    if m.anchor_id not in ctx.state.anchors:
+        known = f"anchors: {some(ctx.state.anchors) or 'none'}"
+        denial = Denial(DenialReason.UNKNOWN_TARGET, f"no anchor {m.anchor_id}", known, m.anchor_id)
+        return ctx.deny(p, m.request_id, denial)
+    if not alignment.is_pose(ctx, m.T_world_anchor):
+        text = f"the pose is not finite with a unit quaternion, or further than {ctx.config.reach_m:g} m away"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "", m.anchor_id))
+    _move(ctx, {**ctx.state.anchors, m.anchor_id: corrections.clean(m.T_world_anchor)}, p.id)
+    return ctx.accept(p, m.request_id)
+
+
+def _move(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
+    """The front cannot know of it before this step is over. What it proposes between then and the moment it hears of it
+    is followed by what it proposes afterwards, over the same connection: nothing of it has come into force by then for
+    anyone who uses an alignment, as corrections need half a second to begin."""
+    moved = [name for name, T in anchors.items() if ctx.state.anchors.get(name) != T]
+    if not moved and anchors.keys() == ctx.state.anchors.keys():
+        return
+    ctx.state.anchors, ctx.state.anchors_ns = anchors, ctx.now_ns
+    for name in moved:
+        ctx.emit(AnchorMoved(name, anchors[name], by))
+    for p in ctx.state.participants.values():
+        p.correction = None
+        if p.alarm is not None and (p.alarm.anchor_id in moved or p.alarm.anchor_id not in anchors):
+            _clear(ctx, p)
+
+
+def give_anew(ctx: Context, anchors: dict[str, Pose]) -> None:
+    """A session that goes on from a recording was given other anchors than it had."""
+    if anchors:
+        _move(ctx, {name: corrections.clean(T) for name, T in anchors.items()}, HOST_ID)
+
+
+def alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
+    """The front's watch found the alignment wrong. A jump voids it at once, the others ask for a new look."""
+    if not p.needs_alignment or m.kind not in AlarmKind.ALL or m.tracking_epoch < p.tracking_epoch:
+        return
+    if m.tracking_epoch > p.tracking_epoch:
+        alignment.tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
+    if m.kind == AlarmKind.DIFFERS and p.correction is not None and not m.beside:
+        return  # known: what was measured is not in force yet
+    size_m = min(max(0.0, m.size_m), ctx.config.reach_m) if math.isfinite(m.size_m) else ctx.config.reach_m
+    if m.kind == AlarmKind.JUMP:
+        p.proposals_from_ns = max(p.proposals_from_ns, ctx.entry_ns)
+        alignment.new_frame(ctx, p)
+    elif not m.beside:
+        p.correction = None  # what it was measured from contradicts what is seen now
+    p.alarm = Alarmed(m.kind, m.anchor_id, size_m, m.beside, ctx.now_ns)
+    ctx.emit(AlignmentAlarmed(p.id, m.kind, m.anchor_id, size_m, m.beside))
+    if m.kind == AlarmKind.JUMP:
+        ctx.publish_participant(p)
+    telling.warn(ctx, p, "alarm", _text(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
+
+
+def _text(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
+    size = f"{size_m * 1e3:.0f} mm"
+    if m.beside:
+        others = some(m.beside)
+        return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere, and {others} where it was: was the sheet moved?"
+    advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
+    if m.kind == AlarmKind.JUMP:
+        return f"the tracking of {p.name} jumped by {size}: it is not aligned, robots hold; {advice}"
+    return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere than its alignment says: {advice}"
+
+
+def _clear(ctx: Context, p: Participant) -> None:
+    p.alarm = None
+    telling.warn(ctx, p, "alarm", "", same="")
+
+
+def cross_checked(ctx: Context, p: Participant, m: CrossChecked) -> None:
+    """Two headsets saw the same thing. Ignored when either has gone, or for numbers that are none."""
+    other = ctx.by_connection.get(m.other)
+    if other is None or other is p or HOST_ID in (p.id, other.id):
+        return
+    x, y, z = m.p_world
+    sizes = (float(m.error_m), float(m.error_rad), float(m.expected_p95_m))
+    if not all(math.isfinite(v) for v in (*sizes, x, y, z)) or min(sizes) < 0.0:
+        return
+    key = " ".join(sorted((p.id, other.id)))
+    ctx.state.cross_checks[key] = Compared(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns)
+    ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, (float(x), float(y), float(z)), m.n))
+
+
+def forget(ctx: Context, p: Participant) -> None:
+    """It has left: nobody can look at what it saw again."""
+    kept = {key: c for key, c in ctx.state.cross_checks.items() if p.id not in (c.a, c.b)}
+    ctx.state.cross_checks = kept
+
+
+def alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
+    """What the authority knows of an alignment; the front adds what it sees."""
+    now, last = p.alignment, p.alarm
+    pending_m, pending_rad = corrections.pending(p)
+    return AlignmentReport(
+        version=0 if now is None else now.version,
+        running=p.aligning,
+        offset=now is not None and now.offset,
+        error_at_anchor_m=0.0 if now is None else now.error_at_anchor_m,
+        error_at_robot_m=0.0 if now is None else now.error_at_robot_m,
+        pending_m=pending_m,
+        pending_rad=pending_rad,
+        alarm="" if last is None else last.kind,
+        alarm_size_m=0.0 if last is None else last.size_m,
+        alarm_ns=-1 if last is None else ctx.now_ns - last.raised_ns,
+    )
+
+
+def cross_check_reports(ctx: Context) -> tuple[CrossCheckReport, ...]:
+    """The newest comparison of every pair, newest first."""
+    newest = sorted(ctx.state.cross_checks.values(), key=lambda c: -c.compared_ns)[:MAX_REPORTED]
+    return tuple(
+        CrossCheckReport(
+            c.a, c.b, c.anchor_id, c.error_m, c.error_rad, c.expected_p95_m, ctx.now_ns - c.compared_ns, c.n
+        )
+        for c in newest
+    )
