@@ -1,4 +1,4 @@
-"""What `fuzz.py` gives to the media channel: decoders of both ends, and a real front's subscription and ingest ports."""
+"""What `fuzz.py` gives to media: the decoders of both ends, and a real front's subscription and ingest ports."""
 
 from __future__ import annotations
 
