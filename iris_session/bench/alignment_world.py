@@ -15,16 +15,14 @@ import numpy as np
 
 from anchors.lie import Array, quat_conjugate, quat_exp, quat_matrix, quat_multiply
 from anchors.pose import PoseTuple, Quat, Vec3
+from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
 
 PER_VIEWPOINT: Final = 20  # 2 s at 10 Hz
 PERIOD_S: Final = 0.1
 WALK_S: Final = 3.0  # from one viewpoint to the next
 DISTANCE_M: Final = (0.4, 1.2)
 ELEVATION_DEG: Final = (40.0, 80.0)
-WRONG_SHARE: Final = 0.05
-WRONG_M: Final = 0.25  # a detection of something else, standard deviation per axis
-WRONG_RAD: Final = 0.5
-SCALE_SIGMA: Final = 0.003
+NOISE: Final = SheetNoise()
 TILT_SIGMA_RAD: Final = math.radians(0.2)
 DRIFT_M_PER_S: Final = 0.003 / 60.0
 HEAD_SIGMA_M: Final = 0.0005  # a headset's tracking of its own head from frame to frame; our assumption
@@ -32,7 +30,6 @@ TIP_SIGMA_M: Final = 0.0015
 HOLDER_SIGMA_RAD: Final = math.radians(
     0.3
 )  # our assumption: a tracked controller is turned as well as a sheet at 0.5 m
-HALF: Final = math.sqrt(0.5)
 
 
 @dataclass(frozen=True)
@@ -83,33 +80,19 @@ class Headset:
         )
         e2 = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         axes = np.stack([e1, e2, np.cross(e1, e2)])
-        along = 0.0004 + 0.0044 * d * d
-        sigma = np.array([along, along / 3.0, along / 3.0])
-        noise = HALF * rng.normal(size=3) + HALF * rng.normal(size=(n, 3))
-        turn_sigma = math.radians(0.3) * d / 0.5
-        turns = turn_sigma * (HALF * rng.normal(size=3) + HALF * rng.normal(size=(n, 3)))
-        p = p_anchor + (noise * sigma) @ axes + rng.normal(0.0, SCALE_SIGMA) * d * e1
-        q = quat_multiply(quat_exp(turns), np.broadcast_to(q_anchor, (n, 4)))
-        head = p_anchor - d * e1
-        self._spoil(p, q, e1)
-        heads = head + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
+        noise = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        p, q = NOISE.seen(p_anchor, q_anchor, axes, d, np.hstack([noise, turns]), rng.normal())
+        for i in np.flatnonzero(rng.random(n) < NOISE.wrong_share):
+            p[i], q[i] = NOISE.wrong(p[i], q[i], e1, rng)
+        heads = p_anchor - d * e1 + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
         return self._report(anchor_id, p, q, heads)
-
-    def _spoil(self, p: Array, q: Array, view: Array) -> None:
-        """Some detections are wrong: half of them mirrored along the line of sight, half of something else."""
-        for i in np.flatnonzero(self.rng.random(len(p)) < WRONG_SHARE):
-            if self.rng.random() < 0.5:
-                v = np.append(0.0, view)
-                q[i] = quat_multiply(quat_multiply(v, q[i]), np.array([0.0, 0.0, 0.0, 1.0]))
-            else:
-                p[i] += self.rng.normal(0.0, WRONG_M, 3)
-                q[i] = quat_multiply(quat_exp(self.rng.normal(0.0, WRONG_RAD, 3)), q[i])
 
     def hold(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[Reported]:
         """2 s of a tracked controller in its holder."""
         rng, n = self.rng, PER_VIEWPOINT
-        noise = TIP_SIGMA_M * (HALF * rng.normal(size=3) + HALF * rng.normal(size=(n, 3)))
-        turns = HOLDER_SIGMA_RAD * (HALF * rng.normal(size=3) + HALF * rng.normal(size=(n, 3)))
+        noise = TIP_SIGMA_M * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = HOLDER_SIGMA_RAD * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
         q = quat_multiply(quat_exp(turns), np.broadcast_to(q_anchor, (n, 4)))
         return self._report(anchor_id, p_anchor + noise, q, np.broadcast_to(p_anchor, (n, 3)))
 

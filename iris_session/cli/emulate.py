@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from iris_session.cli.common import positive_seconds
+from iris_session.cli.common import add_way_to_session, positive_seconds
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,18 +19,23 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session emulate 192.168.0.10 --code 7KQ2-M4XD-9PTR     the first time at a session in the lab\n"
         "  iris-session emulate --session lab-1                   later, by its name\n"
         "  iris-session emulate --headset name=ann,behaviour=giver,robot=left "
-        "--headset name=bob,behaviour=receiver,robot=right",
+        "--headset name=bob,behaviour=receiver,robot=right\n"
+        "  iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that loses its place",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "address", nargs="?", default="", help="HOST:PORT, or the iris:// URI of a pairing code (default: this machine)"
-    )
-    parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
-    parser.add_argument("--code", default="", metavar="CODE", help="join code of `iris-session pair`, the first time")
+    add_way_to_session(parser, code="join code of `iris-session pair`, the first time")
     parser.add_argument("--behaviour", default="wander", help="giver, receiver, wander, idle or observer")
     parser.add_argument("--robot", default="", help="robot to take (default: the policy of the session chooses)")
     parser.add_argument("--count", type=int, default=1, help="how many people with --behaviour")
     parser.add_argument("--seed", type=int, default=0, help="of everything random: frames, noise, motion")
+    parser.add_argument("--drift", type=float, metavar="MM", help="drift of their tracking frames, mm per minute (1)")
+    parser.add_argument(
+        "--bump-at", type=float, action="append", default=[], metavar="S",
+        help="after so many seconds their tracking frames jump by 50 mm, and the headsets do not notice",
+    )  # fmt: skip
+    parser.add_argument(
+        "--glance-every", type=float, default=0.0, metavar="S", help="while working they go and look at the sheet"
+    )
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person in detail")
     parser.add_argument("--seconds", type=positive_seconds, help="at most this long")
     parser.add_argument(
@@ -38,6 +43,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key (*.key_secret)")
+    parser.add_argument("--orders", action="store_true", help="lines on standard input: bump NAME, recentre NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.set_defaults(run=run)
 
@@ -48,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     headsets = arguments.headset or [
         f"name={arguments.behaviour}{i + 1},behaviour={arguments.behaviour},robot={arguments.robot},"
-        f"seed={arguments.seed + i}"
+        f"seed={arguments.seed + i}{_headset_options(arguments)}"
         for i in range(arguments.count)
     ]
     options = ["--address", arguments.address, "--session", arguments.session, "--code", arguments.code]
@@ -58,4 +64,15 @@ def run(arguments: argparse.Namespace) -> int:
         options += ["--headset", headset]
     if arguments.seconds is not None:
         options += ["--seconds", str(arguments.seconds)]
-    return main(options + (["--json"] if arguments.json else []), "iris-session")
+    options += [flag for flag, given in (("--json", arguments.json), ("--orders", arguments.orders)) if given]
+    return main(options, "iris-session")
+
+
+def _headset_options(arguments: argparse.Namespace) -> str:
+    """What all headsets of `--count` have in common, as fields of `--headset`."""
+    text = f",glance_every_s={arguments.glance_every}"
+    if arguments.bump_at:
+        text += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))
+    if arguments.drift is not None:
+        text += f",model.drift_m_per_min={arguments.drift / 1000.0}"
+    return text

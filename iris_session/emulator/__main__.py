@@ -6,6 +6,7 @@ import argparse
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from typing import Any, Final
 
 import msgspec
@@ -13,12 +14,14 @@ import msgspec
 from iris_session.client import ClientError
 from iris_session.client.joining import wanted
 from iris_session.client.meeting import Wanted, settle
+from iris_session.emulator.orders import Orders
 from iris_session.emulator.person import behaviour_of, curve_of
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
-#: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`.
-LISTS: Final = frozenset({"eye", "recentre_at_s"})
+#: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`. Fields of a field have both names:
+#: `model.drift_m_per_min=0.03`, `model.sheet.wrong_share=0`.
+LISTS: Final = frozenset({"eye", "gaze", "recentre_at_s", "bump_at_s", "bump_m"})
 
 
 def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
@@ -44,9 +47,10 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
     say = _say_json if options.json else _say_line
+    orders = Orders(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
     try:
         reports = run_headsets(
-            str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout
+            str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout, orders
         )
         for report in reports:
             say(report, final=True)
@@ -71,12 +75,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key, of everybody here")
+    parser.add_argument(
+        "--orders", action="store_true", help="take orders from standard input: bump NAME, recentre NAME"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
     return parser
 
 
 def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     specs: list[HeadsetSpec] = []
+    if options.specs == "-" and options.orders:
+        raise ValueError("--specs - and --orders both read standard input: write the specs into a file")
     if options.specs:
         data = sys.stdin.buffer.read() if options.specs == "-" else _read(options.specs)
         specs += msgspec.json.decode(data, type=list[HeadsetSpec])
@@ -84,12 +93,27 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
         for key in LISTS & pairs.keys():
             pairs[key] = [float(value) for value in pairs[key].split("/")]
-        specs.append(msgspec.convert(pairs, HeadsetSpec, strict=False))
+        specs.append(msgspec.convert(_nested(pairs), HeadsetSpec, strict=False))
     if not specs:
         raise ValueError("no headset: give --headset name=ann,behaviour=giver,robot=left or --specs FILE")
     given = {"curve_server": options.curve_server, "curve_key": options.curve_key}
     keys = {name: file for name, file in given.items() if file}
     return [msgspec.structs.replace(spec, **keys) for spec in specs]
+
+
+def _nested(pairs: Mapping[str, Any]) -> dict[str, Any]:
+    """`model.drift_m_per_min` is a field of a field."""
+    nested: dict[str, Any] = {}
+    for key, value in pairs.items():
+        *path, name = key.split(".")
+        inner = nested
+        for depth, part in enumerate(path, 1):
+            whole = ".".join(path[:depth])
+            if whole in pairs:
+                raise ValueError(f"--headset: {key!r} and {whole!r} cannot both be given")
+            inner = inner.setdefault(part, {})
+        inner[name] = value
+    return nested
 
 
 def _read(path: str) -> bytes:

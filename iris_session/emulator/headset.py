@@ -15,7 +15,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from anchors.lie import Array
 from anchors.pose import (
+    IDENTITY_POSE,
     PoseTuple,
     Quat,
     Vec3,
@@ -25,9 +27,11 @@ from anchors.pose import (
     quat_from_rotvec,
     quat_from_yaw,
     quat_mul,
+    quat_normalize,
     quat_rotate,
 )
 from iris_session.emulator.link import LinkModel
+from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
 
 #: Where the sheet lies in the demo scene: on the table in front of the people, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -39,11 +43,8 @@ MAX_VIEWPOINTS: Final = 256  # viewpoints whose systematic error is remembered
 class HeadsetModel(msgspec.Struct, frozen=True):
     """What kind of headset it is. The defaults are a good standalone headset of 2024.
 
-    Sheet noise: the model that the alignment benchmark fixes, after OpenCV's QR detector at 640x480 on a 16 cm sheet
-    (0.9 mm median error at 0.5 m, 4.4 mm at 1 m): standard deviation along the view `sheet_sigma_m +
-    sheet_sigma_m_per_m2 * d^2`, a third of it across; rotation `sheet_rotation_sigma_rad` at 0.5 m, growing with
-    distance, about each axis; half of the variance is the same for all observations from one viewpoint (calibration,
-    light, print). Tracking noise and drift: our assumption for inside-out tracking in a textured room.
+    `sheet`: the noise that docs/anchors.md fixes. Tracking noise and drift: our assumption for inside-out tracking in a
+    textured room.
     """
 
     rate_hz: float = 72.0
@@ -53,10 +54,7 @@ class HeadsetModel(msgspec.Struct, frozen=True):
     drift_rad_per_min: float = math.radians(0.02)
     tilt_sigma_rad: float = math.radians(0.2)
     detection_hz: float = 10.0
-    sheet_sigma_m: float = 0.0004
-    sheet_sigma_m_per_m2: float = 0.0044
-    sheet_rotation_sigma_rad: float = math.radians(0.3)
-    wrong_detections: float = 0.0  # share of detections that are nonsense
+    sheet: SheetNoise = SheetNoise()
     field_of_view_rad: float = math.radians(80.0)  # full cone of the cameras
     max_distance_m: float = 1.5
     max_incidence_rad: float = math.radians(65.0)
@@ -72,7 +70,8 @@ class Headset:
         self.tracking_epoch = 0
         self.worn = True
         self.late_samples = 0  # sampling instants that were passed over because nobody asked in time
-        self._biases: dict[tuple[int, int], list[float]] = {}
+        self._T_world_tracking0: PoseTuple = IDENTITY_POSE
+        self._biases: dict[tuple[int, int], Array] = {}
         self._period_ns = int(1e9 / model.rate_hz)
         self._detect_ns = int(1e9 / model.detection_hz)
         self._next_sample_ns = start_ns + int(self.rng.uniform(0.0, self._period_ns))
@@ -94,6 +93,17 @@ class Headset:
         self.tracking_epoch += 1
         self._biases.clear()
         self._new_frame(now_ns)
+
+    def bump(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
+        """The tracking frame jumps, and the headset does not notice: by `shift_m` (world), turned about the vertical
+        through `p_world`. Returns `T_new_old`: what was tracked at x is tracked at `T_new_old * x` from now on."""
+        old = self.T_world_tracking(now_ns)
+        turn = quat_from_yaw(yaw_rad)
+        arm = quat_rotate(turn, (old[0][0] - p_world[0], old[0][1] - p_world[1], old[0][2] - p_world[2]))
+        x, y, z = (p_world[i] + arm[i] + shift_m[i] for i in range(3))
+        self._T_world_tracking0 = ((x, y, z), quat_mul(turn, old[1]))
+        self._epoch_ns = now_ns  # the drift so far is in the new pose
+        return compose(inverse(self._T_world_tracking0), old)
 
     def track(self, T_world_device: PoseTuple, now_ns: int) -> PoseTuple:
         """`T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
@@ -148,20 +158,16 @@ class Headset:
         """`T_tracking_anchor` as detected from here, `None` when the sheet is not seen."""
         if not self.sees(T_world_head, T_world_anchor):
             return None
-        if self.rng.random() < self.model.wrong_detections:
-            return self._nonsense(T_world_anchor, now_ns)
-        d = distance(T_world_head[0], T_world_anchor[0])
-        noise = self._sheet_noise(viewpoint_id)
-        along = self.model.sheet_sigma_m + self.model.sheet_sigma_m_per_m2 * d * d
-        turn = self.model.sheet_rotation_sigma_rad * d / 0.5
-        e1 = _direction(T_world_head[0], T_world_anchor[0])
-        e2, e3 = _across(e1)
-        p = T_world_anchor[0]
-        seen_p = tuple(
-            p[i] + along * (noise[0] * e1[i] + (noise[1] * e2[i] + noise[2] * e3[i]) / 3.0) for i in range(3)
-        )
-        seen_q = quat_mul(T_world_anchor[1], quat_from_rotvec((turn * noise[3], turn * noise[4], turn * noise[5])))
-        return compose(inverse(self.T_world_tracking(now_ns)), ((seen_p[0], seen_p[1], seen_p[2]), seen_q))
+        noise, view = self.model.sheet, _direction(T_world_head[0], T_world_anchor[0])
+        p, q = np.array([T_world_anchor[0]]), np.array([T_world_anchor[1]])
+        if self.rng.random() < noise.wrong_share:
+            p[0], q[0] = noise.wrong(p[0], q[0], np.array(view), self.rng)
+        else:
+            d = distance(T_world_head[0], T_world_anchor[0])
+            units, scale_unit = self._sheet_units(viewpoint_id)
+            p, q = noise.seen(p, q, np.array((view, *_across(view))), d, units[None], scale_unit)
+        (x, y, z), (w, a, b, c) = p[0].tolist(), q[0].tolist()
+        return compose(inverse(self.T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -172,31 +178,22 @@ class Headset:
         tilted = quat_from_rotvec((self.model.tilt_sigma_rad * tilt[0], self.model.tilt_sigma_rad * tilt[1], 0.0))
         x, y = self.rng.uniform(-3.0, 3.0, 2).tolist()
         z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, as the run time likes
-        self._T_world_tracking0: PoseTuple = ((x, y, z), quat_mul(tilted, level))
+        self._T_world_tracking0 = ((x, y, z), quat_mul(tilted, level))
         way = self._normals(3)
         speed = self.model.drift_m_per_min / max(1e-9, math.hypot(*way))
         self._drift: Vec3 = (speed * way[0], speed * way[1], speed * way[2])
         self._yaw_drift = self.model.drift_rad_per_min * (1.0 if self.rng.random() < 0.5 else -1.0)
         self._epoch_ns = now_ns
 
-    def _sheet_noise(self, viewpoint_id: int) -> list[float]:
-        """Six unit normals, half of whose variance is that of the viewpoint."""
+    def _sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
+        """Six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of scale."""
         key = (self.tracking_epoch, viewpoint_id)
         if key not in self._biases:
             if len(self._biases) >= MAX_VIEWPOINTS:
                 del self._biases[next(iter(self._biases))]
-            self._biases[key] = self._normals(6)
-        half = math.sqrt(0.5)
-        return [half * a + half * b for a, b in zip(self._biases[key], self._normals(6), strict=True)]
-
-    def _nonsense(self, T_world_anchor: PoseTuple, now_ns: int) -> PoseTuple:
-        """A wrong detection: off by 0.25 m and 0.5 rad (standard deviation per axis)."""
-        n = self._normals(6)
-        off: PoseTuple = (
-            (0.25 * n[0], 0.25 * n[1], 0.25 * n[2]),
-            quat_from_rotvec((0.5 * n[3], 0.5 * n[4], 0.5 * n[5])),
-        )
-        return compose(inverse(self.T_world_tracking(now_ns)), compose(T_world_anchor, off))
+            self._biases[key] = self.rng.standard_normal(7)
+        common = self._biases[key]
+        return of_viewpoint(common[:6], self.rng.standard_normal(6)), float(common[6])
 
     def _normals(self, n: int) -> list[float]:
         return [float(x) for x in self.rng.standard_normal(n)]

@@ -1,8 +1,9 @@
 """One emulated person: a client, a headset, and a behaviour. Joins, looks at the sheet, takes a robot, works.
 
     join --> look --> acquire --> work --> done          any --> failed (`report.failed` says why)
-             ^---- the tracking frame jumped ----'
+             ^-- the alignment is void or in doubt --'
 
+The headset reports the sheet ten times a second whenever it is in view and the head keeps still, in every phase.
 `step` never waits and takes the time as an argument; the loop around it is in `runner`. All times are local monotonic
 nanoseconds unless named session time.
 """
@@ -14,32 +15,26 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any, Final
 
-from anchors.pose import (
-    PoseTuple,
-    Vec3,
-    apply,
-    compose,
-    distance,
-    inverse,
-    quat_angle,
-    quat_from_yaw,
-)
+from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, compose, inverse, quat_from_yaw
 from iris_session.client import Client, CurveKeys, SceneState
 from iris_session.emulator.behaviours import Behaviour, HandInput, Hands, make_behaviour
 from iris_session.emulator.clutching import Clutch
 from iris_session.emulator.display import Display
-from iris_session.emulator.headset import Headset, look_at
+from iris_session.emulator.gaze import Gaze
+from iris_session.emulator.headset import Headset
+from iris_session.emulator.judge import judge
 from iris_session.emulator.link import DelayLine
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.emulator.viewpoints import between, viewpoint_pose
-from iris_session.protocol.client_messages import Acquire, Sample
-from iris_session.protocol.common import Alignment
-from iris_session.protocol.names import AlignmentKind, DenialReason, Device, Role
-from iris_session.protocol.server_messages import Event, Handover, Notice, Reply
+from iris_session.emulator.viewpoints import between
+from iris_session.protocol.client_messages import Acquire, Observation, Sample
+from iris_session.protocol.common import Alignment, Pose
+from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, DenialReason, Device, Role
+from iris_session.protocol.server_messages import AlignmentAlarmed, Event, Handover, Notice, Reply
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
-MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
+REACT_S: Final = 0.5  # a hand that is suddenly shown elsewhere is brought back to where it should be
+ROUNDS: Final = 2  # about the sheet after an alarm; then what is in force evidently stands
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
 AGES_KEPT: Final = 4_000  # a minute of frames
 RETRY_S: Final = 1.0
@@ -90,24 +85,27 @@ class Person:
             on_event=self._on_event,
         )
         self.display = Display(self.client, spec.display_delay_s)
-        #: What is on its way, and the samples of the frame that is being taken: they travel together.
-        self._uplink: DelayLine[tuple[Sample, ...]] = DelayLine(spec.model.link, self.headset.rng)
+        #: What is on its way, and what was sampled and seen in the frame that is being taken: they travel together.
+        self._uplink: DelayLine[tuple[tuple[Sample, ...], Observation | None]]
+        self._uplink = DelayLine(spec.model.link, self.headset.rng)
         self._frame: list[Sample] = []
         self._ages: deque[float] = deque(maxlen=AGES_KEPT)
         self.started_ns = start_ns
         self._joined_ns = 0
+        self._now_ns = start_ns
         self._phase_ns = start_ns
         self._viewpoint = 0
-        self._viewpoints_used = 0
-        self._seen_here = 0
-        self._moved_ns = 0
+        self._looks_here = 0
         self._looked_ns = 0
+        self._rounds = 0
+        self._doubted: int | None = None  # version of the alignment that was found wrong
+        self._slip: tuple[PoseTuple, int] = (IDENTITY_POSE, 0)  # what a bump did to tracked hands, and when
         self._request: tuple[int, int] | None = None
         self._retry_ns = 0
         self._refused_because = ""
         self._clutches = {device: Clutch() for device in hands}
-        self._jumps = sorted(spec.recentre_at_s)
-        self.head = self._head_from = self._head_to = self._seat = look_at(spec.eye, spec.T_world_anchor[0])
+        self._planned = sorted([(s, "recentre") for s in spec.recentre_at_s] + [(s, "bump") for s in spec.bump_at_s])
+        self.gaze = Gaze(spec)
         yaw = math.atan2(spec.T_world_anchor[0][1] - spec.eye[1], spec.T_world_anchor[0][0] - spec.eye[0])
         for device in hands:
             x, y, z = HAND_AT_REST
@@ -128,9 +126,12 @@ class Person:
 
     def step(self, now_ns: int) -> None:
         """One round of the loop, after `client.poll`."""
-        for frame in self._uplink.pop(now_ns):
-            sent = self.client.send_samples(frame) if len(frame) > 1 else self.client.send(frame[0])
-            self.report.samples += len(frame) if sent else 0
+        self._now_ns = now_ns
+        for samples, seen in self._uplink.pop(now_ns):
+            sent = self.client.send_samples(samples) if len(samples) > 1 else self.client.send(samples[0])
+            self.report.samples += len(samples) if sent else 0
+            if seen is not None and self.client.ready:
+                self.client.send(seen)
         if not self.headset.sample_due(now_ns) or not self.client.ready:
             return
         if not self._joined_ns:
@@ -148,9 +149,22 @@ class Person:
         self.report.failed = why
         self._enter("failed", now_ns)
 
+    def disturb(self, kind: str, now_ns: int) -> None:
+        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice."""
+        if kind == "recentre":
+            self.headset.recentre(now_ns)
+            self.client.new_tracking_frame()
+            for clutch in self._clutches.values():
+                clutch.open()
+        else:
+            spec = self.spec
+            self._slip = (self.headset.bump(spec.bump_m, spec.bump_yaw_rad, self.gaze.pose[0], now_ns), now_ns)
+        self.report.disturbed_ns[kind] = self.client.session_now_ns()
+
     def finish_report(self) -> HeadsetReport:
         """Fills in what is computed at the end."""
         report, client = self.report, self.client
+        self._judge(self._now_ns)
         ages = sorted(self._ages)
         if ages:
             report.age_ms_p50 = ages[len(ages) // 2]
@@ -171,15 +185,38 @@ class Person:
         self._fall_back(now_ns)
         if self.report.phase == "look":
             self._look(now_ns)
-        elif self.report.phase == "acquire":
-            self._acquire(now_ns)
+        elif self.report.phase == "work":
+            self.gaze.work(now_ns)
         else:
-            self._move_head(self._seat, now_ns)
-        self._take(Device.HEAD, self.headset.track(self.head, now_ns))
+            self.gaze.rest(now_ns)
+        if self.report.phase == "acquire":
+            self._acquire(now_ns)
+        seen = self._detect(now_ns)
+        self._take(Device.HEAD, self.headset.track(self.gaze.pose, now_ns))
         if not self.observer:
             self._hands(now_ns)
-        self._uplink.push(tuple(self._frame), now_ns)
+        self._uplink.push((tuple(self._frame), seen), now_ns)
         self._frame.clear()
+
+    def _detect(self, now_ns: int) -> Observation | None:
+        """What the cameras make of the sheet, when it is in view."""
+        spec, headset = self.spec, self.headset
+        if not (headset.worn and self.gaze.still(now_ns) and headset.detection_due(now_ns)):
+            return None
+        self._looks_here += 1
+        seen = headset.observe(self.gaze.pose, spec.T_world_anchor, now_ns, self.gaze.viewpoint_id)
+        if seen is None:
+            return None
+        self.report.observations += 1
+        return Observation(
+            anchor_id=spec.anchor_id,
+            kind=AnchorKind.QR,
+            T_tracking_anchor=Pose(*seen),
+            capture_ns=self.client.session_now_ns(),
+            tracking_epoch=headset.tracking_epoch,
+            viewpoint_id=self.gaze.viewpoint_id,
+            size_m=spec.sheet_m,
+        )
 
     def _hands(self, now_ns: int) -> None:
         behaviour, alignment = self.behaviour, self._alignment()
@@ -208,7 +245,7 @@ class Person:
     def _send_hand(self, hand: HandInput, alignment: Alignment, now_ns: int) -> None:
         """The person puts the hand where the display shows it, so the displayed world decides what is tracked."""
         T_world_tracking: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
-        pose = self.headset.add_noise(compose(inverse(T_world_tracking), hand.pose_world))
+        pose = self.headset.add_noise(self._slipped(compose(inverse(T_world_tracking), hand.pose_world), now_ns))
         self._take(
             hand.device,
             pose,
@@ -216,6 +253,12 @@ class Person:
             clutch=self._clutches[hand.device].sample(hand, self.client, self.display.estop, now_ns),
             gripper=None if math.isnan(hand.gripper) else hand.gripper,
         )
+
+    def _slipped(self, T_tracking_hand: PoseTuple, now_ns: int) -> PoseTuple:
+        """After a bump the hand is tracked, and shown, elsewhere, until the person has brought it back."""
+        T_new_old, since_ns = self._slip
+        left = 1.0 - (now_ns - since_ns) / (REACT_S * 1e9)
+        return compose(between(IDENTITY_POSE, T_new_old, left), T_tracking_hand) if left > 0.0 else T_tracking_hand
 
     def _take(self, device: str, pose: PoseTuple, **fields: Any) -> None:
         """A sample of one device, for the frame that is being taken."""
@@ -229,35 +272,21 @@ class Person:
     def _look(self, now_ns: int) -> None:
         """Walks the head around the sheet; goes on when the session has accepted an alignment after the last look."""
         spec = self.spec
+        if self._viewpoint < spec.viewpoints and self._looks_here >= spec.observations_per_viewpoint:
+            self._looks_here = 0
+            self._viewpoint += 1
+            self._looked_ns = now_ns
         if self._viewpoint < spec.viewpoints:
-            self._move_head(viewpoint_pose(spec, self._viewpoint), now_ns)
-            if now_ns - self._moved_ns < MOVE_S * 1e9 or not self.headset.detection_due(now_ns):
-                return
-            seen = self.headset.observe(self.head, spec.T_world_anchor, now_ns, self._viewpoints_used)
-            self._seen_here += 1
-            if seen is not None:
-                self.report.observations += 1
-                self.client.observe(spec.anchor_id, seen, viewpoint_id=self._viewpoints_used, size_m=spec.sheet_m)
-            if self._seen_here >= spec.observations_per_viewpoint:
-                self._seen_here = 0
-                self._viewpoint += 1
-                self._viewpoints_used += 1
-                self._looked_ns = now_ns
+            self.gaze.look(self._viewpoint, now_ns)
         elif now_ns - self._looked_ns > SETTLE_S * 1e9:
-            if self._alignment() is None:
-                self._viewpoint = 0  # look again
+            self._rounds += 1
+            if self._alignment() is None or (self._in_doubt() and self._rounds < ROUNDS):
+                self._viewpoint = self._looks_here = 0  # look again
                 return
+            self._doubted = None
             self.report.aligned_s = (now_ns - self.started_ns) / 1e9
             self._judge(now_ns)
             self._enter("watch" if self.observer else "acquire", now_ns)
-
-    def _move_head(self, T_world_head: PoseTuple, now_ns: int) -> None:
-        """Moves the head towards a pose, within `MOVE_S` of first being asked to."""
-        if T_world_head != self._head_to:
-            self._head_from, self._head_to, self._moved_ns = self.head, T_world_head, now_ns
-        s = min(1.0, (now_ns - self._moved_ns) / (MOVE_S * 1e9))
-        fraction = s * s * (3.0 - 2.0 * s)
-        self.head = between(self._head_from, self._head_to, fraction)
 
     def _acquire(self, now_ns: int) -> None:
         if self.robots and self._have_robots():
@@ -289,9 +318,10 @@ class Person:
         return all(self.client.lease_version(robot) is not None for robot in self.robots)
 
     def _fall_back(self, now_ns: int) -> None:
-        """What was won can be lost: the alignment with a jump or a new session, the robot to somebody else."""
-        if self.report.phase in ("watch", "acquire", "work") and self._alignment() is None:
-            self._viewpoint = 0
+        """What was won can be lost: the alignment by a jump, an alarm or a new session, the robot to somebody else."""
+        lost = self._alignment() is None or self._in_doubt()
+        if lost and self.report.phase in ("watch", "acquire", "work"):
+            self._viewpoint = self._looks_here = self._rounds = 0
             self._enter("look", now_ns)
         elif self.report.phase == "work" and not self._have_robots():
             self._enter("acquire", now_ns)
@@ -299,12 +329,8 @@ class Person:
     def _scheduled(self, now_ns: int) -> None:
         """What was planned for this moment: the tracking frame jumps, the headset comes off and on."""
         elapsed = (now_ns - self._joined_ns) / 1e9
-        if self._jumps and elapsed >= self._jumps[0]:
-            self._jumps.pop(0)
-            self.headset.recentre(now_ns)
-            self.client.new_tracking_frame()
-            for clutch in self._clutches.values():
-                clutch.open()
+        if self._planned and elapsed >= self._planned[0][0]:
+            self.disturb(self._planned.pop(0)[1], now_ns)
         doff, don = self.spec.doff_at_s, self.spec.don_at_s
         worn = not (doff is not None and elapsed >= doff and (don is None or elapsed < don))
         if worn != self.headset.worn:
@@ -328,21 +354,14 @@ class Person:
             return None
         return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
 
+    def _in_doubt(self) -> bool:
+        """Whether an alarm was raised that no new alignment has answered yet."""
+        alignment = self.client.alignment
+        return self._doubted is not None and alignment is not None and alignment.version <= self._doubted
+
     def _judge(self, now_ns: int) -> None:
-        """Compares the accepted alignment with the truth."""
-        alignment = self._alignment()
-        if alignment is None:
-            return
-        believed: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
-        true = self.headset.T_world_tracking(now_ns)
-        wrong = compose(believed, inverse(true))  # where a point of the world is displayed
-        sheet = self.spec.T_world_anchor[0]
-        x, y, z = sheet
-        around: list[Vec3] = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1)]
-        self.report.alignment_error_mm = 1e3 * distance(apply(wrong, sheet), sheet)
-        self.report.alignment_error_1m_mm = 1e3 * max(distance(apply(wrong, p), p) for p in around)
-        self.report.alignment_error_deg = math.degrees(quat_angle(believed[1], true[1]))
-        self.report.stated_error_mm = 1e3 * alignment.error_at_anchor_m
+        """Compares the alignment in force with the truth."""
+        judge(self.report, self._alignment(), self.headset.T_world_tracking(now_ns), self.spec.T_world_anchor[0])
 
     def _rejected(self) -> dict[str, int]:
         total: dict[str, int] = {}
@@ -361,3 +380,12 @@ class Person:
             self.report.handovers += 1
         elif isinstance(event.body, Notice):
             self._refused_because = event.body.text
+        elif isinstance(event.body, AlignmentAlarmed) and event.body.participant == self.client.participant_id:
+            self._alarmed(event.body)
+
+    def _alarmed(self, alarm: AlignmentAlarmed) -> None:
+        """A jump voids the alignment, which is seen by itself. A sheet that was moved is for others to put right."""
+        alignment = self.client.alignment
+        if alarm.kind != AlarmKind.JUMP and not alarm.beside and alignment is not None:
+            self._doubted = alignment.version
+            self.report.alarms += 1

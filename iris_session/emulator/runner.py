@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from iris_session.client import ClientError, wait_any
@@ -27,12 +27,14 @@ def run_headsets(
     report: Report | None = None,
     stop: Callable[[], bool] = lambda: False,
     join_timeout_s: float = JOIN_TIMEOUT_S,
+    orders: Callable[[], Iterable[tuple[str, str]]] = tuple,
 ) -> list[HeadsetReport]:
     """Runs all `specs` until everyone with a task has finished, `seconds` have passed, or `stop()` is true.
 
-    `report`: called with each person's report at every change of phase and once a second. Returns the final reports,
-    in the order of `specs`. Raises nothing for a person who fails (whom no session let in within `join_timeout_s`,
-    for example): `HeadsetReport.failed` says why.
+    `report`: called with each person's report at every change of phase and once a second. `orders`: asked in every
+    round for what is done to whom (of `Person.disturb`, name). Returns the final reports, in the order of `specs`.
+    Raises nothing for a person who fails (whom no session let in within `join_timeout_s`, for example):
+    `HeadsetReport.failed` says why.
     """
     start = time.monotonic_ns()
     end = None if seconds is None else start + int(seconds * 1e9)
@@ -47,6 +49,10 @@ def run_headsets(
                 break
             for person in people:
                 _drive(person, person.client in ready)
+            for kind, name in orders():
+                for person in people:
+                    if person.spec.name == name and person.client.ready:
+                        person.disturb(kind, now)
             _give_up_joining(people, join_timeout_s, now)
             for person in people:
                 if report is not None:

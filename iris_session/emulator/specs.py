@@ -35,11 +35,14 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     `behaviour`: `observer`, or a name of `emulator.behaviours`; then `robot` is what they drive with `device`. A person
     who works with both hands has `hands` instead, and takes all their robots or none.
-    `eye`: where the head is while working [m, world]. `T_world_anchor`: where the sheet truly lies, which need not be
-    what the session believes. `recentre_at_s`, `doff_at_s`, `don_at_s`: seconds after joining at which the tracking
-    frame jumps, the headset is taken off, and put on again. `display_delay_s`: how old the picture is on purpose
-    (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts. `curve_server`,
-    `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
+    `eye`: where the head is while working [m, world]. `gaze`: what it looks at then, else at the sheet;
+    `glance_every_s`: how often it goes to the sheet for `glance_s` meanwhile, 0: never. `T_world_anchor`: where the
+    sheet truly lies, which need not be what the session believes. `recentre_at_s`, `bump_at_s`, `doff_at_s`,
+    `don_at_s`: seconds after joining at which the tracking frame jumps, jumps without the headset noticing (by `bump_m`
+    and `bump_yaw_rad` about the head), the headset is taken off, and put on again. `display_delay_s`: how old the
+    picture is on purpose (interpolation) plus the way to the headset. `identity_file`: keeps the identity across
+    restarts. `curve_server`, `curve_key`: files with the session's public CURVE key and our own secret one; needed off
+    loopback.
     """
 
     name: str
@@ -61,6 +64,12 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     observations_per_viewpoint: int = 6
     display_delay_s: float = 0.035
     recentre_at_s: tuple[float, ...] = ()
+    bump_at_s: tuple[float, ...] = ()
+    bump_m: Vec3 = (0.05, 0.0, 0.0)
+    bump_yaw_rad: float = 0.0
+    gaze: Vec3 | None = None
+    glance_every_s: float = 0.0
+    glance_s: float = 2.0
     doff_at_s: float | None = None
     don_at_s: float | None = None
     phase_timeout_s: float = 30.0
@@ -100,6 +109,9 @@ class HeadsetReport(msgspec.Struct, kw_only=True):
 
     `alignment_error_mm`: at the sheet; `alignment_error_1m_mm`: the worst of points 1 m around it. `age_ms_*`: from
     the end of the tick to the hands of this program. `rejected`: samples the session did not count, by reason.
+    `alignment_version`: that of the judged alignment. `T_true_shown`: what the session has at x is shown at
+    `T_true_shown * x` of the true world; none while not aligned. `disturbed_ns`: session time of the last of each kind.
+    `alarms`: of our alignment that were heard of, jumps not among them.
     """
 
     name: str
@@ -113,6 +125,10 @@ class HeadsetReport(msgspec.Struct, kw_only=True):
     alignment_error_1m_mm: float = float("nan")
     alignment_error_deg: float = float("nan")
     stated_error_mm: float = float("nan")
+    alignment_version: int = 0
+    T_true_shown: PoseTuple | None = None
+    disturbed_ns: dict[str, int] = {}
+    alarms: int = 0
     observations: int = 0
     samples: int = 0
     samples_not_sent: int = 0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
-from anchors.alignment import AlignmentEstimator
+from anchors.alignment import AlignmentEstimator, mirrored
 from anchors.pose import (
     PoseTuple,
     apply,
@@ -23,13 +24,15 @@ from anchors.pose import (
 )
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR, Headset, HeadsetModel, look_at
 from iris_session.emulator.link import DelayLine, LinkModel
+from iris_session.emulator.sheet_noise import SheetNoise
 from iris_session.emulator.specs import HeadsetSpec
 from iris_session.emulator.viewpoints import between, viewpoint_pose
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
 SHEET = DEFAULT_T_WORLD_ANCHOR
-STILL = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0)
+#: No drift, no wrong detections, no error of scale: what is left is the noise of single looks.
+STILL = HeadsetModel(drift_m_per_min=0.0, drift_rad_per_min=0.0, sheet=SheetNoise(wrong_share=0.0, scale=0.0))
 
 
 def above(d: float, aside: float = 0.2) -> PoseTuple:
@@ -68,6 +71,27 @@ def test_half_of_the_variance_is_the_same_for_one_viewpoint() -> None:
     headset = Headset(STILL, seed=2)
     within = np.mean([errors(headset, above(0.5), 40, viewpoint)[:, 0].var(ddof=1) for viewpoint in range(60)])
     assert within == pytest.approx(0.5 * 0.0015**2, rel=0.1)
+
+
+def test_the_error_of_scale_is_that_of_the_viewpoint() -> None:
+    scaled = msgspec.structs.replace(STILL, sheet=SheetNoise(wrong_share=0.0, scale=0.2))
+    headset = Headset(scaled, seed=2)
+    means = [errors(headset, above(0.5), 10, viewpoint)[:, 0] for viewpoint in range(400)]
+    assert np.std([m.mean() for m in means]) == pytest.approx(0.2 * 0.5, rel=0.1)
+    assert np.mean([m.var(ddof=1) for m in means]) == pytest.approx(0.5 * 0.0015**2, rel=0.1)
+
+
+def test_some_detections_are_wrong_and_half_of_those_mirrored() -> None:
+    headset, head = Headset(HeadsetModel(sheet=SheetNoise(wrong_share=1.0)), seed=2), above(0.5)
+    there = compose(inverse(headset.T_world_tracking(0)), head)[0]
+    back = []
+    for viewpoint in range(400):
+        seen = headset.observe(head, SHEET, 0, viewpoint)
+        assert seen is not None
+        right_way_round = compose(headset.T_world_tracking(0), mirrored(seen, there))
+        back.append(distance(right_way_round[0], SHEET[0]) + quat_angle(right_way_round[1], SHEET[1]))
+    assert sum(b < 1e-6 for b in back) == pytest.approx(200, abs=40)
+    assert sum(b > 0.05 for b in back) == pytest.approx(200, abs=40)
 
 
 def test_same_seed_same_readings() -> None:
@@ -113,6 +137,25 @@ def test_recentring_is_another_frame_and_epoch() -> None:
     assert distance(before[0], headset.T_world_tracking(SECOND)[0]) > 0.01
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.1])
+def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -> None:
+    headset, head = Headset(HeadsetModel(drift_m_per_min=0.06), seed=6), above(0.5)
+    before = headset.T_world_tracking(MINUTE)
+    tracked = compose(inverse(before), SHEET)
+    T_new_old = headset.bump((0.05, 0.0, 0.0), yaw, head[0], MINUTE)
+    after = headset.T_world_tracking(MINUTE)
+    assert headset.tracking_epoch == 0
+    now_at = compose(inverse(after), SHEET)
+    expected = compose(T_new_old, tracked)
+    assert distance(now_at[0], expected[0]) < 1e-9
+    assert quat_angle(now_at[1], expected[1]) < 1e-7
+    at_head = apply(after, apply(inverse(before), head[0]))
+    assert at_head == pytest.approx((head[0][0] + 0.05, head[0][1], head[0][2]))
+    assert quat_angle(before[1], after[1]) == pytest.approx(yaw, abs=1e-7)
+    later = headset.T_world_tracking(2 * MINUTE)
+    assert distance(after[0], later[0]) == pytest.approx(0.06), "it drifts on from there"
+
+
 def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
     headset = Headset(HeadsetModel(), seed=7)
     seen = [headset.track(above(0.5), SECOND) for _ in range(500)]
@@ -138,7 +181,8 @@ def aligned_error(seed: int, model: HeadsetModel) -> float:
         for _ in range(6):
             seen = headset.observe(viewpoint_pose(spec, viewpoint), SHEET, 0, viewpoint)
             assert seen is not None
-            estimator.add(DEFAULT_ANCHOR_ID, seen, 0, 0, viewpoint)
+            eye = compose(inverse(headset.T_world_tracking(0)), viewpoint_pose(spec, viewpoint))[0]
+            estimator.add(DEFAULT_ANCHOR_ID, seen, 0, 0, viewpoint, p_tracking_head=eye)
     estimate = estimator.estimate()
     wrong = compose(estimate.T_world_tracking, inverse(headset.T_world_tracking(0)))
     return distance(apply(wrong, SHEET[0]), SHEET[0])
@@ -146,7 +190,7 @@ def aligned_error(seed: int, model: HeadsetModel) -> float:
 
 @pytest.mark.parametrize("wrong", [0.0, 0.15])
 def test_what_it_sees_aligns_it(wrong: float) -> None:
-    worst = sorted(aligned_error(seed, HeadsetModel(wrong_detections=wrong)) for seed in range(20))
+    worst = sorted(aligned_error(seed, HeadsetModel(sheet=SheetNoise(wrong_share=wrong))) for seed in range(20))
     assert worst[18] < 0.005
 
 

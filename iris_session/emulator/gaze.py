@@ -1,0 +1,65 @@
+"""Where the head of an emulated person is and what it looks at: around the sheet, at the work, and glances in between.
+
+The cameras detect a sheet only while the head keeps still: every place where it comes to rest is a viewpoint.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from anchors.pose import PoseTuple
+from iris_session.emulator.headset import look_at
+from iris_session.emulator.specs import HeadsetSpec
+from iris_session.emulator.viewpoints import between, viewpoint_pose
+
+MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
+
+
+class Gaze:
+    """One head. `pose`: `T_world_head`. `viewpoint_id`: of the place it is at, or on its way to."""
+
+    def __init__(self, spec: HeadsetSpec) -> None:
+        self._spec = spec
+        self._seat = look_at(spec.eye, spec.T_world_anchor[0])
+        self._at_work = self._seat if spec.gaze is None else look_at(spec.eye, spec.gaze)
+        self.pose = self._from = self._to = self._seat
+        self.viewpoint_id = 0
+        self._moved_ns = 0
+        self._glances = 0
+        self._glance_ns: int | None = None  # when the next one begins, or the present one began
+
+    def look(self, index: int, now_ns: int) -> None:
+        """To the `index`-th place around the sheet."""
+        self._move(viewpoint_pose(self._spec, index), now_ns)
+
+    def rest(self, now_ns: int) -> None:
+        """At the seat, looking at the sheet."""
+        self._glance_ns = None
+        self._move(self._seat, now_ns)
+
+    def work(self, now_ns: int) -> None:
+        """At the seat, looking at the work; from time to time at the sheet, from another side every time."""
+        spec = self._spec
+        every_ns, glance_ns = int(spec.glance_every_s * 1e9), int((MOVE_S + spec.glance_s) * 1e9)
+        if self._glance_ns is None:
+            self._glance_ns = now_ns + every_ns
+        if every_ns <= 0 or now_ns < self._glance_ns:
+            self._move(self._at_work, now_ns)
+        elif now_ns < self._glance_ns + glance_ns:
+            self.look(self._glances % max(1, spec.viewpoints), now_ns)
+        else:
+            self._glances += 1
+            self._glance_ns = now_ns + every_ns
+            self._move(self._at_work, now_ns)
+
+    def still(self, now_ns: int) -> bool:
+        """Whether the head has come to rest."""
+        return now_ns - self._moved_ns >= MOVE_S * 1e9
+
+    def _move(self, to: PoseTuple, now_ns: int) -> None:
+        """Moves the head towards a pose, within `MOVE_S` of first being asked to."""
+        if to != self._to:
+            self._from, self._to, self._moved_ns = self.pose, to, now_ns
+            self.viewpoint_id += 1
+        s = min(1.0, (now_ns - self._moved_ns) / (MOVE_S * 1e9))
+        self.pose = between(self._from, self._to, s * s * (3.0 - 2.0 * s))

@@ -1,0 +1,56 @@
+"""Orders to emulated people from a file: read without waiting, whole lines only, and a word on what is none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from iris_session.emulator.orders import MAX_LINE, Orders
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
+def test_orders_come_in_order_and_whole(pipe: tuple[int, int]) -> None:
+    orders = Orders(pipe[0], ["ann", "bob b"])
+    assert orders() == []
+    os.write(pipe[1], b"bump ann\nrecentre bob b\nbu")
+    assert orders() == [("bump", "ann"), ("recentre", "bob b")]
+    assert orders() == []
+    os.write(pipe[1], b"mp ann\r\n\n")
+    assert orders() == [("bump", "ann")]
+
+
+def test_what_is_no_order_is_told(pipe: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+    orders = Orders(pipe[0], ["ann"])
+    os.write(pipe[1], b"kick ann\nbump eve\n\xff\n" + b"x" * (3 * MAX_LINE) + b"\nbump ann\n")
+    assert orders() == [("bump", "ann")]
+    said = capsys.readouterr().err
+    assert "kick ann" in said
+    assert "bump or recentre, then one of ann" in said
+    assert len(said) < 2000
+
+
+def test_a_line_without_end_is_not_kept(pipe: tuple[int, int]) -> None:
+    orders = Orders(pipe[0], ["ann"])
+    for _ in range(50):
+        os.write(pipe[1], b"x" * 4000)
+        assert orders() == []
+    assert len(orders._rest) <= MAX_LINE
+
+
+def test_an_end_of_the_file_is_the_end_of_orders() -> None:
+    reader, writer = os.pipe()
+    orders = Orders(reader, ["ann"])
+    os.write(writer, b"bump ann\n")
+    os.close(writer)
+    assert orders() == [("bump", "ann")]
+    assert orders() == []
+    os.close(reader)
