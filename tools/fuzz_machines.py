@@ -193,14 +193,19 @@ class FrontControl:
                 break
             except zmq.Again:
                 assert time.monotonic() < deadline, "the front takes nothing"
-                self.session.once()
+                self._turn()
         if self._sent % 50 == 0:
-            self.session.once()
+            self._turn()
             self._newest = max((self._newest, *(entry.connection for entry in self.session.entries)))
             self.session.entries.clear()
         if self._sent % self.BARRIER == 0:
             self._check()
         return accepted is not None
+
+    def _turn(self) -> None:
+        """The session goes on, with the same front: one that ended was replaced at once."""
+        self.session.once()
+        assert self.session.process.pid == self.process.pid, "the front ended"
 
     def _peer(self, i: int) -> zmq.Socket[bytes]:
         if i < len(self._peers) and self._lives[i] > 0:
@@ -229,7 +234,7 @@ class FrontControl:
         honest.inbox.clear()
         honest.send(ClockPing(self._sent))
         honest.wait_for(ClockPong)
-        assert self.session.process.alive
+        self._turn()
         rss = self.process.memory_info().rss
         self.peak = max(self.peak, rss)
         assert rss - self.base < self.session.config.limits.memory_bytes, f"the front holds {rss >> 20} MiB"

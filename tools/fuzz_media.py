@@ -74,9 +74,9 @@ class FrontMedia(FrontControl):
                 break
             except zmq.Again:  # it is being cut off, or the front is busy
                 assert time.monotonic() < deadline, "the front takes nothing"
-                self.session.once()
+                self._turn()
         if self._sent % 50 == 0:
-            self.session.once()
+            self._turn()
         if self._sent % self.BARRIER == 0:
             self._see()
             self._check()
@@ -115,7 +115,7 @@ class FrontMedia(FrontControl):
             assert time.monotonic() < deadline, "the honest viewer gets nothing"
             now_ns = self.session.process.link.now_ns
             self.session.process.publish_media(HONEST, b"picture", now_ns, 1, "bytes")
-            self.session.once()
+            self._turn()
         topic, head, frame = self._viewer.recv_multipart()
         assert topic.startswith(media_topic(self._honest.epoch, HONEST)), topic
         assert codec.decode_media_header(head).stream == HONEST
