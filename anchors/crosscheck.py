@@ -118,6 +118,11 @@ class CrossCheck:
             del self._looks[key]
         self._epochs.pop(headset, None)
 
+    def forget_thing(self, thing: str) -> None:
+        """It was moved."""
+        for key in [key for key in self._looks if key[1] == thing]:
+            del self._looks[key]
+
     def compare(
         self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()
     ) -> list[Disagreement]:

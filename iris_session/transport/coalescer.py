@@ -1,15 +1,30 @@
 """What waits for the authority: the newest sample per device, every edge, everything else in order. Bounded. Pure.
 
-A heartbeat and a tracking epoch replace the one before. Two samples of one device in a row are merged into the newer
-one when nothing but the motion differs. A change of clutch, gripper (open or closed), buttons, worn, tracked, targets
-or of any epoch is an edge: both samples stay, so the authority sees every press. Urgent messages have a lane of their
-own that is emptied first.
+A heartbeat and a tracking epoch replace the one before, and so does what the front measured (a proposal, an alarm of
+one kind at one anchor, a comparison with one other): only the newest counts. Two samples of one device in a row are
+merged into the newer one when nothing but the motion differs. A change of clutch, gripper (open or closed), buttons,
+worn, tracked, targets or of any epoch is an edge: both samples stay, so the authority sees every press. Urgent messages
+have a lane of their own that is emptied first; a jump of the tracking frame is one of them, for it stops an arm.
 """
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample, TrackingEpoch
-from iris_session.protocol.entries import HOST, URGENT, Audit, Entry, Join, Lost
+from iris_session.protocol.entries import (
+    HOST,
+    URGENT,
+    AlignmentAlarm,
+    AlignmentProposal,
+    Audit,
+    CrossChecked,
+    Entry,
+    EntryMessage,
+    Join,
+    Lost,
+)
+from iris_session.protocol.names import AlarmKind
 from iris_session.protocol.security import RemoveParticipant
 from iris_session.transport.config import FrontLimits
 from iris_session.transport.limiter import Drops
@@ -37,17 +52,30 @@ def _differs_by_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
     )
 
 
+def _replaces(message: EntryMessage) -> Hashable:
+    """What an entry takes the place of while it waits, `None` for nothing. Names of anchors are the session's own, so
+    there are few."""
+    if isinstance(message, Heartbeat | TrackingEpoch):
+        return type(message)
+    if isinstance(message, AlignmentProposal):
+        return AlignmentProposal, message.refused
+    if isinstance(message, AlignmentAlarm):
+        return AlignmentAlarm, message.kind, message.anchor_id
+    if isinstance(message, CrossChecked):
+        return CrossChecked, message.other
+    return None
+
+
 class _Lane:
     """What waits of one connection. Values are `(arrival number, entry)`."""
 
-    __slots__ = ("heartbeat", "messages", "samples", "tracking", "urgent")
+    __slots__ = ("messages", "newest", "samples", "urgent")
 
     def __init__(self) -> None:
         self.urgent: list[tuple[int, Entry]] = []
         self.messages: list[tuple[int, Entry]] = []
         self.samples: dict[str, list[tuple[int, Entry]]] = {}
-        self.heartbeat: tuple[int, Entry] | None = None
-        self.tracking: tuple[int, Entry] | None = None
+        self.newest: dict[Hashable, tuple[int, Entry]] = {}  # by what it replaces
 
 
 class Coalescer:
@@ -78,11 +106,11 @@ class Coalescer:
             return self._offer_removal(lane, item, message)
         if isinstance(message, URGENT):
             return self._offer_urgent(lane, item)
-        if isinstance(message, Heartbeat):
-            lane.heartbeat = item
-            return True
-        if isinstance(message, TrackingEpoch):
-            lane.tracking = item
+        if isinstance(message, AlignmentAlarm) and message.kind == AlarmKind.JUMP:
+            return self._offer_jump(lane, item)
+        replaces = _replaces(message)
+        if replaces is not None:
+            lane.newest[replaces] = item
             return True
         if len(lane.messages) >= self._limits.pending_messages:
             lost = "audit_lost" if isinstance(message, Audit) else "messages_pending"
@@ -128,7 +156,14 @@ class Coalescer:
             lane.messages = []
         if isinstance(message, Lost | Bye):
             lane.samples.clear()
-            lane.heartbeat = lane.tracking = None
+            lane.newest.clear()
+        lane.urgent.append(item)
+        self.urgent = True
+        return True
+
+    def _offer_jump(self, lane: _Lane, item: tuple[int, Entry]) -> bool:
+        """Never dropped for want of room: of several the newest voids all that was proposed before."""
+        lane.urgent = [one for one in lane.urgent if not isinstance(one[1].message, AlignmentAlarm)]
         lane.urgent.append(item)
         self.urgent = True
         return True
@@ -174,7 +209,7 @@ class Coalescer:
         items = lane.messages
         for waiting in lane.samples.values():
             items += waiting
-        items += [item for item in (lane.heartbeat, lane.tracking) if item is not None]
+        items += lane.newest.values()
         return items
 
     def forget(self, connection: int) -> None:

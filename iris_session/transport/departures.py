@@ -10,7 +10,7 @@ from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport.admission import Admission
-from iris_session.transport.alignment_desk import AlignmentDesk
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.clients import ClientTable, Connection, Outbox
 from iris_session.transport.coalescer import Coalescer
 from iris_session.transport.config import MILLISECOND
@@ -37,7 +37,7 @@ class Departures:
         coalescer: Coalescer,
         drops: Drops,
         status: StatusDesk,
-        desks: dict[int, AlignmentDesk],
+        anchoring: Anchoring,
         session_ns: Callable[[], int],
         doors: Doors,
     ) -> None:
@@ -49,7 +49,7 @@ class Departures:
         self._coalescer = coalescer
         self._drops = drops
         self._status = status
-        self._desks = desks
+        self._anchoring = anchoring
         self._session_ns = session_ns
         self._closed: list[tuple[int, int]] = []  # descriptors of closed TCP connections, each with its deadline
 
@@ -119,5 +119,5 @@ class Departures:
         self._clients.remove(connection)
         if reason in STILL_THERE:
             self._clients.give_up(connection)
-        self._desks.pop(connection.number, None)
+        self._anchoring.forget(connection.number)
         self._drops.forget(connection.number)

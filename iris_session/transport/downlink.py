@@ -19,6 +19,7 @@ from iris_session.protocol.server_messages import (
 from iris_session.protocol.steps import Outgoing
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.clients import ClientTable, Connection, Outbox, encode_message
 from iris_session.transport.limiter import Drops
 from iris_session.transport.revocation import Revocation
@@ -48,6 +49,7 @@ class Downlink:
         session_ns: Callable[[], int],
         forget: Callable[[Connection, str], None],
         revocation: Revocation,
+        anchoring: Anchoring,
     ) -> None:
         self._socket = socket
         self._clients = clients
@@ -58,6 +60,7 @@ class Downlink:
         self._session_ns = session_ns
         self._forget = forget
         self._revocation = revocation
+        self._anchoring = anchoring
         self.heard_ns = 0
         self.acknowledged = 0
         self.report = b""
@@ -118,6 +121,7 @@ class Downlink:
                 self._answer(outgoing)
         for event in decided.events:
             self.broadcast(event)
+            self._anchoring.heard(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.left(event.body.participant)
         for outgoing in snapshots:
@@ -142,6 +146,7 @@ class Downlink:
             return
         if isinstance(message, Snapshot):
             # What only the front knows: the scene, and the poses of the newest state frame.
+            self._anchoring.shown(message.participants)
             state_seq, poses = self._publisher.keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(

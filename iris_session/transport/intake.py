@@ -30,7 +30,7 @@ from iris_session.protocol.security import Pair
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
 from iris_session.transport.admission import Admission
-from iris_session.transport.alignment_desk import AlignmentDesk
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer, Route
 from iris_session.transport.coalescer import Coalescer
@@ -87,6 +87,7 @@ class Intake:
         pairing: PairingDesk,
         audit: AuditTrail,
         doors: Doors,
+        anchoring: Anchoring,
     ) -> None:
         self._config = config
         self._clients = clients
@@ -100,10 +101,8 @@ class Intake:
         self._pairing = pairing
         self._audit = audit
         self._doors = doors
+        self._anchoring = anchoring
         self._stranger_faults = TokenBucket(_STRANGER_FAULTS, _STRANGER_FAULTS)
-        self._anchors = {name: (pose.p, pose.q) for name, pose in config.anchors.items()}
-        #: Connections that have observations to estimate from.
-        self.desks: dict[int, AlignmentDesk] = {}
         #: Connections replaced by a new hello or peer on the same route; the loop takes leave of them.
         self.replaced: list[Connection] = []
 
@@ -214,8 +213,7 @@ class Intake:
             self._status.reported(connection.number, message, now_ns)
             return
         if isinstance(message, Sample):
-            self._raw.put(connection.number, now_ns, message)
-            self._status.sampled(connection.number, message, now_ns)
+            self._look_at(connection, message, now_ns)
         elif isinstance(message, Samples):
             self._samples(connection, envelope.connection_epoch, message, now_ns)
             return
@@ -224,7 +222,7 @@ class Intake:
             return
         elif isinstance(message, Observation):
             self._raw.put(connection.number, now_ns, message)
-            self._observe(connection, message)
+            self._anchoring.observed(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
@@ -245,12 +243,17 @@ class Intake:
         """Each within the rate of single samples."""
         for sample in samples.samples:
             if connection.rates.allow(Sample, now_ns):
-                self._raw.put(connection.number, now_ns, sample)
-                self._status.sampled(connection.number, sample, now_ns)
+                self._look_at(connection, sample, now_ns)
                 self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
             else:
                 self._drops.count(FaultCode.RATE, connection.number)
                 self._flooded(connection, "sample", now_ns)
+
+    def _look_at(self, connection: Connection, sample: Sample, now_ns: int) -> None:
+        """What is done with every sample as it came, before samples are coalesced."""
+        self._raw.put(connection.number, now_ns, sample)
+        self._status.sampled(connection.number, sample, now_ns)
+        self._anchoring.sampled(connection, sample, now_ns)
 
     def _not_taken(self, peer: Peer, connection: Connection | None, now_ns: int, what: str = BEFORE_HELLO) -> None:
         """Counts towards being cut off."""
@@ -265,15 +268,6 @@ class Intake:
         connection.flood_last_ns = now_ns
         if now_ns - connection.flood_since_ns > FLOOD_NS:
             self._doors.flood(connection.address[0], tag, now_ns, connection)
-
-    def _observe(self, connection: Connection, observation: Observation) -> None:
-        desk = self.desks.get(connection.number)
-        if desk is None:
-            desk = self.desks[connection.number] = AlignmentDesk(
-                self._anchors, self._config.proposal_period_ns, self._config.anchor_sizes
-            )
-        if not desk.observe(observation):
-            self._drops.count("observation_unusable", connection.number)
 
     def _unreadable(self, route: Route, peer: Peer, error: ProtocolError, now_ns: int) -> None:
         """Before `hello` this is the answer to it, so it is a refusal."""

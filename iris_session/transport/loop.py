@@ -11,11 +11,11 @@ import time
 
 import zmq
 
-from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.announce import Facts, announce
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Outbox, Peer
@@ -99,6 +99,8 @@ class Front:
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
         self._media = self._make_media()
         self._status.media_row = self._media.row
+        anchoring = Anchoring(config, self._clients, self._coalescer.offer, self._drops)
+        self._status.alignment_report = anchoring.report
         memory = MemoryWatch(config.limits.memory_bytes, lambda: doors.shed(self._give_way), self._shed)
         self._services += [self._keyring, self._status, self._media, doors, memory]
         self._intake = Intake(
@@ -114,6 +116,7 @@ class Front:
             self._pairing,
             self._audit,
             doors,
+            anchoring,
         )
         departures = self._departures = Departures(
             sockets.control.monitor,
@@ -123,7 +126,7 @@ class Front:
             self._coalescer,
             self._drops,
             self._status,
-            self._intake.desks,
+            anchoring,
             self._session_ns,
             doors,
         )
@@ -151,6 +154,7 @@ class Front:
             self._session_ns,
             departures.forget,
             revocation,
+            anchoring,
         )
         self.ended = ""
         #: The link closed without a word: its process ends, or has ended already.
@@ -168,7 +172,7 @@ class Front:
             self._drops,
             self._publisher,
         )
-        self._services += self._announced()
+        self._services += [*self._announced(), anchoring]
         self._next_housekeeping_ns = self._next_collect_ns = 0
 
     def _announced(self) -> list[Service]:
@@ -301,23 +305,11 @@ class Front:
         for service in self._services:
             service.turn(now_ns)
         self._publisher.tend()
-        self._propose(now_ns)
         self._watch_stall(now_ns)
         self._uplink.turn(now_ns)
         if idle and now_ns >= self._next_collect_ns:
             self._next_collect_ns = now_ns + COLLECT_NS
             gc.collect()
-
-    def _propose(self, now_ns: int) -> None:
-        """At most one estimate a pass: it takes up to milliseconds, and state waits meanwhile. Each in turn."""
-        desks = self._intake.desks
-        for number, desk in desks.items():
-            if desk.due(now_ns):
-                desks[number] = desks.pop(number)
-                proposal = desk.propose(now_ns)
-                if proposal is not None:
-                    self._coalescer.offer(Entry(number, number, now_ns, proposal))
-                return
 
     def _watch_end(self) -> None:
         """The link closes with the session's process, however that ended, or with the session."""

@@ -19,6 +19,7 @@ from typing import Final
 import msgspec
 import zmq
 
+from iris_session.protocol.common import Pose
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
 from iris_session.transport.media_source import MediaSource
@@ -120,6 +121,10 @@ class FrontProcess:
         """Another scene, for this front and its successors."""
         self._scene = scene
         self.link.send_scene(scene)
+
+    def set_anchors(self, anchors: dict[str, Pose]) -> None:
+        """Where the anchors are now (`T_world_anchor`), for the successors of this front, which hears it by events."""
+        self._config = msgspec.structs.replace(self._config, anchors=anchors)
 
     def wait_ready(self, timeout_s: float) -> Ports:
         """Waits for `Ready`. Raises `FrontError` when the front fails, dies or says nothing for `timeout_s`."""

@@ -15,6 +15,7 @@ import msgspec
 
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.status import (
+    AlignmentReport,
     ClientReport,
     GetStatus,
     MediaStreamReport,
@@ -84,6 +85,10 @@ class StatusDesk:
         self._tell = tell
         #: What a participant gets of media, as fields of its row.
         self.media_row: Callable[[int], dict[str, Any]] = lambda _number: {}
+        #: The authority's half of a participant's alignment report with that of the front: connection, half, now.
+        self.alignment_report: Callable[[int, AlignmentReport | None, int], AlignmentReport | None] = (
+            lambda _number, half, _now_ns: half
+        )
         self._lines: dict[int, _Line] = {}
         self._lost: dict[str, str] = {}  # participant id -> why its connection was lost
         self._rolled_ns = 0
@@ -195,6 +200,7 @@ class StatusDesk:
             capture_to_receive=quantiles(line.delays_ns),
             drops=self._drops.by_connection.get(connection.number, 0),
             reported=report is not None,
+            alignment_report=self.alignment_report(connection.number, row.alignment_report, now_ns),
             **measured,
             **self.media_row(connection.number),
         )

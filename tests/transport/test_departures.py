@@ -14,10 +14,11 @@ from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import Message, ProtocolFault
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Outbox, Peer, Route
 from iris_session.transport.coalescer import Coalescer
-from iris_session.transport.config import FrontLimits
+from iris_session.transport.config import FrontConfig, FrontLimits
 from iris_session.transport.departures import LAST_WORDS_NS, Departures
 from iris_session.transport.doors import Doors
 from iris_session.transport.limiter import Drops
@@ -45,7 +46,7 @@ class Door:
             self.coalescer,
             self.drops,
             self,  # type: ignore[arg-type]
-            {},
+            Anchoring(FrontConfig(), self.clients, self.coalescer.offer, self.drops),
             lambda: self.now_ns,
             Doors(self.clients, self.drops, AuditTrail(self.coalescer.offer), FrontLimits()),
         )

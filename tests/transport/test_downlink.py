@@ -11,8 +11,9 @@ import zmq
 
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, StateHeader
 from iris_session.transport import link_messages as link
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.clients import ClientTable
-from iris_session.transport.config import SceneInfo
+from iris_session.transport.config import FrontConfig, SceneInfo
 from iris_session.transport.downlink import Downlink
 from iris_session.transport.limiter import Drops
 from iris_session.transport.state_publisher import StatePublisher
@@ -40,6 +41,7 @@ class Far:
             lambda: 77,
             lambda connection: None,
             unused,  # type: ignore[arg-type]
+            Anchoring(FrontConfig(), ClientTable(), lambda entry: True, self.drops),
         )
 
     def send_multipart(self, frames: tuple[bytes, ...]) -> None:

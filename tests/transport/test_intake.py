@@ -23,6 +23,7 @@ from iris_session.protocol.server_messages import Message, ProtocolFault, Refuse
 from iris_session.protocol.steps import Admitted
 from iris_session.transport import FrontConfig, FrontLimits, Ports
 from iris_session.transport.admission import Admission
+from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Outbox, Peer
 from iris_session.transport.coalescer import Coalescer
@@ -74,6 +75,7 @@ class Desk:
             pairing,
             audit,
             doors,
+            Anchoring(config, self.clients, self.coalescer.offer, self.drops),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
