@@ -205,6 +205,7 @@ class Front:
             self._drops,
             self._status.client_report,
             self._tokens.revoked,
+            lambda: self._publisher.frames,
             adapt=self._config.adapt_media,
         )
 

@@ -24,6 +24,8 @@ from iris_session.transport.media_hub import Listener, StreamFacts, Tally
 
 LOOK_NS: Final = 250 * MILLISECOND
 MBIT: Final = 125_000.0
+#: State frames between two reports of a client, of which some should have come: a third of a second.
+MANY_FRAMES: Final = 20
 #: Roles that may hand in frames from elsewhere.
 SOURCES: Final = frozenset({Role.CAMERA, Role.SOURCE})
 
@@ -33,6 +35,7 @@ class _Told:
 
     def __init__(self) -> None:
         self.report: ClientReport | None = None
+        self.frames = 0  # that the state socket had sent when it came
         self.tally = Tally()
         self.grant = Grant({})
         self.wanted: list[str] = []
@@ -44,7 +47,8 @@ class _Told:
 class MediaDesk:
     """A `Service`. `adapt`: slow links get less.
 
-    `report_of(connection, now_ns)`: the newest of a client; `revoked(key)`: it may do nothing.
+    `report_of(connection, now_ns)`: the newest of a client; `revoked(key)`: it may do nothing; `state_frames`: sent by
+    the state socket so far.
     """
 
     def __init__(
@@ -56,6 +60,7 @@ class MediaDesk:
         drops: Drops,
         report_of: Callable[[int, int], ClientReport | None],
         revoked: Callable[[str], bool],
+        state_frames: Callable[[], int],
         *,
         adapt: bool = True,
     ) -> None:
@@ -66,6 +71,7 @@ class MediaDesk:
         self._drops = drops
         self._report_of = report_of
         self._revoked = revoked
+        self._state_frames = state_frames
         self._controller = BudgetController() if adapt else None
         self._told: dict[int, _Told] = {}
         self._facts: dict[str, StreamFacts] = {}
@@ -152,14 +158,21 @@ class MediaDesk:
         told.bytes_per_s = (tally.bytes - before.bytes) * 1e9 / LOOK_NS
         report, fresh = self._report_of(number, now_ns), None
         if report is not None and report is not told.report:
-            expected = report.delivered + report.missed
-            fresh = Report(report.age_ms_p50, report.missed / expected if expected else 0.0)
+            fresh = Report(report.age_ms_p50, self._missed_share(told, report))
         told.report = report or told.report
         limit = max(0.0, told.report.media_limit_mbit_per_s) * MBIT if told.report is not None else 0.0
         measure = Measure(fresh, tally.taken - before.taken, tally.due - before.due, limit)
         rates = {stream: self._facts[stream].rates for stream in told.wanted if stream in self._facts}
         if self._controller is not None:
             told.grant = self._controller.update(number, measure, rates, now_ns)
+
+    def _missed_share(self, told: _Told, report: ClientReport) -> float:
+        """Of state. Who was delivered nothing at all cannot know what was missed, but we know whether we sent it."""
+        before, told.frames = told.frames, self._state_frames()
+        expected = report.delivered + report.missed
+        if not expected:
+            return 1.0 if told.report is not None and told.frames - before >= MANY_FRAMES else 0.0
+        return report.missed / expected
 
     def _publish(self) -> None:
         listeners = {

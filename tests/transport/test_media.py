@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zmq
 
@@ -18,7 +19,7 @@ from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
 from iris_session.transport import FrontLimits
 from iris_session.transport.media_source import MediaSource
-from tests.transport.harness import FrontSession, RawClient
+from tests.transport.harness import N_BODIES, FrontSession, RawClient
 from tests.transport.lab import Lab, Open
 
 Curve = tuple[bytes, bytes, bytes]
@@ -248,6 +249,30 @@ def test_a_client_may_ask_for_less(media: Stage) -> None:
 
     media.until(asks, "none")
     assert ann.got(DeliveryBudget)[-1].reason == "the client asked for no more"
+
+
+def test_who_gets_no_state_at_all_gets_less_media(media: Stage) -> None:
+    """A client that was delivered nothing knows of nothing missed; the front knows what it sent."""
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 100, "media")
+    poses = np.zeros((N_BODIES, 7))
+    poses[:, 3] = 1.0
+
+    rounds = 0
+
+    def starves() -> bool:
+        nonlocal rounds
+        viewer.take()
+        for _ in range(30):
+            session.send_state(poses)
+        rounds += 1
+        ann.send(ClientReport(1.0, 1.0, 60) if rounds < 100 else ClientReport(0.0, 0.0, 0))
+        time.sleep(0.01)
+        return any("of state was missed" in told.reason for told in ann.got(DeliveryBudget))
+
+    media.until(starves, "less, for want of state")
 
 
 def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
