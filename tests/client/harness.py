@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.protocol.client_messages import Control
+from iris_session.protocol.client_messages import Control, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import HOST, Entry, Lost
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo, StateHeader
@@ -64,6 +64,11 @@ class LiveSession:
     def host(self, message: object) -> None:
         """The owner of the session does something."""
         self._inject.append(Entry(HOST, HOST, self.now_ns, message))  # type: ignore[arg-type]
+
+    def say(self, message: object) -> None:
+        """An entry of the front about the first participant who sent a sample."""
+        joined = next(entry for entry in self.entries if isinstance(entry.message, Sample))
+        self._inject.append(Entry(joined.connection, joined.connection, self.now_ns, message))  # type: ignore[arg-type]
 
     def reset(self) -> None:
         self.host(Control(0, "reset"))

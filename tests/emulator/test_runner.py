@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 
 import msgspec
+import numpy as np
 import pytest
 
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
@@ -19,6 +20,7 @@ from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.protocol.client_messages import Observation, Sample, TrackingEpoch
 from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import AlignmentAlarm
 from iris_session.protocol.names import Device
 from tests.client.harness import LiveSession
 
@@ -90,6 +92,77 @@ def test_a_jump_of_the_tracking_frame_is_told_and_measured_anew(session: LiveSes
     epochs = [e.message.tracking_epoch for e in session.kinds(Observation)]  # type: ignore[union-attr]
     assert epochs == sorted(epochs)
     assert set(epochs) == {0, 1}
+
+
+def test_what_is_seen_travels_with_the_head_pose_of_that_moment(session: LiveSession) -> None:
+    run_until(session, [HeadsetSpec(name="eve", recentre_at_s=(1.5,), **QUICK)], "watch")
+    heads = np.array([s.capture_ns for s in samples_of(session, Device.HEAD)])
+    epochs = [s.tracking_epoch for s in samples_of(session, Device.HEAD)]
+    seen = session.kinds(Observation)
+    assert {e.message.tracking_epoch for e in seen} == {0, 1}  # type: ignore[union-attr]
+    for entry in seen:
+        away_ns = np.abs(heads - entry.message.capture_ns)  # type: ignore[union-attr]
+        assert away_ns.min() < 50_000_000, "of several samples between two steps the newest is kept"
+        assert epochs[int(away_ns.argmin())] == entry.message.tracking_epoch  # type: ignore[union-attr]
+
+
+def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSession) -> None:
+    """An idle hand: it jumps with the tracking frame, and returns to where it is shown in its place. Nobody is told."""
+    spec = HeadsetSpec(name="ann", behaviour="idle", robot="left", bump_m=(0.0, 0.0, 0.05), **QUICK)
+    phase: list[str] = [""]
+    bumped_ns: list[int] = []
+
+    def orders() -> list[tuple[str, str]]:
+        if phase[0] != "work" or bumped_ns:
+            return []
+        bumped_ns.append(session.now_ns)
+        return [("bump", "ann")]
+
+    def over() -> bool:
+        return bool(bumped_ns) and session.now_ns - bumped_ns[0] > 1_500_000_000
+
+    def note(report: HeadsetReport) -> None:
+        phase[0] = report.phase
+
+    (report,) = run_headsets(session.address, [spec], 40.0, note, over, orders=orders)
+    assert over(), report
+    assert not session.kinds(TrackingEpoch)
+    at = report.disturbed_ns["bump"]
+    hand = [s for s in samples_of(session, Device.CONTROLLER_RIGHT) if s.capture_ns > at - 200_000_000]
+    up = [s.pose.p[2] for s in hand if s.pose is not None]  # the frame rose: what is tracked sank
+    before = np.mean([z for s, z in zip(hand, up, strict=True) if s.capture_ns < at])
+    assert min(up) - before == pytest.approx(-0.05, abs=0.008)
+    assert up[-1] - before == pytest.approx(0.0, abs=0.003)
+
+
+@pytest.mark.parametrize("beside", [(), ("shelf",)], ids=["headset", "sheet"])
+def test_who_hears_of_an_alarm_looks_at_the_sheet_before_going_on(session: LiveSession, beside: tuple[str]) -> None:
+    """Unless it is the sheet that was moved."""
+    spec = HeadsetSpec(name="ann", behaviour="wander", robot="left", viewpoints=2, observations_per_viewpoint=4)
+    began: list[str] = []
+    alarmed_ns: list[int] = []
+
+    def note(report: HeadsetReport) -> None:
+        if not began or began[-1] != report.phase:
+            began.append(report.phase)
+        if report.phase == "work" and not alarmed_ns:
+            alarmed_ns.append(session.now_ns)
+            session.say(AlignmentAlarm("changed", 0, DEFAULT_ANCHOR_ID, 0.012, 0, beside))
+
+    def over() -> bool:
+        if beside:
+            return bool(alarmed_ns) and session.now_ns - alarmed_ns[0] > 1_500_000_000
+        return began.count("work") == 2
+
+    (report,) = run_headsets(session.address, [spec], 40.0, note, over)
+    assert over(), report
+    phases = [phase for phase in began if phase in ("look", "work")]
+    assert phases == (["look", "work"] if beside else ["look", "work", "look", "work"])
+    assert report.alarms == (0 if beside else 1)
+
+
+def samples_of(session: LiveSession, device: str) -> list[Sample]:
+    return [e.message for e in session.entries if isinstance(e.message, Sample) and e.message.device == device]
 
 
 def test_a_killed_front_costs_a_reconnect_and_nothing_else(session: LiveSession) -> None:
