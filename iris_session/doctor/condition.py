@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from iris_session.doctor import headsets
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role
@@ -59,11 +60,18 @@ def conditions(report: StatusReport, own_id: str = "") -> list[Finding]:
     Of a session that stands still only what does not change meanwhile: nobody keeps up with it.
     """
     people = tuple(p for p in report.participants if p.id != own_id)
-    stepping = [robots(report.robots, people), clients(people), age(people, report), ticks(report)]
+    stepping = [
+        robots(report.robots, people),
+        clients(people),
+        age(people, report),
+        ticks(report),
+        headsets.media(people),
+    ]
     first = session(report)
     return [
         first,
         alignment(people),
+        *headsets.headsets(people, report),
         leases(people, report.robots),
         *([] if first.failed and not report.estop else stepping),
         recorder(report),

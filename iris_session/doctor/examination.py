@@ -24,7 +24,8 @@ LOCAL: Final = "127.0.0.1:7721"
 DOOR: Final = ("server_key", "key", "role", "join")
 ARRIVAL: Final = ("clock", "state")
 CONDITION: Final = (
-    "session", "alignment", "leases", "robots", "clients", "age", "ticks", "recorder", "disk", "drops",
+    "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
+    "age", "ticks", "media", "recorder", "disk", "drops",
 )  # fmt: skip
 
 #: As a person asks: is there a way, am I let in, does anything come, how is the session?

@@ -16,8 +16,8 @@ from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.discovery import DISCOVERY_PORT
 
 CONTROL_PORT: Final = 7721
-#: TCP ports of a session, from the control port: introduction, control, state, media, assets, web.
-BLOCK: Final = {-1: "introduction", 0: "control", 1: "state", 2: "media", 3: "assets", 4: "web"}
+#: TCP ports of a session, from the control port.
+BLOCK: Final = {-1: "introduction", 0: "control", 1: "state", 2: "media", 3: "assets", 4: "web", 5: "media ingest"}
 CLOCK_SOURCE: Final = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 SLOW_CLOCKS: Final = frozenset({"hpet", "acpi_pm", "jiffies", "pit"})
 

@@ -10,6 +10,7 @@ import pytest
 from iris_session.doctor import machine
 from iris_session.doctor.findings import Findings, failed, ok, warning
 from iris_session.keys import KeyHome
+from iris_session.runtime.processes import INGEST_OFFSET, MEDIA_OFFSET
 
 
 def test_every_check_says_something(tmp_path: Path) -> None:
@@ -37,6 +38,21 @@ def test_ports_name_who_has_them() -> None:
     assert found.state == "warning"
     assert f"{port} (control)" in found.text
     assert "python" in found.text or "pytest" in found.text
+
+
+def test_every_port_of_a_session_is_looked_at() -> None:
+    """As the session lays them out: introduction below control, media ingest above the web."""
+    assert {machine.CONTROL_PORT + offset: name for offset, name in machine.BLOCK.items()} == {
+        7720: "introduction",
+        7721: "control",
+        7722: "state",
+        7723: "media",
+        7724: "assets",
+        7725: "web",
+        7726: "media ingest",
+    }
+    assert machine.BLOCK[1 + MEDIA_OFFSET] == "media"
+    assert machine.BLOCK[1 + INGEST_OFFSET] == "media ingest"
 
 
 def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
