@@ -1,14 +1,22 @@
-"""`iris-session anchors`: print a sheet, and find out where a camera stands."""
+"""`iris-session anchors`: print a sheet, an anchors file to edit, and where a camera stands.
+
+What concerns sessions lies in `anchors_live` (one that runs) and `anchors_solve` (a recorded one).
+"""
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import CommandError, add_json, print_json
+from iris_session.cli.anchors_live import register_live
+from iris_session.cli.anchors_solve import register_solve
+from iris_session.cli.common import CommandError, add_json, open_scene, print_json
+from iris_session.cli.poses import pose
+
+if TYPE_CHECKING:
+    from anchors.pose import PoseTuple
 
 _UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
@@ -16,16 +24,24 @@ _UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "anchors",
-        help="print anchor sheets, calibrate cameras",
-        description="Sheets that headsets and cameras find in the room, and where cameras stand.",
+        help="print anchor sheets, align headsets, calibrate cameras",
+        description="Sheets that headsets and cameras find in the room, how well headsets are aligned to them, and "
+        "where cameras stand.",
         epilog="examples:\n"
         "  iris-session anchors print --size 160mm --id table --out table.pdf\n"
+        "  iris-session anchors example > anchors.toml\n"
+        "  iris-session anchors status --watch\n"
+        "  iris-session anchors align start ann\n"
+        "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml\n"
         "  iris-session anchors calibrate-camera pictures --sheet table=160mm --poses poses.csv\n"
         "  iris-session anchors calibrate-camera pictures --sheet table=160mm --at table=0,-0.45,0,1,0,0,0",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
+    _register_example(actions)
+    register_live(actions)
+    register_solve(actions)
     _register_calibrate(actions)
 
 
@@ -42,6 +58,24 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
     add_json(one)
     one.set_defaults(run=run_print)
+
+
+def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "example",
+        help="an anchors file to edit, for `serve --anchors`",
+        description="Prints the anchors of a scene as a file ready to edit. Pass it as `serve --anchors FILE`.",
+        epilog="examples:\n  iris-session anchors example > anchors.toml\n  iris-session anchors example handover",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument(
+        "scene",
+        nargs="?",
+        default="",
+        help="name of a scene (see `iris-session serve --help`); default: the usual sheet",
+    )
+    add_json(one)
+    one.set_defaults(run=run_example)
 
 
 def _register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -103,26 +137,12 @@ def length(text: str) -> float:
     return float(found[1]) * _UNITS[found[2]]
 
 
-def pose(text: str) -> Any:
-    """Type of poses: position [m] and unit quaternion, w first."""
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or abs(math.hypot(*numbers[3:]) - 1.0) > 0.01:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a pose: x,y,z in metres and a unit quaternion qw,qx,qy,qz, for example 0,-0.45,0,1,0,0,0"
-        )
-    norm = math.hypot(*numbers[3:])
-    return tuple(numbers[:3]), tuple(q / norm for q in numbers[3:])
-
-
 def _named_length(text: str) -> tuple[str, float]:
     name, _, rest = text.rpartition("=")
     return _named(name, text), length(rest)
 
 
-def _named_pose(text: str) -> tuple[str, Any]:
+def _named_pose(text: str) -> tuple[str, PoseTuple]:
     name, _, rest = text.rpartition("=")
     return _named(name, text), pose(rest)
 
@@ -163,6 +183,24 @@ def run_print(arguments: argparse.Namespace) -> int:
         return 0
     print(f"{out}: anchor {sheet.anchor_id!r}, code {1e3 * sheet.edge_m:g} mm, for {arguments.paper}")
     print(f"print at 100 % (not 'fit to page'), then measure the code: {1e3 * sheet.edge_m:g} mm from edge to edge")
+    return 0
+
+
+def run_example(arguments: argparse.Namespace) -> int:
+    """Prints what the scene has, in the form that `serve --anchors` reads."""
+    from iris_session.runtime.anchors_file import dump_anchors
+    from iris_session.runtime.config import SessionConfig
+
+    config = SessionConfig()
+    anchors, sizes = config.anchors, config.sheet_sizes()
+    if arguments.scene:
+        scene = open_scene(arguments.scene)
+        anchors, sizes = scene.anchors, scene.anchor_sizes
+    text = dump_anchors(anchors, sizes)
+    if arguments.json:
+        print_json({"toml": text})
+    else:
+        print(text, end="")
     return 0
 
 

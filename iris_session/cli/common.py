@@ -62,13 +62,30 @@ def positive_seconds(text: str) -> float:
 
 def port_base(text: str) -> int:
     """Type of `--port-base`."""
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65530:
-        raise argparse.ArgumentTypeError(f"{text!r} is not the first of six ports: 1 to 65530, for example 7730")
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the first of seven ports: 1 to 65529, for example 7730")
     return int(text)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+
+
+def add_way_to_session(
+    parser: argparse.ArgumentParser,
+    *,
+    option: bool = False,
+    code: str = "join code, for the first time at an encrypted session",
+) -> None:
+    """How a command of a client finds the session: `address`, `session`, `code`. `option`: `--address`, where other
+    words stand at its place."""
+    text = "HOST:PORT or iris://... (default: 127.0.0.1:7721)"
+    if option:
+        parser.add_argument("--address", default="", metavar="ADDR", help=text)
+    else:
+        parser.add_argument("address", nargs="?", default="", help=text)
+    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
+    parser.add_argument("--code", default="", help=code)
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:
@@ -96,7 +113,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         type=port_base,
         default=None,
         metavar="N",
-        help="block of ports: introduction N, control N+1, state N+2, ... N+5 (default: 7720)",
+        help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
     )
     group.add_argument("--no-beacon", action="store_true", help="do not tell the network that this session is here")
     group.add_argument("--control-port", type=int, default=None, metavar="PORT", help="0: any free one")

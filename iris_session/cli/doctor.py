@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_json, print_json
+from iris_session.cli.common import add_json, add_way_to_session, print_json
 from iris_session.cli.live import printable
 from iris_session.protocol.names import Role
 
@@ -31,9 +31,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session doctor --server             the machine that is to serve",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("address", nargs="?", default="", help="HOST:PORT or iris://... (default: 127.0.0.1:7721)")
-    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
-    parser.add_argument("--code", default="", help="a join code to try; it is used up")
+    add_way_to_session(parser, code="a join code to try; it is used up")
     parser.add_argument(
         "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
     )

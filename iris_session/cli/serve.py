@@ -35,6 +35,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
+        "  iris-session serve scene.xml --anchors anchors.toml\n"
         "  iris-session serve handover --assign ann=left --assign bob=right\n"
         "  iris-session serve aloha --seconds 30\n"
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
@@ -44,6 +45,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, or the name of a scene, see below")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
+    parser.add_argument(
+        "--anchors",
+        type=Path,
+        metavar="TOML",
+        help="where sheets and other anchors are, in place of the scene's; see `iris-session anchors example`",
+    )
     parser.add_argument(
         "--assign",
         action="append",
@@ -119,6 +126,7 @@ def session_name(path: Path) -> str:
 def new_session(arguments: argparse.Namespace) -> Session:
     """A session that begins."""
     from iris_session.physics import load_robots_toml
+    from iris_session.runtime.anchors_file import load_anchors
     from iris_session.runtime.session import Session
 
     if arguments.scene is None:
@@ -126,7 +134,11 @@ def new_session(arguments: argparse.Namespace) -> Session:
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = session_config(arguments, session_name(Path(arguments.scene)))
-    config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes)
+    anchors, sizes = scene.anchors, scene.anchor_sizes
+    if arguments.anchors is not None:
+        given = load_anchors(arguments.anchors)
+        anchors, sizes = given.anchors, given.sizes
+    config = dataclasses.replace(config, anchors=anchors, anchor_sizes=sizes)
     return Session(scene.model, config=config, robots=robots)
 
 
@@ -134,7 +146,7 @@ def resumed_session(arguments: argparse.Namespace) -> Session:
     """A session that goes on from its recording."""
     from iris_session.runtime.session import Session
 
-    had = ("robots", "assign", "assignment", "mode", "record", "no_record")
+    had = ("robots", "anchors", "assign", "assignment", "mode", "record", "no_record")
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")

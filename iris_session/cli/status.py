@@ -7,10 +7,11 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
-from iris_session.cli.common import CommandError, add_json, positive_seconds, print_json
+from iris_session.cli.common import CommandError, add_json, add_way_to_session, positive_seconds, print_json
 from iris_session.cli.live import printable
 
 if TYPE_CHECKING:
@@ -35,25 +36,46 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session status --metrics-port 9463      http://127.0.0.1:9463/metrics for Prometheus",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("address", nargs="?", default="", help="HOST:PORT or iris://... (default: 127.0.0.1:7721)")
-    parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
-    parser.add_argument("--code", default="", help="join code, for the first time at an encrypted session")
+    add_way_to_session(parser)
     form = parser.add_mutually_exclusive_group()
-    form.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    add_watch(form, parser)
     form.add_argument("--prometheus", action="store_true", help="text exposition format of Prometheus, once")
     form.add_argument(
         "--metrics-port", type=int, default=None, metavar="PORT", help="serve that on 127.0.0.1 over HTTP"
-    )
-    parser.add_argument(
-        "--period", type=positive_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
     )
     add_json(parser)
     parser.set_defaults(run=run)
 
 
+def add_watch(form: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
+    """The options of `watch`; `form`: where `--watch` goes."""
+    form.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    parser.add_argument(
+        "--period", type=positive_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Prints the status; with --watch or --metrics-port until Ctrl-C."""
-    from iris_session.client import Client
+    from iris_session.cli.metrics import exposition
+
+    with asking(arguments) as (client, report):
+        if arguments.metrics_port is not None:
+            return _serve_metrics(client, arguments.metrics_port)
+        if arguments.watch:
+            return watch(client, arguments.period, show, as_json=arguments.json)
+        if arguments.prometheus:
+            sys.stdout.write(exposition(report))
+        else:
+            show(report, as_json=arguments.json)
+        return 0
+
+
+@contextmanager
+def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
+    """An observer of the session that is meant, and its status. A session that stands still lets nobody in, but tells
+    how it does."""
+    from iris_session.client import Client, NotConnectedError, RequestTimeoutError
 
     client = Client(
         arguments.address,
@@ -67,33 +89,23 @@ def run(arguments: argparse.Namespace) -> int:
         client.open()
         if client.wait_for(lambda one: one.ready, JOIN_S):
             client.sleep(SETTLE_S)
-        return _tell(client, arguments)
+        try:
+            report = client.status()
+        except (NotConnectedError, RequestTimeoutError) as error:
+            why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
+            raise CommandError(why) from None
+        yield client, report
     finally:
         client.close()
 
 
-def _tell(client: Client, arguments: argparse.Namespace) -> int:
-    """In the form that is asked for. A session that stands still lets nobody in, but tells how it does."""
-    from iris_session.cli.metrics import exposition
-    from iris_session.client import NotConnectedError, RequestTimeoutError
+class Show(Protocol):
+    """Prints one report."""
 
-    try:
-        report = client.status()
-    except (NotConnectedError, RequestTimeoutError) as error:
-        why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
-        raise CommandError(why) from None
-    if arguments.metrics_port is not None:
-        return _serve_metrics(client, arguments.metrics_port)
-    if arguments.watch:
-        return _watch(client, arguments.period, as_json=arguments.json)
-    if arguments.prometheus:
-        sys.stdout.write(exposition(report))
-    else:
-        _show(report, as_json=arguments.json)
-    return 0
+    def __call__(self, report: StatusReport, *, as_json: bool) -> None: ...
 
 
-def _show(report: StatusReport, *, as_json: bool) -> None:
+def show(report: StatusReport, *, as_json: bool) -> None:
     import msgspec
 
     if as_json:
@@ -102,7 +114,7 @@ def _show(report: StatusReport, *, as_json: bool) -> None:
         print("\n".join(screen(report)), flush=True)
 
 
-def _watch(client: Client, period_s: float, *, as_json: bool) -> int:
+def watch(client: Client, period_s: float, show: Show, *, as_json: bool) -> int:
     """Until Ctrl-C. A session that goes away is waited for."""
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
@@ -115,7 +127,7 @@ def _watch(client: Client, period_s: float, *, as_json: bool) -> int:
             print(f"{clear}{error}", flush=True)
         else:
             print(clear, end="")
-            _show(report, as_json=as_json)
+            show(report, as_json=as_json)
         client.sleep(max(0.1, period_s - (time.monotonic() - began)))
 
 

@@ -20,6 +20,7 @@ from iris_session.recording.journal import (
     unpack_model,
 )
 from iris_session.recording.lock import RecordingInUseError, RecordingLock
+from iris_session.recording.looks import Frame, InForce, Look, Looks, Person, read_looks
 from iris_session.recording.reader import RawSample, Recording, State
 from iris_session.recording.supervise import RecorderProcess
 from iris_session.recording.verify import Core, Problem, VerifyReport, verify
@@ -45,6 +46,12 @@ __all__ = [
     "Recording",
     "State",
     "RawSample",
+    "read_looks",
+    "Looks",
+    "Look",
+    "Frame",
+    "InForce",
+    "Person",
     "verify",
     "VerifyReport",
     "Problem",

@@ -130,6 +130,10 @@ class Recording:
         """Number of rows in the files, for showing progress."""
         return sum(batch.num_rows for _, batch in self._batches(paths.ROWS))
 
+    def count_samples(self) -> int:
+        """Number of raw messages in the files, for showing progress."""
+        return sum(batch.num_rows for _, batch in self._batches(paths.SAMPLES))
+
     def keyframes(self) -> Iterator[Keyframe]:
         """The keyframes in order."""
         return self._unique(

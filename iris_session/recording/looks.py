@@ -1,0 +1,259 @@
+"""Reads back what headsets saw of anchors, where their heads were, and which alignments were in force meanwhile.
+
+Observations and samples lie in the recording as they came, by connection. Whose connection that was is told by the
+joins in the journal and the events of the same step.
+"""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import msgspec
+
+from iris_session.protocol.client_messages import Observation, Sample
+from iris_session.protocol.common import Alignment, Pose, Vec3
+from iris_session.protocol.decoding import BAD_BYTES
+from iris_session.protocol.entries import Join, decode_entries
+from iris_session.protocol.names import AlarmKind, AlignmentKind, Device
+from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
+    AlignmentChanged,
+    AnchorMoved,
+    Event,
+    ParticipantChanged,
+    ParticipantJoined,
+    ParticipantLeft,
+)
+from iris_session.recording.reader import Recording
+
+#: A head pose further from an observation in time says nothing about it.
+NEAR_NS: Final = 50_000_000
+#: Capability by which a client says that its tracking frame is the one from before.
+RUN_PREFIX: Final = "run:"
+#: Items between two calls of `told`.
+TOLD_EVERY: Final = 20_000
+_KINDS: Final = (
+    ParticipantJoined,
+    ParticipantChanged,
+    ParticipantLeft,
+    AlignmentChanged,
+    AlignmentAlarmed,
+    AnchorMoved,
+)
+_decode = msgspec.msgpack.Decoder(Sample | Observation).decode
+
+
+class Frame(NamedTuple):
+    """One tracking frame: of a participant, in one run of its app (counted from 1), in one tracking epoch."""
+
+    participant: str
+    run: int
+    tracking_epoch: int
+
+
+class Look(NamedTuple):
+    """One observation, and where the head was then, in the same tracking frame; None where no sample is near."""
+
+    seen: Observation
+    p_tracking_head: Vec3 | None
+
+
+class InForce(NamedTuple):
+    """An alignment and from when to when it held, session time; `until_ns` -1: to the end."""
+
+    frame: Frame
+    alignment: Alignment
+    since_ns: int
+    until_ns: int = -1
+
+
+class Moved(NamedTuple):
+    """A director moved an anchor."""
+
+    session_time: int
+    anchor_id: str
+    T_world_anchor: Pose
+
+
+@dataclass
+class Person:
+    """`aligned`: has a headset that is to be aligned. `runs`: what its clients called the runs of their tracking."""
+
+    id: str
+    name: str
+    role: str
+    aligned: bool
+    runs: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Looks:
+    """`people`: everybody who joined, by id. `looks`: by tracking frame, in order of capture. `unreadable`: messages
+    that do not decode; `unowned`: observations over connections whose join is not in this recording."""
+
+    people: dict[str, Person] = field(default_factory=dict)
+    looks: dict[Frame, list[Look]] = field(default_factory=dict)
+    in_force: list[InForce] = field(default_factory=list)
+    moved: list[Moved] = field(default_factory=list)
+    unreadable: int = 0
+    unowned: int = 0
+
+
+class _Heads:
+    """Where one head was, over time."""
+
+    def __init__(self) -> None:
+        self._times, self._places = array("q"), array("d")
+        self._order: list[int] | None = None
+
+    def add(self, capture_ns: int, p: Vec3) -> None:
+        self._times.append(capture_ns)
+        self._places.extend(p)
+
+    def sort(self) -> None:
+        """By time: clocks are slewed, and messages overtake each other."""
+        order = sorted(range(len(self._times)), key=self._times.__getitem__)
+        places = self._places
+        self._times = array("q", [self._times[i] for i in order])
+        self._places = array("d", [c for i in order for c in places[3 * i : 3 * i + 3]])
+
+    def at(self, capture_ns: int) -> Vec3 | None:
+        """The place nearest in time."""
+        i = bisect_left(self._times, capture_ns)
+        near = min(
+            (k for k in (i - 1, i) if 0 <= k < len(self._times)),
+            key=lambda k: abs(self._times[k] - capture_ns),
+            default=-1,
+        )
+        if near < 0 or abs(self._times[near] - capture_ns) > NEAR_NS:
+            return None
+        x, y, z = self._places[3 * near : 3 * near + 3]
+        return x, y, z
+
+
+def read_looks(recording: Recording, told: Callable[[int, int], None] | None = None) -> Looks:
+    """Everything that `Looks` has. `told(done, total)` hears how far it is."""
+    n_rows, n_samples = recording.count_rows(), recording.count_samples()
+    say = told or (lambda done, total: None)
+    events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
+    found = Looks()
+    owners = _roster(recording, events, found, lambda done: say(done, n_rows + n_samples))
+    _messages(recording, owners, found, lambda done: say(n_rows + done, n_rows + n_samples))
+    say(n_rows + n_samples, n_rows + n_samples)
+    return found
+
+
+def _roster(
+    recording: Recording, events: list[Event], found: Looks, say: Callable[[int], None]
+) -> dict[int, tuple[str, int]]:
+    """Fills in people, alignments and moved anchors; gives participant and run by connection."""
+    joined = {event.step for event in events if isinstance(event.body, ParticipantJoined)}
+    joins: dict[int, list[tuple[int, Join]]] = {}
+    for done, row in enumerate(recording.rows()):
+        if done % TOLD_EVERY == 0:
+            say(done)
+        if row.step in joined:
+            joins[row.step] = _joins(row.entries)
+    owners: dict[int, tuple[str, int]] = {}
+    present: dict[str, InForce] = {}
+    for event in events:
+        _take(event, joins.get(event.step, []), owners, present, found)
+    found.in_force.extend(present.values())
+    found.in_force.sort(key=lambda one: one.since_ns)
+    return owners
+
+
+def _joins(entries: bytes) -> list[tuple[int, Join]]:
+    try:
+        return [(e.connection, e.message) for e in decode_entries(entries) if isinstance(e.message, Join)]
+    except msgspec.DecodeError:  # damaged: those who came in this step stay unknown
+        return []
+
+
+def _take(
+    event: Event,
+    joins: list[tuple[int, Join]],
+    owners: dict[int, tuple[str, int]],
+    present: dict[str, InForce],
+    found: Looks,
+) -> None:
+    """One event of the history. `joins`: those of its step that no event has answered yet."""
+    body, now_ns = event.body, event.session_time
+    if isinstance(body, AnchorMoved):
+        found.moved.append(Moved(now_ns, body.anchor_id, body.T_world_anchor))
+    elif isinstance(body, AlignmentChanged):
+        _end(body.participant, now_ns, present, found)
+        person = found.people.get(body.participant)
+        frame = Frame(body.participant, len(person.runs) if person else 0, body.alignment.tracking_epoch)
+        present[body.participant] = InForce(frame, body.alignment, now_ns)
+    elif isinstance(body, AlignmentAlarmed):
+        if body.kind == AlarmKind.JUMP:
+            _end(body.participant, now_ns, present, found)
+    elif isinstance(body, ParticipantLeft):
+        if not body.grace:
+            _end(body.participant, now_ns, present, found)
+    elif isinstance(body, ParticipantJoined | ParticipantChanged):
+        info = body.participant
+        if info.alignment is None:
+            _end(info.id, now_ns, present, found)
+        aligned = info.alignment is None or info.alignment.kind != AlignmentKind.NOT_NEEDED
+        person = found.people.setdefault(info.id, Person(info.id, info.name, info.role, aligned))
+        if isinstance(body, ParticipantJoined):
+            _own(person, joins, owners)
+
+
+def _own(person: Person, joins: list[tuple[int, Join]], owners: dict[int, tuple[str, int]]) -> None:
+    """The join that this person came with: those of one step are answered in their order, but for refused ones."""
+    for i, (connection, join) in enumerate(joins):
+        if (join.name, join.role) == (person.name, person.role):
+            run = next((c for c in join.capabilities if c.startswith(RUN_PREFIX)), f"connection {connection}")
+            if not person.runs or person.runs[-1] != run:
+                person.runs.append(run)
+            owners[connection] = person.id, len(person.runs)
+            del joins[i]
+            return
+    person.runs.append("unknown")
+
+
+def _end(participant: str, now_ns: int, present: dict[str, InForce], found: Looks) -> None:
+    was = present.pop(participant, None)
+    if was is not None:
+        found.in_force.append(was._replace(until_ns=now_ns))
+
+
+def _messages(
+    recording: Recording, owners: dict[int, tuple[str, int]], found: Looks, say: Callable[[int], None]
+) -> None:
+    """Fills in the looks: observations with the head pose nearest in time."""
+    heads: dict[Frame, _Heads] = {}
+    seen: dict[Frame, list[Observation]] = {}
+    for done, raw in enumerate(recording.samples()):
+        if done % TOLD_EVERY == 0:
+            say(done)
+        try:
+            message = _decode(raw.data)
+        except BAD_BYTES:
+            found.unreadable += 1
+            continue
+        owner = owners.get(raw.connection)
+        if owner is None:
+            found.unowned += isinstance(message, Observation)
+            continue
+        frame = Frame(*owner, message.tracking_epoch)
+        if isinstance(message, Observation):
+            seen.setdefault(frame, []).append(message)
+        elif message.device == Device.HEAD and message.pose is not None and message.tracked:
+            heads.setdefault(frame, _Heads()).add(message.capture_ns, message.pose.p)
+    for frame, observations in sorted(seen.items()):
+        found.looks[frame] = _with_heads(observations, heads.get(frame))
+
+
+def _with_heads(observations: Iterable[Observation], heads: _Heads | None) -> list[Look]:
+    if heads is not None:
+        heads.sort()
+    ordered = sorted(observations, key=lambda one: one.capture_ns)
+    return [Look(one, None if heads is None else heads.at(one.capture_ns)) for one in ordered]

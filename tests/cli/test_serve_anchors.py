@@ -1,0 +1,62 @@
+"""`serve --anchors` on paper: the file takes the place of the scene's anchors, and its example is one that works."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli import serve
+from iris_session.cli.main import build_parser, main
+
+DOOR = (
+    'format = 1\nreference = "door"\n[anchors.door]\nposition_m = [1.0, 2.0, 0.5]\n'
+    "quaternion_wxyz = [0.0, 0.0, 0.0, 1.0]\nsize_m = 0.12\n"
+)
+
+
+def test_the_file_takes_the_place_of_the_scenes_anchors(tmp_path: Path) -> None:
+    path = tmp_path / "anchors.toml"
+    path.write_text(DOOR)
+    arguments = build_parser().parse_args(["serve", "arm", "--no-record", "--anchors", str(path)])
+    config = serve.new_session(arguments).config
+    assert config.anchors == {"door": ((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))}
+    assert config.sheet_sizes() == {"door": 0.12}
+    plain = serve.new_session(build_parser().parse_args(["serve", "arm", "--no-record"])).config
+    assert set(plain.anchors) == {"table"}
+
+
+def test_the_example_is_read_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for scene in ([], ["arms4"]):
+        assert main(["anchors", "example", *scene]) == 0
+        text = capsys.readouterr().out
+        path = tmp_path / "example.toml"
+        path.write_text(text)
+        arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
+        config = serve.new_session(arguments).config
+        assert set(config.anchors) == {"table"}
+        assert config.sheet_sizes() == {"table": 0.16}
+    own = serve.new_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
+    assert config.anchors == own.anchors, "that of the scene"
+    assert main(["anchors", "example", "arms4", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"toml": text}
+
+
+@pytest.mark.parametrize("text", ["nonsense", DOOR.replace("position_m", "position_mm"), None])
+def test_a_bad_file_is_one_line_that_names_the_example(
+    text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "anchors.toml"
+    if text is not None:
+        path.write_text(text)
+    assert main(["serve", "arm", "--no-record", "--anchors", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("iris-session: ")
+    assert "`iris-session anchors example` prints one that is right" in said
+
+
+def test_a_resumed_session_has_its_anchors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--resume", str(tmp_path), "--anchors", "anchors.toml"]) == 2
+    assert "--anchors cannot be given with --resume: the recording has them" in capsys.readouterr().err
