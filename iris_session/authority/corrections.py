@@ -231,6 +231,7 @@ def _put(
         error_at_robot_m,
         offset,
     )
+    telling.warn(ctx, p, "unaligned", "", same="")
     ctx.emit(AlignmentChanged(p.id, p.alignment))
 
 

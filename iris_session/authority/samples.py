@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from anchors.pose import distance, quat_angle
-from iris_session.authority import alignment, engagement, stated_error
+from iris_session.authority import alignment, engagement, stated_error, telling
 from iris_session.authority.context import Context, find_grant
 from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
@@ -179,6 +179,9 @@ def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
     if reason == RejectReason.SEQ:
         return
     hold = HoldReason.UNALIGNED if reason == RejectReason.UNALIGNED else HoldReason.REJECTED
+    if reason == RejectReason.UNALIGNED and p.alignment is None:
+        advice = "look at an anchor sheet" if p.aligning else "start its alignment run"
+        telling.warn(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)
     for t in s.targets:
         lease = ctx.lease(t.kind, t.name)
         g = find_grant(lease, p.id, s.device) if lease is not None else None

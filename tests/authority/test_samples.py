@@ -11,7 +11,7 @@ from iris_session.authority import AuthorityConfig
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.server_messages import SamplesRejected
+from iris_session.protocol.server_messages import Notice, SamplesRejected
 
 from .table import MS, Person, Table, make_view
 
@@ -146,6 +146,10 @@ def test_unaligned_holder_holds_unaligned() -> None:
     op.sends("left")
     assert t.hold() == "unaligned"
     assert t.since(SamplesRejected)[0].reason == "unaligned"
+    for _ in range(5):
+        op.sends("left")
+    told = [e.text for e in t.events if isinstance(e, Notice) and e.participant == op.id]
+    assert told == ["person1 is not aligned and moves nothing: look at an anchor sheet"], "once, not with every sample"
 
 
 def test_too_fast_counts_from_the_last_counted_sample() -> None:
