@@ -168,6 +168,12 @@ class Network:
         ip("-n", name, "addr", "add", f"{self.headset.address}/32", "dev", interface)
         ip("-n", name, "route", "add", "10.77.1.0/24", "dev", interface)
 
+    def other_subnet(self) -> None:
+        """The headset has an address of another network, on the same cable."""
+        name, interface = self.headset.name, self.headset.interface
+        ip("-n", name, "addr", "flush", "dev", interface)
+        ip("-n", name, "addr", "add", "10.88.1.2/24", "brd", "+", "dev", interface)
+
     def allow_broadcasts(self) -> None:
         name, interface = self.headset.name, self.headset.interface
         ip("-n", name, "addr", "flush", "dev", interface)

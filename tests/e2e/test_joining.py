@@ -123,6 +123,18 @@ def test_another_key_than_the_stored_one_is_refused_until_it_is_forgotten(networ
     assert headset.look("10.77.1.1", "--code", pair(network.server)["code"])["frames"] > SEEN
 
 
+def test_another_network_is_named_with_both_addresses(network: Network, lab: Served) -> None:
+    network.other_subnet()
+    done = network.headset.iris("doctor", network.server.address, "--json")
+    network.allow_broadcasts()
+    found = {one["check"]: one for one in json.loads(done.stdout)["checks"]}
+    assert done.returncode == 1
+    assert found["subnet"]["state"] == "failed"
+    assert "10.77.1.1" in found["subnet"]["text"]
+    assert "10.88.1.0/24" in found["subnet"]["text"]
+    assert "same network" in found["subnet"]["advice"]
+
+
 def test_an_interface_that_is_not_there_is_told_with_those_that_are(network: Network) -> None:
     done = network.server.iris("serve", "handover", "--no-record", "--interface", "wlan7")
     assert done.returncode == 2
