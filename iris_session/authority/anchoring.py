@@ -92,7 +92,7 @@ def _move(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
 
 def give_anew(ctx: Context, anchors: dict[str, Pose]) -> None:
     """A session that goes on from a recording was given other anchors than it had."""
-    if anchors:
+    if anchors and all(alignment.is_pose(ctx, T) for T in anchors.values()):
         _move(ctx, {name: corrections.clean(T) for name, T in anchors.items()}, HOST_ID)
 
 

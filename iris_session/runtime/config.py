@@ -10,9 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from anchors.pose import IDENTITY_QUAT, PoseTuple
+from anchors.pose import IDENTITY_QUAT, PoseTuple, quat_normalize
 from iris_session.authority import AuthorityConfig
 from iris_session.control import ControlConfig
+from iris_session.protocol.common import Pose
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.runtime.config_checks import check_anchors, check_types
 from iris_session.runtime.errors import ConfigError
@@ -80,6 +81,10 @@ class SessionConfig:
             raise ConfigError(f"state_hz {self.state_hz} is out of range: 1 to 240")
         if not 0.5 <= self.keyframe_s <= 60.0:
             raise ConfigError(f"keyframe_s {self.keyframe_s} is out of range: 0.5 to 60")
+
+    def anchor_poses(self) -> dict[str, Pose]:
+        """`T_world_anchor` of each anchor, as it travels."""
+        return {name: Pose(p, quat_normalize(q)) for name, (p, q) in self.anchors.items()}
 
     def sheet_sizes(self) -> dict[str, float]:
         """Edge of each printed sheet [m] whose size is known, the default one's included."""

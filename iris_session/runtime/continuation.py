@@ -29,6 +29,7 @@ from iris_session.physics import (
     model_from_bytes,
     scene_hash,
 )
+from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import decode_entries
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import (
@@ -73,11 +74,13 @@ class Continuation:
 
     `path`: any file of the recording, or the folder that `session.rrd` is in. `core`: in the state after `step`, at
     session time `now_ns`. `recording`: the file to go on in. `origin_ns`: of session time, as `time.monotonic_ns()`.
-    `notes`: what people should know. `patience_s`: for the recorder of a session that was killed to finish its file.
+    `notes`: what people should know. `anchors`: where they are, when `take` was given that anew. `patience_s`: for the
+    recorder of a session that was killed to finish its file.
     """
 
     def __init__(self, path: Path, patience_s: float = PATIENCE_S) -> None:
         self.notes: list[str] = []
+        self.anchors: dict[str, Pose] = {}
         first = first_file(path)
         try:
             self._lock, newest = _lock_newest(first, patience_s)
@@ -121,16 +124,20 @@ class Continuation:
 
     def _config(self, given: SessionConfig) -> SessionConfig:
         plain, core = SessionConfig(), self.core.config
+        authority = msgspec.structs.replace(core.authority, anchors={})  # as it is given: anchors come beside it
         if given.record is not True:
             raise ConfigError(f"a resumed session goes on in the folder of {self.file}: leave `record` as it is")
         if given.name not in (plain.name, self.header.session_name):
             raise ConfigError(f"a resumed session keeps its name, {self.header.session_name!r}")
-        for name, had in (("authority", core.authority), ("control", core.control)):
+        for name, had in (("authority", authority), ("control", core.control)):
             if getattr(given, name) not in (getattr(plain, name), had):
                 raise ConfigError(f"a resumed session keeps its settings: leave `{name}` as it is")
-        changes: dict[str, Any] = {"name": self.header.session_name, "authority": core.authority}
-        if self.header.anchors and given.anchors == plain.anchors:
-            changes["anchors"] = {name: (pose.p, pose.q) for name, pose in self.header.anchors.items()}
+        changes: dict[str, Any] = {"name": self.header.session_name, "authority": authority}
+        if given.anchors == plain.anchors:  # where they were last, which may be another place than at the beginning
+            poses = self.core.authority.anchors or self.header.anchors
+            changes["anchors"] = {name: (T.p, T.q) for name, T in poses.items()} or plain.anchors
+        else:
+            self.anchors = given.anchor_poses()
         for kept in (self.header.settings, None if self.note is None else self.note.listening):
             had_them = {} if kept is None else msgspec.structs.asdict(kept)
             changes |= {name: had for name, had in had_them.items() if getattr(given, name) == getattr(plain, name)}

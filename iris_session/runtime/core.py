@@ -191,7 +191,7 @@ def core_of(
     known: SessionCore | None = None,
 ) -> SessionCore:
     """The core of a session that begins with `data` as it is now; `known` when that is the one."""
-    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned)
+    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=session.anchor_poses())
     initial = b"" if data is None else plant_state(model, data)
     config = CoreConfig(authority, session.control, robots, objects, initial)
     if known is not None and known.config == config:

@@ -20,7 +20,6 @@ import numpy as np
 
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Marker
-from iris_session.protocol.common import Pose
 from iris_session.recording import (
     CLOSED,
     OPEN,
@@ -42,7 +41,7 @@ from iris_session.runtime.errors import StartError
 from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path
-from iris_session.runtime.stepper import Stepper
+from iris_session.runtime.stepper import ResumedFrom, Stepper
 from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replaced
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
 from iris_session.transport.sockets import host_in_address
@@ -173,7 +172,7 @@ class SessionProcesses:
             curve=config.curve,
             curve_secret_file=config.curve_key,
             curve_clients_dir=config.curve_clients,
-            anchors=anchor_poses(config),
+            anchors=config.anchor_poses(),
             anchor_sizes=config.sheet_sizes(),
             recorder_endpoint="" if self.recorder is None else self.recorder.samples_endpoint,
         )
@@ -192,7 +191,8 @@ class SessionProcesses:
             self.feed.header(header)
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
-        after = None if self._past is None else (self._past.step, self._past.now_ns)
+        past = self._past
+        after = None if past is None else ResumedFrom(past.step, past.now_ns, past.anchors)
         return Stepper(core, self.front.link, self.feed, clock, self.state_period_ns, keyframe_ns, chain, after)
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
@@ -212,7 +212,7 @@ class SessionProcesses:
             continues=None if self._past is None else self._past.continues,
             origin_ns=self._origin_ns,
             boot_id=boot_id(),
-            anchors=anchor_poses(self._config),
+            anchors=self._config.anchor_poses(),
             settings=settings_of(self._config),
         )
 
@@ -224,6 +224,7 @@ class SessionProcesses:
         self._next_watch_ns = now_ns + WATCH_PERIOD_NS
         self._note()
         if self.front is not None and not self.front.alive and self._front_backoff.dead(now_ns):
+            self.front.set_anchors(stepper.core.authority.anchors)
             what = replaced(self.front.restart, FrontError)
             stepper.post(Marker(request_id=0, text=f"the front process ended and {what}"))
         if self.supervisor is not None and self.feed is not None:
@@ -250,6 +251,11 @@ class SessionProcesses:
     @property
     def recorder_pid(self) -> int:
         return 0 if self.recorder is None else self.recorder.pid
+
+    @property
+    def sheet_sizes(self) -> dict[str, float]:
+        """Edge of the printed sheets [m], of those whose size is known."""
+        return self._config.sheet_sizes()
 
     def drops(self) -> dict[str, int]:
         """Everything that was not delivered, by reason."""
@@ -305,11 +311,6 @@ class SessionProcesses:
         if fault:
             _log.error("%s", fault)
         return fault
-
-
-def anchor_poses(config: SessionConfig) -> dict[str, Pose]:
-    """`T_world_anchor` of each sheet, as it travels."""
-    return {name: Pose(*T_world_anchor) for name, T_world_anchor in config.anchors.items()}
 
 
 def settings_of(config: SessionConfig) -> Settings:

@@ -10,11 +10,12 @@ import os
 import resource
 import sys
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from iris_session.physics import Pacer
-from iris_session.protocol.common import MAX_TEXT
-from iris_session.protocol.status import RecorderReport, RobotReport, StatusReport
+from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.status import AnchorReport, RecorderReport, RobotReport, StatusReport
 from iris_session.runtime.tick_times import TickTimes
 
 if TYPE_CHECKING:
@@ -76,12 +77,14 @@ class Reporter:
             load=os.getloadavg()[0],
             cpus=os.cpu_count() or 1,
             memory_bytes=memory_bytes(),
-            participants=stepper.ledger.participant_reports(now_ns),
+            participants=stepper.ledger.participant_reports(now_ns, core.authority.alignment_reports()),
             robots=robots(stepper),
             recorder=recorder,
             drops=processes.own_drops(),
             restarts=processes.restarts(),
             warnings=tuple(warnings(stepper, recorder, self.scheduling)),
+            anchors=anchors(core.authority.anchors, processes.sheet_sizes),
+            cross_checks=core.authority.cross_check_reports(),
         )
 
     def _cpu_share(self) -> float:
@@ -90,6 +93,11 @@ class Reporter:
         share = (cpu_ns - self._cpu_ns) / max(1, at_ns - self._cpu_at_ns)
         self._cpu_ns, self._cpu_at_ns = cpu_ns, at_ns
         return share
+
+
+def anchors(poses: Mapping[str, Pose], sizes: Mapping[str, float]) -> tuple[AnchorReport, ...]:
+    """Where every anchor is now; `sizes`: edges of the printed sheets [m], where known."""
+    return tuple(AnchorReport(name, T, sizes.get(name, 0.0)) for name, T in poses.items())
 
 
 def robots(stepper: Stepper) -> tuple[RobotReport, ...]:

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -23,7 +25,7 @@ from iris_session.protocol.server_messages import (
     SamplesRejected,
     Snapshot,
 )
-from iris_session.protocol.status import ParticipantReport, Quantiles, quantiles
+from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, quantiles
 from iris_session.protocol.steps import ControlStatus, Decision
 
 if TYPE_CHECKING:
@@ -189,8 +191,10 @@ class SessionLedger:
             )
         return tuple(rows)
 
-    def participant_reports(self, now_ns: int) -> tuple[ParticipantReport, ...]:
-        """The authority's part of the roster in a `StatusReport`."""
+    def participant_reports(
+        self, now_ns: int, alignments: Mapping[str, AlignmentReport] = MappingProxyType({})
+    ) -> tuple[ParticipantReport, ...]:
+        """The authority's part of the roster in a `StatusReport`. `alignments`: by participant."""
         held = self._held()
         waits: dict[str, list[str]] = {}
         for lease in self.mirror.leases.values():
@@ -215,6 +219,7 @@ class SessionLedger:
                 holds=tuple(held.get(info.id, ())),
                 waits_for=tuple(waits.get(info.id, ())),
                 rejected=rejected.get(info.id, {}),
+                alignment_report=alignments.get(info.id),
             )
             for info in self.mirror.participants.values()
         )

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.client_messages import Control, GetSnapshot, Marker
-from iris_session.protocol.common import MAX_TEXT, Applied
+from iris_session.protocol.common import MAX_TEXT, Applied, Pose
 from iris_session.protocol.entries import (
     HOST,
     Entry,
@@ -76,12 +77,21 @@ class RecorderPort(Protocol):
     def take_gap(self) -> int: ...
 
 
+class ResumedFrom(NamedTuple):
+    """What a session goes on from: newest step and session time of its recording. `anchors`: where they are, when that
+    was given anew; empty: as they were."""
+
+    step: int
+    now_ns: int
+    anchors: Mapping[str, Pose] = MappingProxyType({})
+
+
 class Stepper:
     """Drives one `SessionCore` against a front and a recorder.
 
     `clock` gives session time in nanoseconds. `state_period_ns`: how often rigid state is published and recorded.
-    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded). `resumed_from`: newest step
-    and session time of the recording that `core` goes on from.
+    `chain`: `header_root` of the recording's header (any bytes when nothing is recorded). `resumed_from`: of the
+    recording that `core` goes on from.
     """
 
     def __init__(
@@ -93,13 +103,13 @@ class Stepper:
         state_period_ns: int,
         keyframe_period_ns: int,
         chain: bytes = b"",
-        resumed_from: tuple[int, int] | None = None,
+        resumed_from: ResumedFrom | None = None,
     ) -> None:
         self.core = core
         self.front = front
         self.recorder = recorder
         self.clock = clock
-        self.step_count = 0 if resumed_from is None else resumed_from[0] + 1
+        self.step_count = 0 if resumed_from is None else resumed_from.step + 1
         self._newest_step = 0
         self.last: StepOutcome | None = None
         self._host: deque[EntryMessage] = deque()
@@ -117,7 +127,7 @@ class Stepper:
         #: Called after each part of a step with the `LateCause` that its time counts as. Set by the pacing loop.
         self.lap: Callable[[str], None] = unmeasured
         self._resumed_from = resumed_from
-        self._last_now_ns = -1 if resumed_from is None else resumed_from[1]
+        self._last_now_ns = -1 if resumed_from is None else resumed_from.now_ns
         self._poses = np.zeros((len(core.world.bodies), 7))
 
     @property
@@ -180,7 +190,8 @@ class Stepper:
         host: list[Entry] = []
         if self.last is None and self._resumed_from is not None:
             # The ledger knows nobody yet: it learns the roster as a client would.
-            begin = (SessionResumed(now_ns - self._resumed_from[1]), GetSnapshot())
+            past = self._resumed_from
+            begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
         while self._host:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))

@@ -34,12 +34,22 @@ ENUMS: Final[dict[str, tuple[str, ...]]] = {
     "device": tuple(sorted(names.Device.ALL)),
     "mode": tuple(sorted(names.LeaseMode.ALL)),
     "role": tuple(sorted(names.Role.ALL)),
-    "action": tuple(sorted(names.ControlAction.ALL | names.EpisodeAction.ALL)),
+    "action": tuple(sorted(names.ControlAction.ALL | names.EpisodeAction.ALL | names.AlignAction.ALL)),
+    "kind": tuple(sorted(names.AlarmKind.ALL)),
     "alignment": ("measured", "not_needed", "placed"),
 }
 _MESSAGES: Final = tuple(kind for kind in get_args(EntryMessage) if kind is not em.Join)
 #: Rare, or nothing would live long enough to be interesting.
-_ENDING: Final = (em.Lost, cm.Bye, em.FrontRestarted, cm.EStop, em.ExternalReset, em.StalledGap)
+_ENDING: Final = (
+    em.Lost,
+    cm.Bye,
+    em.FrontRestarted,
+    em.SessionResumed,
+    em.AlignmentAlarm,
+    cm.EStop,
+    em.ExternalReset,
+    em.StalledGap,
+)
 _decision = msgspec.msgpack.Decoder(Decision)
 
 
@@ -50,7 +60,9 @@ class Fuzz:
         self.rng = Random(seed)
         model = n_arms_scene(4, 3).compile()
         config = make_config(model, user_owned=False)
-        authority = msgspec.structs.replace(config.authority, quota=32)
+        authority = msgspec.structs.replace(
+            config.authority, quota=32, anchors={"table": Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}
+        )
         assert config.robots[0].name in WORDS
         self.core = SessionCore(model, CoreConfig(authority, config.control, config.robots, config.objects))
         self.now_ns = 1000 * MS
@@ -123,16 +135,20 @@ class Fuzz:
         number = rng.choice(FLOATS) if rng.random() < 0.2 else rng.uniform(0.1, 2.0)
         if name in ("tracking_epoch", "ticks", "request_id"):
             return 0 if rng.random() < 0.95 else rng.choice((1, 2**63 - 1))
-        if name in ("robots", "objects", "devices", "capabilities"):
+        if name in ("robots", "objects", "devices", "capabilities", "beside"):
             known = [r.name for r in self.core.config.robots] if name == "robots" else WORDS
             return tuple(rng.choice(known if rng.random() < 0.9 else WORDS) for _ in range(rng.randrange(4)))
         if name == "targets":
             return self.targets()
-        if name in ("T_world_tracking", "T_tracking_anchor", "pose"):
+        if name in ("T_world_tracking", "T_tracking_anchor", "T_world_anchor", "pose"):
             return self.pose()
+        if name == "anchors":
+            return {"table": self.pose()} if rng.random() < 0.5 else {}
+        if name == "anchor_id":
+            return rng.choice(("table", *WORDS))
         if name in ("covariance", "q", "qd", "hand_joints"):
             return (number,) * rng.choice([0, 1, 6, 7, 36])
-        if name == "pivot_world":
+        if name in ("pivot_world", "p_world"):
             return (number, 0.0, rng.choice(FLOATS))
         if "float" in kind:
             return number

@@ -50,7 +50,7 @@ from iris_session.runtime.core import CoreState, SessionCore
 from iris_session.runtime.errors import ConfigError, ResumeError
 from iris_session.runtime.processes import settings_of
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path, read_note
-from iris_session.runtime.stepper import Stepper
+from iris_session.runtime.stepper import ResumedFrom, Stepper
 from iris_session.runtime.verification import verify_recording
 from iris_session.transport.resume_tokens import ResumeTokens, handback_above
 from tests.recording.support import write
@@ -453,7 +453,7 @@ def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
     header = msgspec.structs.replace(past.header, continues=past.continues)
     front, journal = Front(), Journal()
     stepper = Stepper(
-        past.core, front, journal, clock, 10**9, 10**10, header_root(header), (past.step, past.now_ns)
+        past.core, front, journal, clock, 10**9, 10**10, header_root(header), ResumedFrom(past.step, past.now_ns)
     )  # fmt: skip
     stepper.post(Marker(0, "on we go"))
     for _ in range(40):
