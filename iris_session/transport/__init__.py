@@ -3,7 +3,7 @@
 `process.FrontProcess` starts and restarts the front, `link.FrontLink` exchanges entries and decisions with it. In the
 front: `front` (the loop), `intake` and `coalescer` (client -> authority), `admission` and `resume_tokens` (identity),
 `clients` (connections and sending), `doors` and `memory` (who is too many, too much, or silent), `announce`, `beacon`,
-`introduction`, `interfaces` (being found), `state_publisher`, `alignment_desk`, `zap`, `sockets`.
+`introduction`, `interfaces` (being found), `anchoring` (alignment), `state_publisher`, `zap`, `sockets`.
 """
 
 from iris_session.transport.config import FrontConfig, FrontError, FrontLimits, Ports, SceneInfo

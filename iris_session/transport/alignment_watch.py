@@ -1,7 +1,8 @@
 """The watch over the alignment of one connection: head poses and observations in, alarms out. `anchors.drift` decides.
 
-What observations may contradict is what is in force. Two cases are not worth an alarm: a correction that waits (then
-the newest estimate is judged), and what an alarm has told already (then nothing is, until there is a new estimate).
+What observations may contradict is what is in force. Three cases are not worth an alarm: a correction that waits (then
+the newest estimate is judged), what an alarm has told already (then nothing is, until there is a new estimate), and a
+sheet that is known to have been moved (it may be moved again, but what it says of the headset is nothing).
 """
 
 from __future__ import annotations
@@ -43,12 +44,18 @@ class AlignmentWatch:
     def begin(self) -> None:
         """A run begins: nothing that was seen before counts."""
         self._monitor = DriftMonitor(self._anchors)
+        self._moved: set[str] = set()  # anchors that were seen to be moved beside others
         self.known_wrong()
 
     def known_wrong(self) -> None:
         """What is in force is wrong, and that was told; until the next estimate there is nothing to contradict."""
         self._newest: AlignmentEstimate | None = None
         self._mute = True
+
+    def anchor_moved(self, anchor_id: str) -> None:
+        """It is known again where an anchor is; what is in force does not know yet."""
+        self._moved.discard(anchor_id)
+        self.known_wrong()
 
     def estimated(self, estimate: AlignmentEstimate) -> None:
         """Something was proposed."""
@@ -81,10 +88,12 @@ class AlignmentWatch:
                 observation.capture_ns,
                 observation.tracking_epoch,
                 observation.viewpoint_id,
-                self._judged(),
+                None if observation.anchor_id in self._moved else self._judged(),
             )
         except UNSOLVABLE:
             return None
+        if alarm is not None and alarm.beside:
+            self._moved.add(alarm.anchor_id)
         return _of_interest(alarm)
 
     def _judged(self) -> AlignmentEstimate | None:

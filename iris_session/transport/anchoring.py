@@ -222,7 +222,7 @@ class Anchoring:
         self._comparisons.forget_thing(anchor_id)
         for person in self._people.values():
             person.desk.anchors_moved()
-            person.watch.known_wrong()
+            person.watch.anchor_moved(anchor_id)
 
     def _of(self, participant: str) -> list[_Person]:
         numbers = [c.number for c in self._clients.by_number.values() if c.participant_id == participant]

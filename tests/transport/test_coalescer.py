@@ -18,7 +18,17 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import IDENTITY, Target
-from iris_session.protocol.entries import HOST, Audit, Entry, EntryMessage, Join, Lost
+from iris_session.protocol.entries import (
+    HOST,
+    AlignmentAlarm,
+    AlignmentProposal,
+    Audit,
+    CrossChecked,
+    Entry,
+    EntryMessage,
+    Join,
+    Lost,
+)
 from iris_session.protocol.security import RemoveParticipant
 from iris_session.transport.coalescer import Coalescer
 from iris_session.transport.config import FrontLimits
@@ -231,3 +241,53 @@ def test_removals_are_bounded_and_a_directors_word_is_a_request_like_others() ->
     assert len(waiting.take(urgent_only=True)) == 3
     assert drops.by_reason == {"urgent_pending": 2}
     assert len(waiting.take()) == 1
+
+
+def proposal(n: int, refused: bool = False) -> AlignmentProposal:
+    return AlignmentProposal(IDENTITY, 1, (), (0.0, 0.0, 0.0), 0.0, n_observations=n, refused=refused)
+
+
+def test_of_proposals_and_comparisons_the_newest_waits_and_takes_no_room_from_requests() -> None:
+    waiting, drops = coalescer(pending_messages=2)
+    for n in range(100):
+        assert waiting.offer(entry(proposal(n)))
+        assert waiting.offer(entry(proposal(n, refused=True)))
+        assert waiting.offer(entry(CrossChecked(2 + n % 2, "sheet", 0.01, 0.0, 0.02, (0.0, 0.0, 0.0), n)))
+    assert waiting.offer(entry(Acquire(1)))
+    assert waiting.offer(entry(Acquire(2)))
+    messages = [e.message for e in waiting.take()]
+    assert [m for m in messages if isinstance(m, AlignmentProposal)] == [proposal(99), proposal(99, refused=True)]
+    assert [m.n for m in messages if isinstance(m, CrossChecked)] == [98, 99]
+    assert len(messages) == 6
+    assert drops.by_reason == {}
+
+
+def test_alarms_are_never_dropped_and_come_before_later_proposals() -> None:
+    waiting, drops = coalescer(pending_messages=1, pending_urgent=1)
+    waiting.offer(entry(Acquire(1)))
+    for size in (0.01, 0.02):
+        assert waiting.offer(entry(AlignmentAlarm("changed", 1, "sheet", size)))
+    assert waiting.offer(entry(AlignmentAlarm("changed", 1, "other", 0.01)))
+    waiting.offer(entry(proposal(1)))
+    alarms = [e.message for e in waiting.take()]
+    assert alarms == [
+        Acquire(1),
+        AlignmentAlarm("changed", 1, "sheet", 0.02),
+        AlignmentAlarm("changed", 1, "other", 0.01),
+        proposal(1),
+    ]
+    assert drops.by_reason == {}
+
+
+def test_a_jump_is_urgent_whatever_else_is() -> None:
+    waiting, drops = coalescer(pending_urgent=2)
+    for request in (1, 2):
+        waiting.offer(entry(Release(request)))
+    waiting.offer(entry(proposal(1)))
+    for size in (0.1, 0.2):
+        assert waiting.offer(entry(AlignmentAlarm("jump", 1, "sheet", size)))
+    assert waiting.urgent
+    batch = [e.message for e in waiting.take(urgent_only=True)]
+    assert batch == [Release(1), Release(2), AlignmentAlarm("jump", 1, "sheet", 0.2)]
+    assert [e.message for e in waiting.take()] == [proposal(1)]
+    assert drops.by_reason == {}

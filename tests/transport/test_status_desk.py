@@ -8,12 +8,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.protocol.client_messages import Hello, Sample, Samples
+from iris_session.protocol.client_messages import Hello, Observation, Sample, Samples
+from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Join
 from iris_session.protocol.limits import LIMITS
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.status import ClientReport, GetStatus, ParticipantReport, StatusReport, quantiles
+from iris_session.protocol.status import (
+    AlignmentReport,
+    ClientReport,
+    GetStatus,
+    ParticipantReport,
+    StatusReport,
+    quantiles,
+)
 from iris_session.transport.status_desk import REUSE_NS
 from tests.transport.harness import N_BODIES, FrontSession, RawClient
 
@@ -81,6 +89,26 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
     assert ann.heard_ns >= 0
     assert ann.lost == ""
+
+
+def test_an_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
+    session = open_session(anchors={"table": IDENTITY})
+    ann, bob = session.client(), session.client()
+    ids = [ann.join(devices=("head",)).participant_id, bob.join(name="Bob").participant_id]
+    theirs = AlignmentReport(version=7, alarm="changed", alarm_ns=5)
+    session.process.link.send_report(half(row(ids[0], alignment_report=theirs), row(ids[1], alignment_report=theirs)))
+    for i in range(8):
+        ann.send(Observation("table", "qr", IDENTITY, session.process.link.now_ns, 1, i))
+    report = ask(
+        session,
+        bob,
+        lambda r: bool(r.participants) and getattr(r.participants[0].alignment_report, "observations", 0) == 8,
+    )
+    ours, other = (person.alignment_report for person in report.participants)
+    assert ours is not None
+    assert (ours.version, ours.alarm, ours.alarm_ns) == (7, "changed", 5)
+    assert [(s.anchor_id, s.observations) for s in ours.seen] == [("table", 8)]
+    assert other == theirs
 
 
 def test_way_of_samples_is_measured(session: FrontSession) -> None:
