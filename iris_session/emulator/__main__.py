@@ -75,9 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key, of everybody here")
-    parser.add_argument(
-        "--orders", action="store_true", help="take orders from standard input: bump NAME, recentre NAME"
-    )
+    parser.add_argument("--orders", action="store_true", help="take orders from standard input, such as: bump NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
     return parser
 

@@ -71,6 +71,7 @@ class Headset:
         self.worn = True
         self.late_samples = 0  # sampling instants that were passed over because nobody asked in time
         self._T_world_tracking0: PoseTuple = IDENTITY_POSE
+        self._drift: Vec3 = (0.0, 0.0, 0.0)  # m/min, world
         self._biases: dict[tuple[int, int], Array] = {}
         self._period_ns = int(1e9 / model.rate_hz)
         self._detect_ns = int(1e9 / model.detection_hz)
@@ -104,6 +105,13 @@ class Headset:
         self._T_world_tracking0 = ((x, y, z), quat_mul(turn, old[1]))
         self._epoch_ns = now_ns  # the drift so far is in the new pose
         return compose(inverse(self._T_world_tracking0), old)
+
+    def drift(self, m_per_min: float, now_ns: int) -> None:
+        """From now on the tracking frame drifts at this speed, in the direction that is its own."""
+        self._T_world_tracking0 = self.T_world_tracking(now_ns)
+        self._epoch_ns = now_ns
+        x, y, z = self._way
+        self._drift = (m_per_min * x, m_per_min * y, m_per_min * z)
 
     def track(self, T_world_device: PoseTuple, now_ns: int) -> PoseTuple:
         """`T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
@@ -180,10 +188,11 @@ class Headset:
         z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, as the run time likes
         self._T_world_tracking0 = ((x, y, z), quat_mul(tilted, level))
         way = self._normals(3)
-        speed = self.model.drift_m_per_min / max(1e-9, math.hypot(*way))
-        self._drift: Vec3 = (speed * way[0], speed * way[1], speed * way[2])
+        length = max(1e-9, math.hypot(*way))
+        self._way: Vec3 = (way[0] / length, way[1] / length, way[2] / length)
         self._yaw_drift = self.model.drift_rad_per_min * (1.0 if self.rng.random() < 0.5 else -1.0)
         self._epoch_ns = now_ns
+        self.drift(self.model.drift_m_per_min, now_ns)
 
     def _sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
         """Six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of scale."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 #: What can be done to the tracking frame of a headset: `Person.disturb`.
-KINDS: Final = ("bump", "recentre")
+KINDS: Final = ("bump", "drift", "recentre")
 MAX_LINE: Final = 256  # bytes; a longer line is no order
 
 
@@ -37,6 +37,6 @@ class Orders:
         kind, _, name = line[:MAX_LINE].decode(errors="replace").strip().partition(" ")
         if kind in KINDS and name in self._names:
             return [(kind, name)]
-        known = f"{' or '.join(KINDS)}, then one of {', '.join(self._names)}"
+        known = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}, then one of {', '.join(self._names)}"
         print(f"no order: {kind} {name}".rstrip() + f"; it is {known}", file=sys.stderr, flush=True)
         return []

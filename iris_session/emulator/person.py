@@ -150,12 +150,14 @@ class Person:
         self._enter("failed", now_ns)
 
     def disturb(self, kind: str, now_ns: int) -> None:
-        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice."""
+        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice; or begins to `drift`."""
         if kind == "recentre":
             self.headset.recentre(now_ns)
             self.client.new_tracking_frame()
             for clutch in self._clutches.values():
                 clutch.open()
+        elif kind == "drift":
+            self.headset.drift(self.spec.drift_m_per_min, now_ns)
         else:
             spec = self.spec
             self._slip = (self.headset.bump(spec.bump_m, spec.bump_yaw_rad, self.gaze.pose[0], now_ns), now_ns)

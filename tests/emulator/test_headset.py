@@ -156,6 +156,16 @@ def test_a_bump_moves_the_frame_about_the_head_and_keeps_the_epoch(yaw: float) -
     assert distance(after[0], later[0]) == pytest.approx(0.06), "it drifts on from there"
 
 
+def test_a_drift_that_begins_later_begins_where_the_frame_is() -> None:
+    headset = Headset(HeadsetModel(drift_m_per_min=0.0), seed=6)
+    before = headset.T_world_tracking(3 * MINUTE)
+    headset.drift(0.03, 3 * MINUTE)
+    after = headset.T_world_tracking(3 * MINUTE)
+    assert distance(before[0], after[0]) < 1e-12
+    assert quat_angle(before[1], after[1]) < 1e-7
+    assert distance(headset.T_world_tracking(5 * MINUTE)[0], before[0]) == pytest.approx(0.06)
+
+
 def test_tracking_is_the_inverse_of_the_truth_with_little_noise() -> None:
     headset = Headset(HeadsetModel(), seed=7)
     seen = [headset.track(above(0.5), SECOND) for _ in range(500)]
