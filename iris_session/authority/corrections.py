@@ -58,7 +58,7 @@ def offer(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
         return _arrive(ctx, p, goal)
     if p.correction is not None:
         before = p.correction
-        goal.slides_ns, goal.T_told, goal.told_ns = before.slides_ns, before.T_told, before.told_ns
+        goal.slides_ns, goal.T_told = before.slides_ns, before.T_told
     p.correction = goal
     return None
 
@@ -142,13 +142,18 @@ def _is_large(ctx: Context, away_m: float, turn_rad: float) -> bool:
 def _wait(ctx: Context, p: Participant) -> None:
     """A clutch is engaged: the wearer is told once what will come."""
     c = p.correction
-    if c is not None and c.T_told is None:
+    if c is not None and c.T_told is None and _may_tell(ctx, p):
         _tell(ctx, p, c, "the correction waits until you let go")
+
+
+def _may_tell(ctx: Context, p: Participant) -> bool:
+    """Wild measurements must not fill the wearer's view. It is also how long ago the last one was announced."""
+    return p.told_ns is None or ctx.now_ns - p.told_ns >= ctx.config.announce_ns
 
 
 def _tell(ctx: Context, p: Participant, c: Correction, what: str) -> None:
     away_m, turn_rad = _away(p, c)
-    c.T_told, c.told_ns = c.T_world_tracking, ctx.now_ns
+    c.T_told, p.told_ns = c.T_world_tracking, ctx.now_ns
     size = f"{away_m * 1e3:.0f} mm and {math.degrees(turn_rad):.1f} degrees"
     telling.inform(ctx, p, f"the alignment of {p.name} is off by {size}: {what}")
 
@@ -160,7 +165,7 @@ def _approach(ctx: Context, p: Participant, c: Correction) -> None:
     elif not _is_large(ctx, away_m, turn_rad):
         if ctx.now_ns >= c.slides_ns:
             _slide(ctx, p, c, away_m, turn_rad)
-    elif c.T_told is None or ctx.now_ns - c.told_ns >= ctx.config.announce_ns:
+    elif _may_tell(ctx, p):
         # What was told and what it has become meanwhile may be two things.
         if c.T_told is None or _is_large(ctx, *_apart(c.T_told, c.T_world_tracking, c.pivot_world)):
             _tell(ctx, p, c, f"the scene moves by that in {ctx.config.announce_ns * 1e-9:g} s")
@@ -172,7 +177,7 @@ def _slide(ctx: Context, p: Participant, c: Correction, away_m: float, turn_rad:
     """One part of a small correction; after a pause it goes on sliding, it does not leap."""
     seconds = ctx.config.slide_ns * 1e-9
     parts = max(away_m / (ctx.config.slide_m_per_s * seconds), turn_rad / (ctx.config.slide_rad_per_s * seconds))
-    if parts <= 1.0:
+    if parts <= 1.0 + 1e-6:  # what rounding leaves is no part of its own
         return _arrive(ctx, p, c)
     old, new = _measured(p), c.T_world_tracking
     p_tracking = apply(inverse((new.p, new.q)), c.pivot_world)

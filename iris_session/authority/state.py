@@ -59,8 +59,7 @@ class Warned(msgspec.Struct):
 class Correction(msgspec.Struct):
     """A measured alignment (without the director's offset) that is not wholly in force yet.
 
-    `T_told`: what it was when its wearer was told, at `told_ns`; it may go on changing. `slides_ns`: when the next part
-    of it may come.
+    `T_told`: what it was when its wearer was told; it may go on changing. `slides_ns`: when its next part may come.
     """
 
     T_world_tracking: Pose
@@ -69,7 +68,6 @@ class Correction(msgspec.Struct):
     error_at_anchor_m: float
     slides_ns: int
     T_told: Pose | None = None
-    told_ns: int = 0
 
 
 class Placing(msgspec.Struct):
@@ -98,7 +96,8 @@ class Participant(msgspec.Struct):
     one that was placed. `pivot_world`: the point at which its covariance is stated. `aligning`: its alignment run goes
     on, `alignment_run` counts the starts. `placed`: a director's word stands, so measurements do not count. `in_use`:
     it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that were made at
-    `proposals_from_ns` or before do not count. `devices` empty: none declared, all known ones are taken.
+    `proposals_from_ns` or before do not count. `told_ns`: when its wearer was last told of a correction.
+    `devices` empty: none declared, all known ones are taken.
     """
 
     id: str
@@ -128,6 +127,7 @@ class Participant(msgspec.Struct):
     proposals_from_ns: int = -1
     correction: Correction | None = None
     placing: Placing | None = None
+    told_ns: int | None = None
     alarm: Alarmed | None = None
     refused_ns: int | None = None
     warnings: dict[str, Warned] = {}

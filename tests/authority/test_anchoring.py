@@ -1,0 +1,372 @@
+"""Alignment runs, moved anchors, alarms of the front's watch, comparisons of headsets, and the report of all that."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.protocol.client_messages import Align, Bye, Heartbeat, MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import AlignmentAlarm, CrossChecked, Entry, Lost, SessionResumed
+from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
+    AlignmentChanged,
+    AlignmentRun,
+    AnchorMoved,
+    HeadsetsCompared,
+    Notice,
+    ParticipantChanged,
+)
+from iris_session.protocol.status import AlignmentReport
+
+from .table import MS, SECOND, Person, Table, proposal
+
+TABLE = Pose((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
+DOOR = Pose((2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+CONFIG = AuthorityConfig(anchors={"table": TABLE, "door": DOOR})
+
+
+def shifted(x: float, **fields: Any) -> Any:
+    return proposal(T_world_tracking=Pose((x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), **fields)
+
+
+def report(t: Table, person: Person) -> AlignmentReport:
+    return t.authority.alignment_reports()[person.id]
+
+
+def compared(other: int, **fields: Any) -> CrossChecked:
+    plain: dict[str, Any] = {"error_m": 0.004, "error_rad": 0.01, "expected_p95_m": 0.006, "p_world": (0.0, 1.0, 0.0)}
+    return CrossChecked(other, "table", n=12, **{**plain, **fields})
+
+
+# --- runs -------------------------------------------------------------------------------------------------------------
+
+
+def test_who_may_align_whom() -> None:
+    t = Table(CONFIG)
+    boss, anna, bert = t.join("director", alignment="not_needed"), t.join(name="anna"), t.join(name="bert")
+    assert anna.asks(Align(1, "start")).ok
+    assert t.since(AlignmentRun) == [AlignmentRun(anna.id, True, 1, anna.id)]
+    assert anna.asks(Align(1, "stop", "anna")).ok
+    assert anna.denied(Align(1, "start", bert.id)) == "role"
+    assert anna.denied(Align(1, "start", "nobody")) == "role"
+    assert boss.asks(Align(1, "start", bert.id)).ok
+    assert t.since(AlignmentRun) == [AlignmentRun(bert.id, True, 1, boss.id)]
+    assert boss.denied(Align(1, "start", "nobody")) == "unknown_participant"
+    assert boss.denied(Align(1, "start")) == "invalid"
+    assert boss.denied(Align(1, "dance", bert.id)) == "unknown_value"
+    t.step(t.host(Align(1, "stop", bert.id)))
+    assert t.since(AlignmentRun) == [AlignmentRun(bert.id, False, 1, "host")]
+    t.step(t.host(Align(1, "stop", bert.id)))
+    assert (t.since(AlignmentRun), t.decision.outgoing[0].message.ok) == ([], True)
+
+
+def test_a_new_run_keeps_what_is_in_force_and_lets_the_next_in_at_once() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.sends("left")
+    t.step(anna.says(shifted(1.5)))
+    late = anna.says(shifted(1.9))
+    assert anna.asks(Align(1, "start")).ok
+    assert t.since(AlignmentChanged) == []
+    assert report(t, anna).version == 1
+    t.step(late)
+    t.step(anna.says(Heartbeat()), dt_ns=3 * SECOND)
+    assert t.since(AlignmentChanged) == [], "what the run before has made counts no more, and what waited is dropped"
+    t.step(anna.says(shifted(1.5)))
+    assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == [1.5]
+
+
+def test_a_stopped_run_keeps_what_is_in_force_whatever_is_seen() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.wait(100 * MS)
+    anna.asks(Align(1, "stop"))
+    t.step(anna.says(shifted(1.5)))
+    t.step(anna.says(proposal(refused=True, advice="closer")))
+    assert t.since(AlignmentChanged) == t.since(Notice) == []
+    assert not report(t, anna).running
+
+
+def test_stopping_drops_a_correction_that_waits() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.sends("left")
+    t.step(anna.says(shifted(1.5)))
+    anna.asks(Align(1, "stop"))
+    assert report(t, anna).pending_m == 0.0
+    changes = [t.step(anna.says(Heartbeat()), dt_ns=SECOND) for _ in range(4)]
+    assert not any(isinstance(e.body, AlignmentChanged) for d in changes for e in d.events)
+
+
+def test_measurements_count_again_after_a_placement() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.step(t.host(PlaceAlignment(1, anna.id, Pose((4.0, 0.0, 0.0), IDENTITY.q))))
+    t.step(anna.says(shifted(1.5)))
+    assert t.since(AlignmentChanged) == []
+    anna.asks(Align(1, "start"))
+    t.step()
+    t.step(anna.says(shifted(4.0)))
+    assert [(e.alignment.kind, e.alignment.offset) for e in t.since(AlignmentChanged)] == [("measured", False)]
+
+
+def test_an_offset_ends_with_its_run() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.step(t.host(PlaceAlignment(1, anna.id, Pose((0.0, 1.0, 0.0), IDENTITY.q), offset=True)))
+    assert report(t, anna).offset
+    anna.asks(Align(1, "start"))
+    t.step()
+    assert report(t, anna).offset
+    t.step(anna.says(shifted(1.0)))
+    assert [(e.alignment.offset, e.alignment.T_world_tracking.p) for e in t.since(AlignmentChanged)] == [
+        (False, (1.0, 0.0, 0.0))
+    ]
+
+
+def test_without_alignment_a_stopped_run_is_said() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    anna.asks(Align(1, "stop"))
+    anna.does(TrackingEpoch(1))
+    assert "run is stopped" in t.since(Notice)[0].text
+
+
+# --- anchors ----------------------------------------------------------------------------------------------------------
+
+
+def test_only_a_director_moves_anchors_and_only_to_poses() -> None:
+    t = Table(CONFIG)
+    boss, anna = t.join("director", alignment="not_needed"), t.join()
+    there = Pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    assert anna.denied(MoveAnchor(1, "table", there)) == "role"
+    assert boss.denied(MoveAnchor(1, "moon", there)) == "unknown_target"
+    for p, q in (
+        ((math.nan, 0, 0), IDENTITY.q),
+        ((0, 0, 2e3), IDENTITY.q),
+        ((0, 0, 0), (0.0,) * 4),
+        ((0, 0, 0), (2, 0, 0, 0)),
+    ):
+        assert boss.denied(MoveAnchor(1, "table", Pose(p, q))) == "invalid"  # type: ignore[arg-type]
+    assert t.authority.anchors == {"table": TABLE, "door": DOOR}
+    assert boss.asks(MoveAnchor(1, "table", there)).ok
+    assert t.since(AnchorMoved) == [AnchorMoved("table", there, boss.id)]
+    assert t.authority.anchors == {"table": there, "door": DOOR}
+    assert boss.asks(MoveAnchor(1, "table", there)).ok
+    assert t.since(AnchorMoved) == []
+
+
+def test_what_was_measured_to_the_old_place_counts_no_more() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    anna.sends("left")
+    t.step(anna.says(shifted(1.004)))
+    in_flight = anna.says(shifted(1.008))
+    t.step(t.host(MoveAnchor(1, "table", DOOR)))
+    t.step(in_flight)
+    assert report(t, anna).pending_m == 0.0
+    t.step(anna.says(shifted(3.0)))
+    assert report(t, anna).pending_m == pytest.approx(2.0)
+    assert "2000 mm" in t.since(Notice)[0].text
+
+
+def test_anchors_survive_a_snapshot_and_are_given_anew_to_a_session_that_goes_on() -> None:
+    t = Table(CONFIG)
+    t.step(t.host(MoveAnchor(1, "table", DOOR)))
+    again = Table(CONFIG)
+    again.authority.restore(t.authority.snapshot())
+    assert again.authority.anchors["table"] == DOOR
+    again.now_ns = t.now_ns
+    again.step(again.host(SessionResumed(SECOND)))
+    assert again.since(AnchorMoved) == []
+    again.step(again.host(SessionResumed(SECOND, {"wall": TABLE, "door": DOOR})))
+    assert again.since(AnchorMoved) == [AnchorMoved("wall", TABLE, "host")]
+    assert again.authority.anchors == {"wall": TABLE, "door": DOOR}
+
+
+def test_anchors_must_be_poses() -> None:
+    with pytest.raises(ValueError, match="anchor 'x'"):
+        Authority(AuthorityConfig(anchors={"x": Pose((math.nan, 0.0, 0.0), IDENTITY.q)}), (), ())
+
+
+# --- alarms -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_jump_voids_the_alignment_at_once_and_the_robot_holds() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    before = anna.says(shifted(1.2))
+    t.step(anna.says(AlignmentAlarm("jump", 0, "table", 0.12)))
+    assert t.hold() == "rearm"
+    assert t.since(AlignmentAlarmed) == [AlignmentAlarmed(anna.id, "jump", "table", 0.12)]
+    assert [e.participant.alignment for e in t.since(ParticipantChanged)] == [None]
+    assert "jumped by 120 mm" in t.since(Notice)[0].text
+    t.step(before)
+    assert t.since(AlignmentChanged) == [], "it was made before the jump"
+    assert report(t, anna).alarm == "jump"
+    t.step(anna.says(shifted(1.2)))
+    assert len(t.since(AlignmentChanged)) == 1
+    assert report(t, anna).alarm == ""
+    anna.alignment_version = 2
+    anna.engage("left", p=(3.0, 0.0, 0.0))  # as far away in its frame as the jump has put it
+    assert t.command().kind == "pose"
+
+
+@pytest.mark.parametrize("kind", ["changed", "differs"])
+def test_a_doubt_is_said_and_stays_until_a_new_alignment_answers(kind: str) -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
+    assert t.command().kind == "pose", "a doubt moves nothing and stops nobody"
+    assert t.since(AlignmentAlarmed) == [AlignmentAlarmed(anna.id, kind, "table", 0.03)]
+    assert [e.participant for e in t.since(Notice)] == [anna.id]
+    t.step(anna.says(AlignmentAlarm(kind, 0, "table", 0.03)))
+    assert (len(t.since(AlignmentAlarmed)), t.since(Notice)) == (1, []), "the wearer is not told again and again"
+    anna.sends("left")
+    t.step()
+    r = report(t, anna)
+    assert (r.alarm, r.alarm_size_m, r.version) == (kind, 0.03, 1)
+    assert r.alarm_ns > 0
+    t.step(anna.says(proposal()))
+    for _ in range(30):
+        t.step(anna.says(Heartbeat()), dt_ns=20 * MS)
+    assert t.last(AlignmentChanged).alignment.version == 2, "a new look that says the same answers it too"
+    assert report(t, anna).alarm == ""
+
+
+def test_a_moved_sheet_is_not_answered_by_a_new_alignment_but_by_a_new_place() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.step(anna.says(AlignmentAlarm("changed", 0, "table", 0.03, 0, ("door",))))
+    assert "was the sheet moved?" in t.since(Notice)[0].text
+    assert t.since(AlignmentAlarmed)[0].beside == ("door",)
+    t.step(anna.says(shifted(1.2)))
+    assert report(t, anna).alarm == "changed"
+    t.step(t.host(MoveAnchor(1, "door", TABLE)))
+    assert report(t, anna).alarm == "changed"
+    t.step(t.host(MoveAnchor(1, "table", DOOR)))
+    assert report(t, anna).alarm == ""
+
+
+def test_what_differs_because_a_correction_waits_is_no_alarm() -> None:
+    t = Table(CONFIG)
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(anna.says(shifted(1.2)))
+    t.step(anna.says(AlignmentAlarm("differs", 0, "table", 0.2)))
+    assert (t.decision.events, report(t, anna).pending_m) == ((), pytest.approx(0.2))
+    t.step(anna.says(AlignmentAlarm("changed", 0, "table", 0.2)))
+    assert report(t, anna).pending_m == 0.0
+
+
+@pytest.mark.parametrize(
+    "alarm",
+    [
+        AlignmentAlarm("boom", 0, "table", 0.2),
+        AlignmentAlarm("jump", 0, "table", 0.2),
+    ],
+)
+def test_alarms_of_unknown_kinds_and_old_frames_change_nothing(alarm: AlignmentAlarm) -> None:
+    t = Table(CONFIG)
+    anna, agent = t.operator(), t.join("agent", alignment="not_needed")
+    anna.does(TrackingEpoch(1))
+    t.step(anna.says(alarm), agent.says(AlignmentAlarm("jump", 0)), t.host(AlignmentAlarm("jump", 0)))
+    assert t.decision.events == ()
+
+
+@pytest.mark.parametrize("size_m", [math.nan, math.inf, -1.0, 1e300])
+def test_odd_sizes_are_bounded(size_m: float) -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.step(anna.says(AlignmentAlarm("jump", 1, "", size_m)))
+    assert 0.0 <= t.since(AlignmentAlarmed)[0].size_m <= CONFIG.reach_m
+    assert report(t, anna).version == 0
+
+
+def test_a_flood_of_its_own_does_not_push_out_what_the_front_says() -> None:
+    t = Table(AuthorityConfig(quota=4))
+    anna = t.operator("left")
+    anna.engage("left")
+    t.step(*(anna.says(Heartbeat()) for _ in range(20)), anna.says(AlignmentAlarm("jump", 0)))
+    assert t.hold() == "rearm"
+    assert len(t.since(AlignmentAlarmed)) == 1
+
+
+def test_what_the_front_says_is_no_sign_of_life() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    steps = [t.step(anna.says(proposal()), dt_ns=100 * MS) for _ in range(32)]
+    assert [d.reason for decision in steps for d in decision.dropped] == ["heartbeat"]
+
+
+# --- comparisons ------------------------------------------------------------------------------------------------------
+
+
+def test_two_headsets_are_compared_and_the_newest_is_kept_per_pair() -> None:
+    t = Table(CONFIG)
+    anna, bert, carl = t.operator(), t.operator(), t.operator()
+    t.step(anna.says(compared(bert.connection)), bert.says(compared(carl.connection, error_m=0.1)))
+    assert t.since(HeadsetsCompared)[0] == HeadsetsCompared(
+        anna.id, bert.id, "table", 0.004, 0.01, 0.006, (0.0, 1.0, 0.0), 12
+    )
+    t.step(bert.says(compared(anna.connection, error_m=0.02)), dt_ns=SECOND)
+    t.step(dt_ns=100 * MS)
+    newest, older = t.authority.cross_check_reports()
+    assert ({newest.a, newest.b}, newest.error_m, newest.age_ns) == ({anna.id, bert.id}, 0.02, 100 * MS)
+    assert ({older.a, older.b}, older.error_m) == ({bert.id, carl.id}, 0.1)
+    t.step(anna.says(Lost()))
+    assert len(t.authority.cross_check_reports()) == 2
+    carl.does(Bye())
+    assert [{c.a, c.b} for c in t.authority.cross_check_reports()] == [{anna.id, bert.id}]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"error_m": math.nan}, {"error_rad": -1.0}, {"expected_p95_m": math.inf}, {"p_world": (0.0, math.nan, 0.0)}],
+)
+def test_comparisons_that_are_no_numbers_are_ignored(fields: dict[str, Any]) -> None:
+    t = Table(CONFIG)
+    anna, bert = t.operator(), t.operator()
+    t.step(anna.says(compared(bert.connection, **fields)))
+    assert (t.decision.events, t.authority.cross_check_reports()) == ((), ())
+
+
+def test_comparisons_with_who_is_gone_are_ignored() -> None:
+    t = Table(CONFIG)
+    anna, bert = t.operator(), t.operator()
+    t.step(bert.says(Lost()))
+    for other in (bert.connection, anna.connection, 0, 99):
+        t.step(anna.says(compared(other)))
+        assert t.decision.events == ()
+    t.step(Entry(99, 99, t.now_ns, compared(anna.connection)), t.host(compared(anna.connection)))
+    assert (t.decision.events, t.authority.cross_check_reports()) == ((), ())
+
+
+def test_of_many_pairs_the_newest_are_reported() -> None:
+    t = Table(CONFIG)
+    people = [t.join() for _ in range(13)]
+    for i, a in enumerate(people):
+        for b in people[:i]:
+            t.step(a.says(compared(b.connection)), *(p.says(Heartbeat()) for p in people))
+    reports = t.authority.cross_check_reports()
+    assert len(reports) == 64
+    assert reports[0].age_ns == 0
+
+
+def test_the_report_has_those_who_need_an_alignment() -> None:
+    t = Table(CONFIG)
+    anna = t.operator()
+    t.join("agent", alignment="not_needed")
+    assert t.authority.alignment_reports().keys() == {anna.id}
+    r = report(t, anna)
+    a = t.last(AlignmentChanged).alignment
+    assert (r.version, r.running, r.error_at_anchor_m, r.error_at_robot_m) == (1, True, 0.002, a.error_at_robot_m)
