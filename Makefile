@@ -74,7 +74,7 @@ coverage: install-dev
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input" "slow-client"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 
