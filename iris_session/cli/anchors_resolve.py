@@ -1,8 +1,8 @@
 """Alignments and constellations solved again from a recording, with what was seen before and after: the calculation
 behind `iris-session anchors solve`.
 
-An alignment of the live session rests on what was seen until then. Here everything within `AROUND_NS` of a moment
-counts, before it and after it, by how long before or after: what drifts in between widens the error alike.
+An alignment of the live session rests on what was seen until then. Here what was seen after it counts too
+(`anchors_around`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator
+from anchors.alignment import AlignmentConfig, AlignmentEstimate
 from anchors.constellation import (
     Constellation,
     ConstellationError,
@@ -24,25 +24,16 @@ from anchors.constellation import (
     find_moved,
     solve_constellation,
 )
-from anchors.controller import controller_covariance
 from anchors.noise import NoiseModel, isotropic, stated
-from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, quat_angle
+from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, is_rigid, quat_angle
 from anchors.uncertainty import length_p95
-from iris_session.protocol.client_messages import Observation
+from iris_session.cli.anchors_around import MAX_IN_GROUP, Anchors, Resolver, covariance_of, pose_of
 from iris_session.protocol.names import AlignmentKind, AnchorKind
 from iris_session.recording import Frame, InForce, Look, Looks
 
-AROUND_NS: Final = 600_000_000_000
-#: Of one viewpoint, and viewpoints: those nearest to the moment.
-MAX_IN_GROUP: Final = 120
-MAX_GROUPS: Final = 200
-#: Moments closer than this share a solution: tracking frames drift by less than a millimetre meanwhile.
-GRAIN_NS: Final = 10_000_000_000
 #: Beyond the stated 95 % by this factor it is not chance.
 BEYOND: Final = 2.0
 SHEETS: Final = (AnchorKind.QR, AnchorKind.BOARD)
-#: What numbers of a stranger can make of linear algebra.
-_UNSOLVABLE: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True)
@@ -102,127 +93,6 @@ class Result:
     outliers: list[Outlier] = field(default_factory=list)
 
 
-class Anchors:
-    """Where anchors were, over time: as configured, then as directors moved them; or by a file, always the same."""
-
-    def __init__(self, looks: Looks, configured: Mapping[str, PoseTuple], given: Constellation | None) -> None:
-        self._eras: list[tuple[int, dict[str, PoseTuple]]] = [(0, dict(configured if given is None else given.anchors))]
-        for moved in () if given is not None else looks.moved:
-            pose = (moved.T_world_anchor.p, moved.T_world_anchor.q)
-            self._eras.append((moved.session_time, {**self._eras[-1][1], moved.anchor_id: pose}))
-
-    def era(self, now_ns: int) -> int:
-        """Number of the period in which none was moved."""
-        return max(i for i, (since, _) in enumerate(self._eras) if i == 0 or since <= now_ns)
-
-    def of(self, era: int) -> dict[str, PoseTuple]:
-        return self._eras[era][1]
-
-    @property
-    def last(self) -> dict[str, PoseTuple]:
-        return self._eras[-1][1]
-
-
-class Resolver:
-    """Solutions of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
-
-    def __init__(self, looks: Sequence[Look], anchors: Anchors, sizes: Mapping[str, float]) -> None:
-        self._looks, self._anchors, self._sizes = looks, anchors, sizes
-        self._times = np.array([look.seen.capture_ns for look in looks], dtype=np.int64)
-        self._known: dict[tuple[int, int], tuple[AlignmentEstimate, AlignmentEstimator]] = {}
-
-    def at(self, now_ns: int) -> AlignmentEstimate:
-        """What was seen around `now_ns` as one alignment, with the anchors of then."""
-        return self._solve(now_ns)[0]
-
-    def unused(self, now_ns: int) -> dict[str, int]:
-        """How many observations around `now_ns` were of no use, by reason."""
-        e = self._solve(now_ns)[1]
-        counts = {
-            "unknown anchor": e.unknown_anchors,
-            "wrong size": e.wrong_size,
-            "against gravity": e.against_gravity,
-            "not a pose": e.invalid,
-            "touched points": sum(look.seen.kind == AnchorKind.TOUCH for look in self._looks),
-        }
-        return {why: n for why, n in counts.items() if n}
-
-    def _solve(self, now_ns: int) -> tuple[AlignmentEstimate, AlignmentEstimator]:
-        moment = (now_ns // GRAIN_NS) * GRAIN_NS + GRAIN_NS // 2
-        key = (moment, self._anchors.era(now_ns))
-        if key not in self._known:
-            config = AlignmentConfig(
-                max_observations=MAX_IN_GROUP * MAX_GROUPS,
-                max_in_group=MAX_IN_GROUP,
-                max_groups=MAX_GROUPS,
-                max_age_ns=AROUND_NS,
-            )
-            estimator = AlignmentEstimator(self._anchors.of(key[1]), config, self._sizes)
-            for look in reversed(self._around(moment)):
-                # What came after counts as what came as long before.
-                add(estimator, look, moment - abs(look.seen.capture_ns - moment))
-            self._known[key] = estimate(estimator), estimator
-        return self._known[key]
-
-    def _around(self, moment: int) -> list[Look]:
-        """The looks that count, nearest first."""
-        away = np.abs(self._times - moment)
-        groups: dict[tuple[str, int], int] = {}
-        kept = []
-        for i in np.argsort(away, kind="stable").tolist():
-            seen = self._looks[i].seen
-            if away[i] > AROUND_NS:
-                break
-            key = (seen.anchor_id, seen.viewpoint_id)
-            n = groups.get(key, 0)
-            if seen.kind == AnchorKind.TOUCH or n >= MAX_IN_GROUP or (not n and len(groups) >= MAX_GROUPS):
-                continue
-            groups[key] = n + 1
-            kept.append(self._looks[i])
-        return kept
-
-
-def add(estimator: AlignmentEstimator, look: Look, capture_ns: int) -> bool:
-    """As the front does it."""
-    seen = look.seen
-    try:
-        return estimator.add(
-            seen.anchor_id,
-            pose_of(seen),
-            capture_ns,
-            seen.tracking_epoch,
-            viewpoint_id=seen.viewpoint_id,
-            quality=seen.quality,
-            size_m=seen.size_m,
-            covariance=covariance_of(seen),
-            p_tracking_head=None if seen.kind == AnchorKind.CONTROLLER else look.p_tracking_head,
-        )
-    except _UNSOLVABLE:
-        estimator.invalid += 1
-        return False
-
-
-def estimate(estimator: AlignmentEstimator) -> AlignmentEstimate:
-    """The solution; refused for numbers that nobody can solve."""
-    try:
-        return estimator.estimate()
-    except _UNSOLVABLE:
-        zero, epoch = (0.0, 0.0, 0.0), estimator.tracking_epoch
-        text = "what was seen cannot be solved"
-        return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, zero, math.inf, 0.0, 0, 0, True, text)
-
-
-def pose_of(seen: Observation) -> PoseTuple:
-    return seen.T_tracking_anchor.p, seen.T_tracking_anchor.q
-
-
-def covariance_of(seen: Observation) -> tuple[float, ...]:
-    """As stated; that of a tracked controller where its client states none."""
-    if seen.kind == AnchorKind.CONTROLLER and not seen.covariance:
-        return controller_covariance()
-    return seen.covariance
-
-
 def resolve(
     frame: Frame,
     looks: Sequence[Look],
@@ -238,9 +108,7 @@ def resolve(
     for look in looks:
         sheets[look.seen.anchor_id] = sheets.get(look.seen.anchor_id, 0) + 1
     viewpoints = len({look.seen.viewpoint_id for look in looks})
-    result = Result(
-        frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.at(last_ns), resolver.unused(last_ns)
-    )
+    result = Result(frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.at(last_ns), resolver.unused())
     for live in in_force:
         result.compared.append(compare(live, resolver, last_ns))
         told()
@@ -285,7 +153,7 @@ def outliers(looks: Sequence[Look], resolver: Resolver, anchors: Anchors) -> lis
         solved = resolver.at(at_ns)
         if place is None or solved.refused:
             continue
-        seen = [compose(solved.T_world_tracking, pose_of(look.seen)) for look in group if _sound(look.seen)]
+        seen = [compose(solved.T_world_tracking, pose_of(look.seen)) for look in group if is_rigid(pose_of(look.seen))]
         if not seen:
             continue
         middle = np.median(np.array([p for p, _ in seen]), axis=0)
@@ -295,11 +163,6 @@ def outliers(looks: Sequence[Look], resolver: Resolver, anchors: Anchors) -> lis
         if off_m > BEYOND * expected:
             found.append(Outlier(anchor_id, viewpoint_id, len(group), off_m, off_rad, expected, at_ns))
     return sorted(found, key=lambda one: -one.off_m)
-
-
-def _sound(seen: Observation) -> bool:
-    q = seen.T_tracking_anchor.q
-    return all(map(math.isfinite, (*seen.T_tracking_anchor.p, *q))) and abs(math.hypot(*q) - 1.0) < 1e-2
 
 
 def noise_p95(look: Look) -> float:
@@ -357,7 +220,7 @@ def _seen(looks: Looks) -> Iterable[Seen]:
             o = look.seen
             key = (o.anchor_id, o.viewpoint_id)
             groups[key] = groups.get(key, 0) + 1
-            if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and _sound(o):
+            if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(pose_of(o)):
                 headset = f"{frame.participant} {frame.run}"  # a new run has a tracking frame of its own
                 yield Seen(headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, pose_of(o), look.p_tracking_head)
 

@@ -49,7 +49,8 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def run_solve(arguments: argparse.Namespace) -> int:
     """Exit status 1 when `--out` was asked for and nothing can be written."""
-    from iris_session.cli.anchors_resolve import Anchors, constellation
+    from iris_session.cli.anchors_around import Anchors
+    from iris_session.cli.anchors_resolve import constellation
     from iris_session.recording import Recording, read_looks
     from iris_session.runtime.anchors_file import load_anchors
 

@@ -1,0 +1,257 @@
+"""The alignment of one headset at any moment of a recording, by what was seen before it and after it.
+
+What came before is solved forwards in time, what came after backwards, each by the estimator of the live session with
+its model of drift; the two are then weighted by their covariances (a two-filter smoother, Fraser and Potter 1969).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator
+from anchors.constellation import Constellation
+from anchors.controller import controller_covariance
+from anchors.pose import (
+    IDENTITY_POSE,
+    PoseTuple,
+    Vec3,
+    apply,
+    inverse,
+    quat_conj,
+    quat_from_rotvec,
+    quat_mul,
+    quat_normalize,
+    quat_rotate,
+    quat_to_rotvec,
+)
+from anchors.uncertainty import length_p95
+from iris_session.protocol.client_messages import Observation
+from iris_session.protocol.names import AnchorKind
+from iris_session.recording import Look, Looks
+
+Array = NDArray[np.float64]
+AROUND_NS: Final = 600_000_000_000
+#: Of one viewpoint, and viewpoints: those nearest to the moment.
+MAX_IN_GROUP: Final = 120
+MAX_GROUPS: Final = 200
+#: Moments closer than this share a solution: tracking frames drift by less than a millimetre meanwhile.
+GRAIN_NS: Final = 10_000_000_000
+#: 99.9 % quantile of chi-square with 6 degrees of freedom.
+CHI2_6_999: Final = 22.458
+#: What numbers of a stranger can make of linear algebra.
+_UNSOLVABLE: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+
+
+class Anchors:
+    """Where anchors were, over time: as configured, then as directors moved them; or by a file, always the same."""
+
+    def __init__(self, looks: Looks, configured: Mapping[str, PoseTuple], given: Constellation | None) -> None:
+        self._eras: list[tuple[int, dict[str, PoseTuple]]] = [(0, dict(configured if given is None else given.anchors))]
+        for moved in () if given is not None else looks.moved:
+            pose = (moved.T_world_anchor.p, moved.T_world_anchor.q)
+            self._eras.append((moved.session_time, {**self._eras[-1][1], moved.anchor_id: pose}))
+
+    def era(self, now_ns: int) -> int:
+        """Number of the period in which none was moved."""
+        return max(i for i, (since, _) in enumerate(self._eras) if i == 0 or since <= now_ns)
+
+    def of(self, era: int) -> dict[str, PoseTuple]:
+        return self._eras[era][1]
+
+    @property
+    def last(self) -> dict[str, PoseTuple]:
+        return self._eras[-1][1]
+
+
+class Resolver:
+    """Solutions of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
+
+    def __init__(self, looks: Sequence[Look], anchors: Anchors, sizes: Mapping[str, float]) -> None:
+        self._looks, self._anchors, self._sizes = looks, anchors, sizes
+        self._times = np.array([look.seen.capture_ns for look in looks], dtype=np.int64)
+        self._known: dict[tuple[int, int], AlignmentEstimate] = {}
+
+    def at(self, now_ns: int) -> AlignmentEstimate:
+        """What was seen around `now_ns` as one alignment, with the anchors of then."""
+        moment = (now_ns // GRAIN_NS) * GRAIN_NS + GRAIN_NS // 2
+        key = (moment, self._anchors.era(now_ns))
+        if key not in self._known:
+            places = self._anchors.of(key[1])
+            solved = self._solve(moment, places)
+            seen = sorted({look.seen.anchor_id for look in self._looks} & set(places))
+            if solved.refused and len(seen) > 2:
+                solved = self._without_one(moment, places, seen) or solved
+            self._known[key] = solved
+        return self._known[key]
+
+    def _without_one(
+        self, moment: int, places: Mapping[str, PoseTuple], seen: Sequence[str]
+    ) -> AlignmentEstimate | None:
+        """Of three or more sheets all but one may agree: then that one was moved."""
+        tried = []
+        for name in seen:
+            solved = self._solve(moment, {k: pose for k, pose in places.items() if k != name})
+            if not solved.refused:
+                advice = f"moved since it was measured: sheet '{name}'; it is not used"
+                tried.append(replace(solved, moved=(name,), advice=advice))
+        return min(tried, key=lambda one: one.error_at_anchor_m, default=None)
+
+    def unused(self) -> dict[str, int]:
+        """How many observations are of no use at all, by reason."""
+        e = AlignmentEstimator(self._anchors.last, AlignmentConfig(), self._sizes)
+        touched = 0
+        for look in self._looks:
+            if look.seen.kind == AnchorKind.TOUCH:
+                touched += 1
+            else:
+                add(e, look, look.seen.capture_ns)
+        counts = {
+            "unknown anchor": e.unknown_anchors,
+            "wrong size": e.wrong_size,
+            "against gravity": e.against_gravity,
+            "not a pose": e.invalid,
+            "touched points": touched,
+        }
+        return {why: n for why, n in counts.items() if n}
+
+    def _solve(self, moment: int, places: Mapping[str, PoseTuple]) -> AlignmentEstimate:
+        sides = []
+        halves = self._sides(moment)
+        for looks, sign in zip(halves, (1, -1), strict=True):
+            estimator = AlignmentEstimator(places, _config(), self._sizes)
+            ages = [sign * (look.seen.capture_ns - moment) for look in looks]
+            for look, age_ns in sorted(zip(looks, ages, strict=True), key=lambda one: one[1]):
+                add(estimator, look, moment + age_ns)
+            sides.append(_later(estimate(estimator), -max(ages, default=0) * 1e-9))
+        before, after = sides
+        if before.refused and after.refused:
+            return before if len(halves[0]) >= len(halves[1]) else after
+        if before.refused or after.refused:
+            return after if before.refused else before
+        return fused(before, after)
+
+    def _sides(self, moment: int) -> tuple[list[Look], list[Look]]:
+        """The looks that count, before the moment and after it. What was seen from one viewpoint stays together: its
+        errors are common."""
+        away = np.abs(self._times - moment)
+        groups: dict[tuple[str, int], list[Look]] = {}
+        for i in np.argsort(away, kind="stable").tolist():
+            seen = self._looks[i].seen
+            key = (seen.anchor_id, seen.viewpoint_id)
+            if away[i] > AROUND_NS or (key not in groups and len(groups) >= MAX_GROUPS):
+                break
+            if seen.kind != AnchorKind.TOUCH and len(groups.setdefault(key, [])) < MAX_IN_GROUP:
+                groups[key].append(self._looks[i])
+        sides: tuple[list[Look], list[Look]] = ([], [])
+        for group in groups.values():
+            late = 2 * sum(look.seen.capture_ns > moment for look in group) > len(group)
+            sides[late].extend(group)
+        return sides
+
+
+def _config() -> AlignmentConfig:
+    return AlignmentConfig(
+        max_observations=MAX_IN_GROUP * MAX_GROUPS,
+        max_in_group=MAX_IN_GROUP,
+        max_groups=MAX_GROUPS,
+        max_age_ns=2 * AROUND_NS,
+    )
+
+
+def _later(e: AlignmentEstimate, seconds: float) -> AlignmentEstimate:
+    """The same so long after its newest look: what the frame may have drifted meanwhile is added to its covariance."""
+    if e.refused or seconds <= 0.0:
+        return e
+    prior = _config().prior
+    drifted = (prior.drift_m_per_s * seconds) ** 2 + prior.walk_m_per_sqrt_s**2 * seconds
+    return _with(e, e.T_world_tracking, np.reshape(e.covariance, (6, 6)) + np.diag([drifted] * 3 + [0.0] * 3))
+
+
+def _with(e: AlignmentEstimate, T: PoseTuple, C: Array) -> AlignmentEstimate:
+    C = 0.5 * (C + C.T)
+    return replace(e, T_world_tracking=T, covariance=tuple(C.ravel().tolist()), error_at_anchor_m=length_p95(C[:3, :3]))
+
+
+def fused(a: AlignmentEstimate, b: AlignmentEstimate) -> AlignmentEstimate:
+    """Both as one, at the pivot of `a`: means weighted by covariances, wider where they differ by more than these."""
+    p_tracking = apply(inverse(a.T_world_tracking), a.pivot_world)
+    p_b = apply(b.T_world_tracking, p_tracking)
+    turn = quat_to_rotvec(quat_mul(b.T_world_tracking[1], quat_conj(a.T_world_tracking[1])))
+    x = np.array([*(p_b[i] - a.pivot_world[i] for i in range(3)), *turn])
+    C_a, C_b = np.reshape(a.covariance, (6, 6)), _carried(b, p_b)
+    gain = C_a @ np.linalg.inv(C_a + C_b)
+    step, C = gain @ x, C_a - gain @ C_a
+    misfit = float(x @ np.linalg.solve(C_a + C_b, x))
+    if misfit > CHI2_6_999:
+        C = C * (misfit / 6.0)
+    dx, dy, dz, *dr = step.tolist()
+    q = quat_normalize(quat_mul(quat_from_rotvec((dr[0], dr[1], dr[2])), a.T_world_tracking[1]))
+    lever = quat_rotate(q, p_tracking)
+    x0, y0, z0 = a.pivot_world
+    p: Vec3 = (x0 + dx - lever[0], y0 + dy - lever[1], z0 + dz - lever[2])
+    both = _with(a, (p, q), C)
+    tilt = max(a.residual_tilt_rad, b.residual_tilt_rad)
+    return replace(
+        both,
+        residual_tilt_rad=tilt,
+        pivot_world=(x0 + dx, y0 + dy, z0 + dz),
+        n_observations=a.n_observations + b.n_observations,
+        n_viewpoints=a.n_viewpoints + b.n_viewpoints,
+        advice=a.advice or b.advice,
+        moved=tuple(sorted({*a.moved, *b.moved})),
+    )
+
+
+def _carried(e: AlignmentEstimate, p_world: Vec3) -> Array:
+    """Covariance (6, 6) of an estimate at another point: d(point) = d(pivot) + rot x (point - pivot)."""
+    x, y, z = (p_world[i] - e.pivot_world[i] for i in range(3))
+    J = np.eye(6)
+    J[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(J @ np.reshape(e.covariance, (6, 6)) @ J.T)
+
+
+def add(estimator: AlignmentEstimator, look: Look, capture_ns: int) -> bool:
+    """As the front does it."""
+    seen = look.seen
+    try:
+        return estimator.add(
+            seen.anchor_id,
+            pose_of(seen),
+            capture_ns,
+            seen.tracking_epoch,
+            viewpoint_id=seen.viewpoint_id,
+            quality=seen.quality,
+            size_m=seen.size_m,
+            covariance=covariance_of(seen),
+            p_tracking_head=None if seen.kind == AnchorKind.CONTROLLER else look.p_tracking_head,
+        )
+    except _UNSOLVABLE:
+        estimator.invalid += 1
+        return False
+
+
+def estimate(estimator: AlignmentEstimator) -> AlignmentEstimate:
+    """The solution; refused for numbers that nobody can solve."""
+    try:
+        return estimator.estimate()
+    except _UNSOLVABLE:
+        zero, epoch = (0.0, 0.0, 0.0), estimator.tracking_epoch
+        text = "what was seen cannot be solved"
+        return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, zero, math.inf, 0.0, 0, 0, True, text)
+
+
+def pose_of(seen: Observation) -> PoseTuple:
+    return seen.T_tracking_anchor.p, seen.T_tracking_anchor.q
+
+
+def covariance_of(seen: Observation) -> tuple[float, ...]:
+    """As stated; that of a tracked controller where its client states none."""
+    if seen.kind == AnchorKind.CONTROLLER and not seen.covariance:
+        return controller_covariance()
+    return seen.covariance

@@ -1,0 +1,123 @@
+"""A recorded session of headsets that look at sheets, without a session: for tests of what is read back of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from anchors.pose import PoseTuple, apply, inverse
+from iris_session.protocol.client_messages import Observation, Sample
+from iris_session.protocol.common import Alignment, Pose
+from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    Event,
+    EventKind,
+    ParticipantInfo,
+    ParticipantJoined,
+)
+from iris_session.recording import Settings, header_root, make_row
+from iris_session.recording.messages import Batch
+from iris_session.recording.writer import RrdWriter
+from tests.anchors.worlds import Look, around
+from tests.recording.support import make_header
+
+S = 1_000_000_000
+STEP_NS = S // 10
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class Played:
+    """What happened, step by step; `write` makes a recording of it. `anchors`: as the session has them."""
+
+    def __init__(self, anchors: dict[str, PoseTuple], sizes: dict[str, float] | None = None, seed: int = 1) -> None:
+        poses = {name: Pose(p, q) for name, (p, q) in anchors.items()}
+        settings = Settings(60.0, 5.0, False, anchor_sizes=sizes or {})
+        self.header = msgspec.structs.replace(make_header(), anchors=poses, settings=settings)
+        self.rng = np.random.default_rng(seed)
+        self.now_ns = 0
+        self.samples: list[tuple[int, int, bytes]] = []
+        self._entries: dict[int, list[Entry]] = {}
+        self._events: list[Event] = []
+        self._people: dict[str, ParticipantInfo] = {}
+
+    @property
+    def step(self) -> int:
+        return self.now_ns // STEP_NS
+
+    def wait(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+    def event(self, body: EventKind) -> None:
+        self._events.append(Event(len(self._events) + 1, self.step, self.now_ns, body))
+
+    def join(
+        self,
+        connection: int,
+        id: str,
+        name: str,
+        *,
+        run: str = "run:1",
+        role: str = "operator",
+        alignment: Alignment | None = None,
+        refused: bool = False,
+    ) -> None:
+        """`refused`: the session did not take it, so there is no event."""
+        entry = Entry(connection, connection, self.now_ns, Join("key", role, name, capabilities=(run,) if run else ()))
+        self._entries.setdefault(self.step, []).append(entry)
+        if not refused:
+            self.event(ParticipantJoined(ParticipantInfo(id, name, role, True, alignment=alignment), resumed=False))
+
+    def aligned(self, id: str, version: int, T_world_tracking: PoseTuple, stated_m: float, epoch: int = 0) -> None:
+        """The session accepts an alignment."""
+        pose = Pose(*T_world_tracking)
+        self.event(AlignmentChanged(id, Alignment(version, "measured", pose, epoch, (), stated_m, stated_m)))
+
+    def look(
+        self,
+        connection: int,
+        anchor_id: str,
+        T_world_anchor: PoseTuple,
+        T_world_tracking: PoseTuple,
+        viewpoint: int,
+        *,
+        n: int = 20,
+        epoch: int = 0,
+        head_late_ns: int = 5_000_000,
+        noise: float = 1.0,
+    ) -> None:
+        """A headset looks at a sheet from a new place, `n` pictures in two seconds. `head_late_ns`: how long after a
+        picture the nearest sample of the head was taken."""
+        look = Look(self.rng, T_world_anchor, around(self.rng, T_world_anchor[0], 0.6), noise)
+        for _ in range(n):
+            self.wait(2.0 / n)
+            seen = Observation(
+                anchor_id, "qr", Pose(*look.new(T_world_tracking)), self.now_ns, epoch, viewpoint, size_m=0.16
+            )
+            self.sample(
+                connection, apply(inverse(T_world_tracking), look.p_head_world), self.now_ns + head_late_ns, epoch
+            )
+            self.raw(connection, _encode(seen))
+
+    def sample(self, connection: int, p: tuple[float, float, float], capture_ns: int, epoch: int = 0) -> None:
+        head = Sample("head", "pose", len(self.samples), capture_ns, 1, epoch, 1, pose=Pose(p, (1.0, 0.0, 0.0, 0.0)))
+        self.raw(connection, _encode(head))
+
+    def raw(self, connection: int, data: bytes) -> None:
+        self.samples.append((connection, self.now_ns, data))
+
+    def write(self, path: Path) -> Path:
+        """The recording."""
+        writer = RrdWriter(path, "id")
+        writer.header(self.header)
+        chain, rows = header_root(self.header), []
+        for step in range(self.step + 1):
+            rows.append(make_row(chain, step, step * STEP_NS, 1, self._entries.get(step, []), b"\0" * 16, b""))
+            chain = rows[-1].chain
+        writer.add(Batch(rows=rows, events=self._events))
+        for sample in self.samples:
+            writer.add_sample(*sample)
+        writer.close()
+        return path

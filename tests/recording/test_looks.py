@@ -1,0 +1,150 @@
+"""What headsets saw is read back: whose it was, in which tracking frame, where the head was, what was in force."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from anchors.pose import PoseTuple, distance
+from iris_session.protocol.common import IDENTITY, Alignment, Pose
+from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
+    AnchorMoved,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantLeft,
+)
+from iris_session.recording import Frame, Looks, Recording, read_looks
+from tests.recording.headsets import Played, S
+
+TABLE: PoseTuple = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
+HERE: PoseTuple = ((0.3, 0.2, 0.0), (1.0, 0.0, 0.0, 0.0))
+NOT_NEEDED = Alignment(0, "not_needed", IDENTITY)
+
+
+@pytest.fixture
+def played() -> Played:
+    return Played({"table": TABLE})
+
+
+def read(played: Played, folder: Path) -> Looks:
+    with Recording.open(played.write(folder / "session.rrd")) as recording:
+        return read_looks(recording)
+
+
+def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) -> None:
+    """Several who join in one step, one of them refused, two of one name."""
+    played.join(1, "", "eve", refused=True)
+    played.join(2, "p1", "ann")
+    played.join(3, "p2", "ann")
+    played.join(4, "p3", "desk", role="agent", alignment=NOT_NEEDED)
+    played.wait(1.0)
+    played.look(3, "table", TABLE, HERE, 1, n=4)
+    played.look(2, "table", TABLE, HERE, 2, n=3)
+    played.look(9, "table", TABLE, HERE, 3, n=2)
+    found = read(played, tmp_path)
+    assert {frame: len(looks) for frame, looks in found.looks.items()} == {Frame("p1", 1, 0): 3, Frame("p2", 1, 0): 4}
+    assert found.unowned == 2, "nobody joined by that connection"
+    assert {id: one.aligned for id, one in found.people.items()} == {"p1": True, "p2": True, "p3": False}
+
+
+def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann", run="run:a")
+    played.look(1, "table", TABLE, HERE, 1, n=2)
+    played.look(1, "table", TABLE, HERE, 2, n=3, epoch=1)
+    played.join(2, "p1", "ann", run="run:a")  # the connection broke, the tracking went on
+    played.look(2, "table", TABLE, HERE, 3, n=4, epoch=1)
+    played.join(3, "p1", "ann", run="run:b")  # the app was started anew
+    played.look(3, "table", TABLE, HERE, 4, n=5)
+    found = read(played, tmp_path)
+    assert {frame: len(looks) for frame, looks in found.looks.items()} == {
+        Frame("p1", 1, 0): 2,
+        Frame("p1", 1, 1): 7,
+        Frame("p1", 2, 0): 5,
+    }
+
+
+@pytest.mark.parametrize(("late_ns", "known"), [(5_000_000, True), (-50_000_000, True), (50_000_001, False)])
+def test_the_head_pose_nearest_in_time_goes_with_a_look(
+    played: Played, tmp_path: Path, late_ns: int, known: bool
+) -> None:
+    played.join(1, "p1", "ann")
+    played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=late_ns)
+    played.sample(1, (9.0, 9.0, 9.0), played.now_ns + 2 * abs(late_ns))
+    (look,) = read(played, tmp_path).looks["p1", 1, 0]
+    assert (look.p_tracking_head is not None) == known
+    if look.p_tracking_head is not None:
+        assert distance(look.p_tracking_head, look.seen.T_tracking_anchor.p) < 0.7
+
+
+def test_heads_of_another_tracking_epoch_say_nothing(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann")
+    played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=S)
+    played.sample(1, (1.0, 2.0, 3.0), played.now_ns, epoch=1)
+    (look,) = read(played, tmp_path).looks["p1", 1, 0]
+    assert look.p_tracking_head is None
+
+
+def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann")
+    played.aligned("p1", 1, HERE, 0.004)
+    played.wait(1.0)
+    played.aligned("p1", 2, HERE, 0.004)
+    played.wait(1.0)
+    played.event(AlignmentAlarmed("p1", "differs", "table", 0.02))  # says something, ends nothing
+    played.wait(1.0)
+    played.event(AlignmentAlarmed("p1", "jump", "", 0.2))
+    played.wait(1.0)
+    played.aligned("p1", 3, HERE, 0.004)
+    played.wait(1.0)
+    played.event(ParticipantChanged(ParticipantInfo("p1", "ann", "operator", True, tracking_epoch=1)))
+    played.aligned("p1", 4, HERE, 0.004, epoch=1)
+    played.wait(1.0)
+    played.event(ParticipantLeft("p1", "silent", grace=True))
+    played.wait(1.0)
+    played.event(ParticipantLeft("p1", "expired"))
+    played.join(2, "p2", "bob")
+    played.aligned("p2", 1, HERE, 0.004)
+    found = read(played, tmp_path).in_force
+    assert [(one.alignment.version, one.since_ns // S, one.until_ns // S) for one in found] == [
+        (1, 0, 1),
+        (2, 1, 3),
+        (3, 4, 5),
+        (4, 5, 7),
+        (1, 7, -1),
+    ]
+    assert found[3].frame == Frame("p1", 1, 1)
+
+
+def test_moved_anchors_are_told(played: Played, tmp_path: Path) -> None:
+    played.wait(2.0)
+    played.event(AnchorMoved("table", Pose(*HERE)))
+    (moved,) = read(played, tmp_path).moved
+    assert moved == (2 * S, "table", Pose(*HERE))
+
+
+def test_what_does_not_decode_is_counted(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann")
+    played.raw(1, b"\xc1")
+    played.raw(1, b"\x81\xa4type\xa3bye")
+    played.look(1, "table", TABLE, HERE, 1, n=2)
+    found = read(played, tmp_path)
+    assert (found.unreadable, len(found.looks["p1", 1, 0])) == (2, 2)
+
+
+def test_recordings_of_any_session_can_be_read(played: Played, tmp_path: Path) -> None:
+    """Nobody came, and no raw message was written at all."""
+    found = read(played, tmp_path)
+    assert (found.people, found.looks, found.in_force) == ({}, {}, [])
+
+
+def test_progress_comes_to_its_end(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann")
+    played.look(1, "table", TABLE, HERE, 1, n=2)
+    told: list[tuple[int, int]] = []
+    with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
+        read_looks(recording, lambda done, total: told.append((done, total)))
+        assert told[-1] == (recording.count_rows() + recording.count_samples(),) * 2
+        assert recording.count_samples() == 4
+    assert told == sorted(told)
