@@ -53,7 +53,8 @@ def align(ctx: Context, p: Participant, m: Align) -> None:
 def _start(ctx: Context, p: Participant) -> None:
     """Measures anew: what is in force stays until then, a director's word and offset do not outlive it."""
     p.alignment_run += 1
-    p.aligning, p.placed, p.in_use, p.aligned_ns = True, False, False, None
+    p.aligning, p.placed, p.aligned_ns = True, False, None
+    p.in_use = corrections.engaged(ctx, p)  # who works with it meanwhile is not startled by the first of the new ones
     p.correction = p.placing = p.offset = None
     p.proposals_from_ns = ctx.now_ns
     if p.alignment is not None and p.alignment.kind == AlignmentKind.MEASURED:

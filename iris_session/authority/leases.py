@@ -119,10 +119,13 @@ def release(ctx: Context, p: Participant, m: Release) -> None:
     return ctx.accept(p, m.request_id, chosen)
 
 
-def forget_requests(ctx: Context, p: Participant, why: str) -> None:
-    """Drops what `p` waits for; answers it with `why` unless that is empty (the participant is gone)."""
+def forget_requests(ctx: Context, p: Participant, why: str, *, keeps_place: bool = False) -> None:
+    """Drops what `p` waits for; answers it with `why` unless that is empty (the participant is gone). `keeps_place`:
+    its place in the queue stays, and nobody waits for the answer."""
     for pending in (*ctx.state.queue, *ctx.state.consents):
-        if pending.participant == p.id:
+        if pending.participant == p.id and keeps_place and pending in ctx.state.queue:
+            pending.request_id = KEPT
+        elif pending.participant == p.id:
             drop_request(ctx, pending)
             if why and pending.request_id != KEPT:
                 text = f"no longer waiting: {why}"

@@ -6,7 +6,7 @@ from typing import Final
 
 from iris_session.authority import anchoring, assignment, corrections, engagement, leases
 from iris_session.authority.context import Context
-from iris_session.authority.state import HOST_ID, KEPT, NO_CONNECTION, Participant
+from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
@@ -110,14 +110,14 @@ def _evict(ctx: Context) -> bool:
     return False
 
 
-def lose(ctx: Context, p: Participant, reason: str) -> None:
+def lose(ctx: Context, p: Participant, reason: str, *, keeps_place: bool = False) -> None:
     """The connection is gone: its robots hold, and the grace period begins."""
     if p.connection == NO_CONNECTION or p.id == HOST_ID:
         return
     del ctx.by_connection[p.connection]
     connection, p.connection = p.connection, NO_CONNECTION
     p.expires_ns = ctx.now_ns + ctx.config.grace_ns
-    leases.forget_requests(ctx, p, "")
+    leases.forget_requests(ctx, p, "", keeps_place=keeps_place)
     ctx.emit(ParticipantLeft(p.id, reason, grace=True))
     for lease in ctx.leases_of(p):
         overrides = lease.override == p.id
@@ -127,7 +127,7 @@ def lose(ctx: Context, p: Participant, reason: str) -> None:
         if overrides:
             engagement.give_back(ctx, lease)
         ctx.publish(lease, "left", p.id)
-    _lose_clients(ctx, connection, reason)
+    _lose_clients(ctx, connection, reason, keeps_place=keeps_place)
 
 
 def leave(ctx: Context, p: Participant, reason: str) -> None:
@@ -163,12 +163,12 @@ def remove_participant(ctx: Context, p: Participant, m: RemoveParticipant) -> No
     return _lose_clients(ctx, connection, "gateway")
 
 
-def _lose_clients(ctx: Context, gateway: int, reason: str) -> None:
+def _lose_clients(ctx: Context, gateway: int, reason: str, *, keeps_place: bool = False) -> None:
     """Everyone for whom the gateway at that connection spoke is lost with it, and forgotten by the front."""
     for p in tuple(ctx.state.participants.values()):
         if p.gateway == gateway and gateway != HOST and p.connection != NO_CONNECTION:
             ctx.dropped.append(Dropped(p.connection, "gateway"))
-            lose(ctx, p, reason)
+            lose(ctx, p, reason, keeps_place=keeps_place)
 
 
 def remove(ctx: Context, p: Participant, cause: str, reason: str = "") -> None:
@@ -187,12 +187,8 @@ def lose_everyone(ctx: Context, reason: str) -> None:
 
     Who waited for a robot keeps the place, as nobody could choose to leave it.
     """
-    places, ctx.state.queue = ctx.state.queue, []
     for p in tuple(ctx.state.participants.values()):
-        lose(ctx, p, reason)
-    ctx.state.queue = places
-    for pending in places:
-        pending.request_id = KEPT
+        lose(ctx, p, reason, keeps_place=True)
 
 
 def begin_grace_anew(ctx: Context) -> None:

@@ -13,16 +13,29 @@ from typing import Any, Final
 
 import msgspec
 
+from anchors.pose import quat_from_yaw
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.authority.state import Pending, State
+from iris_session.authority.state import KEPT, Pending, State
 from iris_session.client.session_state import SessionMirror
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol.common import Pose, Target
-from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, decode_entries, encode_entries
+from iris_session.protocol.entries import (
+    AlignmentAlarm,
+    AlignmentProposal,
+    CrossChecked,
+    Entry,
+    FrontRestarted,
+    Join,
+    Lost,
+    SessionResumed,
+    decode_entries,
+    encode_entries,
+)
 from iris_session.protocol.server_messages import ConsentRequested, Reply, Snapshot
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Command, Decision, FixedView, ObjectContact
 
+from .alignment_books import AlignmentBooks
 from .table import MS, SECOND, make_view, proposal, robot
 
 ROBOTS: Final = (robot("left"), robot("right", "priority"), robot("third", "shared"))
@@ -30,7 +43,18 @@ OBJECTS: Final = (ObjectSpec("hammer", "hammer"), ObjectSpec("board", "board"))
 NAMES: Final = tuple(r.name for r in ROBOTS)
 DEVICES: Final = ("head", "controller/left", "controller/right", "hand/left", "target", "joints", "foot")
 CONFIG: Final = AuthorityConfig(
-    heartbeat_timeout_ns=SECOND, grace_ns=2 * SECOND, max_participants=6, max_queue=3, max_consents=2, quota=8
+    heartbeat_timeout_ns=SECOND,
+    grace_ns=2 * SECOND,
+    max_participants=6,
+    max_queue=3,
+    max_consents=2,
+    quota=8,
+    announce_ns=200 * MS,
+    slide_ns=50 * MS,
+    anchors={
+        "table": Pose((0.0, -0.5, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        "door": Pose((2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),
+    },
 )
 #: Holds after which the clutch must be seen open before the robot may move again.
 REARMED: Final = (
@@ -68,6 +92,7 @@ class Play:
     def __init__(self, rng: Random, policy: str = "join-order") -> None:
         self.config = msgspec.structs.replace(CONFIG, policy=policy, assignments={"anna": ("left",)})
         self.authority, self.twin = self.fresh(), self.fresh()
+        self.alignments = AlignmentBooks(self.config)
         self.journal: list[tuple[int, bytes, int, FixedView]] = []
         self.results: list[bytes] = []
         self.now_ns = SECOND
@@ -124,6 +149,7 @@ class Play:
         entries = decode_entries(blob)
         self.entries = []
         before = self.connected()
+        self.alignments.begin(self.state)
         self.decision = self.authority.step(self.now_ns, entries, n_ticks, self.view)
         self.journal.append((self.now_ns, blob, n_ticks, self.view))
         self.results.append(_encode(self.decision))
@@ -135,6 +161,7 @@ class Play:
         self.consents += [e.body.consent_id for e in self.decision.events if isinstance(e.body, ConsentRequested)]
         self.follow_events()
         self.check_commands(entries)
+        self.alignments.check(self.state, self.decision, entries, self.now_ns)
         self.check_urgent(entries)
         self.check_bounds()
         self.check_queue()
@@ -257,6 +284,8 @@ class Play:
                 cm.Control(1, rng.choice(["pause", "step", "reset"])),
                 cm.Episode(1, rng.choice(["start", "success", "rerecord", "reset"])),
                 cm.PlaceAlignment(1, person, pose, rng.random() < 0.5),
+                cm.Align(1, rng.choice(["start", "stop", "dance"]), person),
+                cm.MoveAnchor(1, rng.choice(["table", "moon"]), pose),
                 FrontRestarted() if rng.random() < 0.2 else cm.ClearEStop(1),
             ]
         )
@@ -267,9 +296,35 @@ class Play:
         if self.rng.random() < 0.3:
             client.tracking_epoch += 1
             self.say(client, cm.TrackingEpoch(client.tracking_epoch))
-        refused, x = self.rng.random() < 0.2, self.rng.choice([1.0, 1.1])
-        T = Pose((x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        self.say(client, proposal(tracking_epoch=client.tracking_epoch, refused=refused, T_world_tracking=T))
+        self.say(client, self.look(client, refused=self.rng.random() < 0.2))
+
+    def look(self, client: Client, **fields: Any) -> AlignmentProposal:
+        """A measurement that says something else than the last one, a little or a lot."""
+        x, yaw = self.rng.choice([1.0, 1.0, 1.003, 1.005, 1.009, 1.05, 1.1]), self.rng.choice([0.0, 0.01, 0.05])
+        T = Pose((x, 0.0, 0.0), quat_from_yaw(yaw))
+        return proposal(tracking_epoch=client.tracking_epoch, T_world_tracking=T, **fields)
+
+    def watch(self) -> None:
+        """What the front says of its own: alarms, comparisons of headsets, and a run that somebody starts or stops."""
+        client, rng = self.who(), self.rng
+        alarm = AlignmentAlarm(
+            rng.choice(["changed", "differs", "differs", "jump", "boom"]),
+            max(0, client.tracking_epoch - rng.choice([0, 0, 0, 1])),
+            rng.choice(["table", "door", ""]),
+            rng.choice([0.01, 0.2, math.nan]),
+            beside=rng.choice([(), (), ("door",)]),
+        )
+        compared = CrossChecked(self.who().connection, "table", rng.choice([0.004, math.nan]), 0.0, 0.01, (0.0,) * 3, 9)
+        self.say(client, rng.choice([alarm, compared, cm.Align(1, "start"), cm.Align(1, "stop")]))
+
+    def go_on(self) -> None:
+        """The session ends and goes on from its recording: a new process, and everybody is away."""
+        self.flush()
+        self.swap()
+        gap_ns = self.rng.choice([0, 5, 3600]) * SECOND
+        self.now_ns += gap_ns
+        self.host(SessionResumed(gap_ns))
+        self.flush(0)
 
     # --- samples ---
 
@@ -321,6 +376,8 @@ class Play:
                 fields = self.rng.choice([{"kind": "twist"}, {"kind": "twist"}, {"pose": far}, {"tracked": False}])
             names = self.held(client) if self.rng.random() < 0.9 else ()
             self.say(client, self.sample(client, names, client.device, self.rng.random() < 0.9, **fields))
+            if client.role == "operator" and self.rng.random() < 0.2:
+                self.say(client, self.look(client))
         self.now_ns += 14 * MS
         self.flush()
 
@@ -478,7 +535,11 @@ class Play:
                 assert (out.connection, out.message.request_id) in self.open, "a second reply, or to nobody's request"
                 self.open.remove((out.connection, out.message.request_id))
         people, state = self.state.participants, self.state
-        waiting = {(people[w.participant].connection, w.request_id) for w in (*state.queue, *state.consents)}
+        waiting = {
+            (people[w.participant].connection, w.request_id)
+            for w in (*state.queue, *state.consents)
+            if w.request_id != KEPT
+        }
         here = {p.connection for p in people.values()}
         assert {asked for asked in self.open if asked[0] in here} == waiting
 
@@ -487,7 +548,7 @@ class Play:
 
     def check_dropped(self, before: set[int], entries: list[Entry]) -> None:
         """The front learns of every connection that the authority is done with, unless it said so itself."""
-        if any(isinstance(e.message, FrontRestarted) for e in entries):
+        if any(isinstance(e.message, FrontRestarted | SessionResumed) for e in entries):
             return
         known = {e.connection for e in entries if isinstance(e.message, Lost)}
         known |= {d.connection for d in self.decision.dropped}
@@ -516,6 +577,8 @@ ACTIONS: Final[list[tuple[float, Callable[[Play], None]]]] = [
     (1.0, Play.direct),
     (0.7, Play.trouble),
     (0.7, Play.align),
+    (0.3, Play.watch),
+    (0.05, Play.go_on),
     (0.5, Play.join),
     (0.4, Play.resume),
     (0.4, Play.swap),

@@ -24,6 +24,15 @@ def test_long_sessions(seed: int) -> None:
     assert play.moved > 20 or policy != "join-order", "a session in which hardly anything moved proves nothing"
 
 
+def test_random_sessions_have_corrections_of_every_kind() -> None:
+    """Else the books of alignments would prove nothing."""
+    play = Play(Random(12))
+    for _ in range(400):
+        play.act()
+    assert play.alignments.came["slid"] > 3
+    assert play.alignments.came["announced"] > 3
+
+
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     actions=st.lists(st.integers(0, len(ACTIONS) - 1), max_size=40),

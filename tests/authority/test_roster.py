@@ -116,13 +116,14 @@ def test_grace_begins_anew_when_the_session_was_down_also_for_who_was_lost_befor
     assert t.last(LeaseChanged).lease.holder == ""
 
 
-def test_who_waited_keeps_the_place_while_the_session_was_down() -> None:
+@pytest.mark.parametrize("news", [SessionResumed(SECOND), FrontRestarted()])
+def test_who_waited_keeps_the_place_while_the_session_was_down(news: SessionResumed | FrontRestarted) -> None:
     """Bert is first, comes back last and need not ask again; Carl asks again and keeps his place; Dora never comes."""
     t = Table()
     ann, bert, carl, dora = t.operator("left"), t.join(), t.join(), t.join()
     for waiting in (bert, carl, dora):
         waiting.does(Acquire(7, ("left",), wait=True))
-    t.step(t.host(SessionResumed(SECOND)), dt_ns=SECOND)
+    t.step(t.host(news), dt_ns=SECOND)
     assert t.last(LeaseChanged).lease.queue == (bert.id, carl.id, dora.id)
     ann, carl = rejoin(t, ann), rejoin(t, carl)
     carl.does(Acquire(3, ("left",), wait=True))
