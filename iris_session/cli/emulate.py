@@ -43,7 +43,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key (*.key_secret)")
-    parser.add_argument("--orders", action="store_true", help="lines on standard input: bump, drift or recentre NAME")
+    parser.add_argument(
+        "--orders", action="store_true", help="lines on standard input: bump, recentre, drift or steady NAME"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.set_defaults(run=run)
 

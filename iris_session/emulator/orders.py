@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 #: What can be done to the tracking frame of a headset: `Person.disturb`.
-KINDS: Final = ("bump", "drift", "recentre")
+KINDS: Final = ("bump", "drift", "recentre", "steady")
 MAX_LINE: Final = 256  # bytes; a longer line is no order
 
 

@@ -16,10 +16,11 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, compose, inverse, quat_from_yaw
-from iris_session.client import Client, CurveKeys, SceneState
-from iris_session.emulator.behaviours import Behaviour, HandInput, Hands, make_behaviour
+from iris_session.client import Client, SceneState
+from iris_session.emulator.behaviours import HandInput
 from iris_session.emulator.clutching import Clutch
 from iris_session.emulator.display import Display
+from iris_session.emulator.equipment import behaviour_of, curve_of
 from iris_session.emulator.gaze import Gaze
 from iris_session.emulator.headset import Headset
 from iris_session.emulator.judge import judge
@@ -29,7 +30,7 @@ from iris_session.emulator.viewpoints import between
 from iris_session.protocol.client_messages import Acquire, Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, DenialReason, Device, Role
-from iris_session.protocol.server_messages import AlignmentAlarmed, Event, Handover, Notice, Reply
+from iris_session.protocol.server_messages import AlignmentAlarmed, AlignmentRun, Event, Handover, Notice, Reply
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
@@ -41,24 +42,6 @@ RETRY_S: Final = 1.0
 
 #: Denials that no waiting mends.
 FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, DenialReason.UNKNOWN_VALUE})
-
-
-def behaviour_of(spec: HeadsetSpec, robot: str) -> Behaviour | None:
-    """The behaviour of one person, `None` for an observer. Raises `ValueError` naming what is available."""
-    hands = [
-        make_behaviour(
-            task.behaviour, task.robot or robot, task.object, task.partner, task.device, spec.seed, task.arm, task.place
-        )
-        for task in spec.tasks
-    ]
-    return None if not hands else hands[0] if len(hands) == 1 else Hands(hands)
-
-
-def curve_of(spec: HeadsetSpec) -> CurveKeys | None:
-    """The CURVE keys of one person. Raises `IdentityError` for files that are no keys, `ValueError` for half a pair."""
-    if bool(spec.curve_server) != bool(spec.curve_key):
-        raise ValueError("the session's public key and our own secret key (curve_server, curve_key) go together")
-    return CurveKeys.from_files(spec.curve_server, spec.curve_key) if spec.curve_key else None
 
 
 class Person:
@@ -98,7 +81,8 @@ class Person:
         self._looks_here = 0
         self._looked_ns = 0
         self._rounds = 0
-        self._doubted: int | None = None  # version of the alignment that was found wrong
+        self._look_again = False  # somebody said so
+        self._doubted = -1  # version of the alignment that is to be measured anew
         self._slip: tuple[PoseTuple, int] = (IDENTITY_POSE, 0)  # what a bump did to tracked hands, and when
         self._request: tuple[int, int] | None = None
         self._retry_ns = 0
@@ -150,14 +134,15 @@ class Person:
         self._enter("failed", now_ns)
 
     def disturb(self, kind: str, now_ns: int) -> None:
-        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice; or begins to `drift`."""
+        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice. Or it begins to `drift`,
+        until `steady`."""
         if kind == "recentre":
             self.headset.recentre(now_ns)
             self.client.new_tracking_frame()
             for clutch in self._clutches.values():
                 clutch.open()
-        elif kind == "drift":
-            self.headset.drift(self.spec.drift_m_per_min, now_ns)
+        elif kind in ("drift", "steady"):
+            self.headset.drift(self.spec.drift_m_per_min if kind == "drift" else 0.0, now_ns)
         else:
             spec = self.spec
             self._slip = (self.headset.bump(spec.bump_m, spec.bump_yaw_rad, self.gaze.pose[0], now_ns), now_ns)
@@ -282,10 +267,11 @@ class Person:
             self.gaze.look(self._viewpoint, now_ns)
         elif now_ns - self._looked_ns > SETTLE_S * 1e9:
             self._rounds += 1
-            if self._alignment() is None or (self._in_doubt() and self._rounds < ROUNDS):
+            alignment = self._alignment()
+            if alignment is None or (alignment.version == self._doubted and self._rounds < ROUNDS):
                 self._viewpoint = self._looks_here = 0  # look again
                 return
-            self._doubted = None
+            self._look_again = False
             self.report.aligned_s = (now_ns - self.started_ns) / 1e9
             self._judge(now_ns)
             self._enter("watch" if self.observer else "acquire", now_ns)
@@ -321,9 +307,9 @@ class Person:
 
     def _fall_back(self, now_ns: int) -> None:
         """What was won can be lost: the alignment by a jump, an alarm or a new session, the robot to somebody else."""
-        lost = self._alignment() is None or self._in_doubt()
-        if lost and self.report.phase in ("watch", "acquire", "work"):
+        if (self._alignment() is None or self._look_again) and self.report.phase in ("watch", "acquire", "work"):
             self._viewpoint = self._looks_here = self._rounds = 0
+            self._look_again = False
             self._enter("look", now_ns)
         elif self.report.phase == "work" and not self._have_robots():
             self._enter("acquire", now_ns)
@@ -356,11 +342,6 @@ class Person:
             return None
         return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
 
-    def _in_doubt(self) -> bool:
-        """Whether an alarm was raised that no new alignment has answered yet."""
-        alignment = self.client.alignment
-        return self._doubted is not None and alignment is not None and alignment.version <= self._doubted
-
     def _judge(self, now_ns: int) -> None:
         """Compares the alignment in force with the truth."""
         judge(self.report, self._alignment(), self.headset.T_world_tracking(now_ns), self.spec.T_world_anchor[0])
@@ -382,12 +363,15 @@ class Person:
             self.report.handovers += 1
         elif isinstance(event.body, Notice):
             self._refused_because = event.body.text
-        elif isinstance(event.body, AlignmentAlarmed) and event.body.participant == self.client.participant_id:
-            self._alarmed(event.body)
+        elif isinstance(event.body, AlignmentAlarmed | AlignmentRun):
+            self._asked_to_look(event.body)
 
-    def _alarmed(self, alarm: AlignmentAlarmed) -> None:
+    def _asked_to_look(self, event: AlignmentAlarmed | AlignmentRun) -> None:
         """A jump voids the alignment, which is seen by itself. A sheet that was moved is for others to put right."""
         alignment = self.client.alignment
-        if alarm.kind != AlarmKind.JUMP and not alarm.beside and alignment is not None:
-            self._doubted = alignment.version
-            self.report.alarms += 1
+        if event.participant != self.client.participant_id or alignment is None:
+            return
+        alarm = isinstance(event, AlignmentAlarmed)
+        if event.running if isinstance(event, AlignmentRun) else event.kind != AlarmKind.JUMP and not event.beside:
+            self._look_again, self._doubted = True, alignment.version
+            self.report.alarms += alarm

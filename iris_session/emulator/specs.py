@@ -40,9 +40,9 @@ class HeadsetSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     sheet truly lies, which need not be what the session believes. `recentre_at_s`, `bump_at_s`, `doff_at_s`,
     `don_at_s`: seconds after joining at which the tracking frame jumps, jumps without the headset noticing (by `bump_m`
     and `bump_yaw_rad` about the head), the headset is taken off, and put on again. `drift_m_per_min`: of the tracking
-    frame after the order `drift`; until then that of `model`. `display_delay_s`: how old the picture is on purpose
-    (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts. `curve_server`,
-    `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
+    frame between the orders `drift` and `steady`; until then that of `model`. `display_delay_s`: how old the picture is
+    on purpose (interpolation) plus the way to the headset. `identity_file`: keeps the identity across restarts.
+    `curve_server`, `curve_key`: files with the session's public CURVE key and our own secret one; needed off loopback.
     """
 
     name: str

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class LiveSession:
         self.entries: list[Entry] = []
         self.commands: dict[str, str] = {}
         self.poses = np.zeros((len(BODIES), 7))
-        self._inject: list[Entry] = []
+        self._inject: deque[Entry] = deque()  # other threads append
         self._scene_epoch = 1
         self._paused = threading.Event()
         self._stop = threading.Event()
@@ -94,7 +95,7 @@ class LiveSession:
                 continue
             if not self.front.alive:
                 self.front.restart()
-            inject, self._inject = self._inject, []
+            inject = [self._inject.popleft() for _ in range(len(self._inject))]
             entries = [*inject, *self.front.link.poll()]
             self.entries += entries
             now = self.now_ns

@@ -34,7 +34,7 @@ def test_what_is_no_order_is_told(pipe: tuple[int, int], capsys: pytest.CaptureF
     assert orders() == [("bump", "ann")]
     said = capsys.readouterr().err
     assert "kick ann" in said
-    assert "bump, drift or recentre, then one of ann" in said
+    assert "bump, drift, recentre or steady, then one of ann" in said
     assert len(said) < 2000
 
 
