@@ -6,8 +6,9 @@ import dataclasses
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -20,7 +21,7 @@ from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.authority import AuthorityConfig
 from iris_session.physics import load_model, model_bytes
 from iris_session.physics.scenes import scene_path
-from iris_session.protocol.client_messages import Marker
+from iris_session.protocol.client_messages import Marker, MoveAnchor
 from iris_session.protocol.common import Applied, Pose
 from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
 from iris_session.protocol.names import CommandKind
@@ -70,10 +71,12 @@ def recorded(
     path: Path,
     change: Callable[[JournalRow], JournalRow] = lambda row: row,
     keyframes: Callable[[Keyframe], Keyframe] = lambda keyframe: keyframe,
+    core: SessionCore | None = None,
+    said: Mapping[int, list[Entry]] = MappingProxyType({}),
     **header: object,
 ) -> Path:
     """The scripted session of `play`, as our loop would have recorded it."""
-    core = make_core()
+    core = core or make_core()
     head = SessionHeader(
         "s1",
         "lab",
@@ -93,7 +96,8 @@ def recorded(
     batch = Batch(keyframes=[seal(keyframe_of(core, -1), chain)])
     for step in range(STEPS):
         now_ns = (step + 1) * TICK_NS
-        row = make_row(chain, step, now_ns, 1, entries(step), core.step(now_ns, entries(step), 1).digest)
+        came = [*entries(step), *said.get(step, ())]
+        row = make_row(chain, step, now_ns, 1, came, core.step(now_ns, came, 1).digest)
         batch.rows.append(change(row))
         chain = batch.rows[-1].chain
         if step in KEYFRAMES:
@@ -313,6 +317,30 @@ def test_sheets_are_checked_for_misprints_as_they_were(
     past.close()
     assert config.sheet_sizes() == sizes
     assert not config.adapt_media
+
+
+@pytest.mark.parametrize("given", [{}, {"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}])
+def test_anchors_are_where_they_were_last_unless_given_anew(tmp_path: Path, given: dict[str, PoseTuple]) -> None:
+    """Also when a director moved one since."""
+    table, moved = Pose((0.0, -0.45, 0.0), IDENTITY_QUAT), Pose((0.5, 0.0, 0.0), IDENTITY_QUAT)
+    path = recorded(
+        tmp_path / "session.rrd",
+        core=make_core(anchors={"table": table}),
+        said={40: [host(41 * TICK_NS, MoveAnchor(0, "table", moved))]},
+        anchors={"table": table},
+    )
+    anew = {"anchors": given} if given else {}
+    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    assert past is not None
+    past.close()
+    now = {name: Pose(*T) for name, T in given.items()}
+    assert (config.anchor_poses(), past.anchors) == (now or {"table": moved}, now)
+    stepper = Stepper(
+        past.core, Front(), None, lambda: LAST_NS + 10**9, 10**9, 10**10, b"",
+        ResumedFrom(past.step, past.now_ns, past.anchors),
+    )  # fmt: skip
+    stepper.step(1)
+    assert past.core.authority.anchors == (now or {"table": moved})
 
 
 def test_what_is_noted_for_a_resumed_session_is_what_it_was_given() -> None:

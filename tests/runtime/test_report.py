@@ -8,14 +8,16 @@ from typing import Any
 import pytest
 
 from iris_session.physics import Pacer
-from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
-from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
-from iris_session.protocol.status import ParticipantReport
+from iris_session.protocol.status import AnchorReport, ParticipantReport
 from iris_session.recording.feed import FeedStats
 from iris_session.recording.messages import RecorderStatus
-from iris_session.runtime.report import PATIENCE_NS, PERIOD_NS, Reporter, recorder_report, robots
+from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.processes import SessionProcesses
+from iris_session.runtime.report import PATIENCE_NS, PERIOD_NS, Reporter, anchors, recorder_report, robots
 from iris_session.runtime.stepper import Stepper
 from tests.runtime.play import TICK_NS, entries, host, make_core
 from tests.runtime.test_stepper import Front
@@ -102,6 +104,34 @@ def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
     assert reporter.due(PERIOD_NS + PATIENCE_NS)
     reporter.pacer = Pacer(TICK_NS, 3 * PERIOD_NS)
     assert reporter.due(3 * PERIOD_NS)
+
+
+def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) -> None:
+    session.step(bob(TICK_NS))
+    row = session.people()["bob"]
+    session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
+    reports = session.stepper.core.authority.alignment_reports()
+    (told,) = [r for r in session.stepper.ledger.participant_reports(session.now_ns, reports) if r.id == row.id]
+    assert told.alignment_report is not None
+    assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
+    assert anchors({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (
+        AnchorReport("table", IDENTITY, 0.16),
+        AnchorReport("door", IDENTITY, 0.0),
+    )
+
+
+def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
+    core = make_core(anchors={"table": IDENTITY})
+    moved = Pose((1.0, 0.0, 0.0), IDENTITY.q)
+    core.step(TICK_NS, [host(TICK_NS, MoveAnchor(0, "table", moved))], 0)
+    told: list[object] = []
+    session_processes = SessionProcesses(SessionConfig(record=False), core.world, 0)
+    session_processes.front = SimpleNamespace(  # type: ignore[assignment]
+        alive=False, set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
+    )
+    session_processes.reporter = SimpleNamespace(due=lambda now_ns: False)  # type: ignore[assignment]
+    session_processes.watch(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
+    assert told == [{"table": moved}, "restarted"]
 
 
 def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "") -> Any:
