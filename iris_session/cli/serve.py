@@ -126,7 +126,6 @@ def session_name(path: Path) -> str:
 def new_session(arguments: argparse.Namespace) -> Session:
     """A session that begins."""
     from iris_session.physics import load_robots_toml
-    from iris_session.runtime.anchors_file import load_anchors
     from iris_session.runtime.session import Session
 
     if arguments.scene is None:
@@ -134,11 +133,8 @@ def new_session(arguments: argparse.Namespace) -> Session:
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
     config = session_config(arguments, session_name(Path(arguments.scene)))
-    anchors, sizes = scene.anchors, scene.anchor_sizes
-    if arguments.anchors is not None:
-        given = load_anchors(arguments.anchors)
-        anchors, sizes = given.anchors, given.sizes
-    config = dataclasses.replace(config, anchors=anchors, anchor_sizes=sizes)
+    config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes)
+    config = with_anchors(config, arguments.anchors)
     return Session(scene.model, config=config, robots=robots)
 
 
@@ -146,13 +142,24 @@ def resumed_session(arguments: argparse.Namespace) -> Session:
     """A session that goes on from its recording."""
     from iris_session.runtime.session import Session
 
-    had = ("robots", "anchors", "assign", "assignment", "mode", "record", "no_record")
+    had = ("robots", "assign", "assignment", "mode", "record", "no_record")
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
     if given:
         raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")
     model = None if arguments.scene is None else open_scene(arguments.scene).model
     config = dataclasses.replace(session_config(arguments, "session"), resume=arguments.resume)
+    config = with_anchors(config, arguments.anchors)
     return Session(model, config=config)
+
+
+def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
+    """The anchors of a file, where one was given."""
+    from iris_session.runtime.anchors_file import load_anchors
+
+    if path is None:
+        return config
+    given = load_anchors(path)
+    return dataclasses.replace(config, anchors=given.anchors, anchor_sizes=given.sizes)
 
 
 def run(arguments: argparse.Namespace) -> int:

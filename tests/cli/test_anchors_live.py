@@ -12,13 +12,14 @@ from typing import Any
 import msgspec
 import pytest
 
+from iris_session.authority import AuthorityConfig
 from iris_session.cli import anchors_live
 from iris_session.cli.anchors_live import as_dict, chosen, screen
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
-from iris_session.client import DeniedError
+from iris_session.client import Client, DeniedError
 from iris_session.protocol.common import IDENTITY, Alignment, Denial, Pose
-from iris_session.protocol.server_messages import ParticipantInfo
+from iris_session.protocol.server_messages import AlignmentRun, AnchorMoved, Event, ParticipantInfo
 from iris_session.protocol.status import (
     AlignmentReport,
     AnchorReport,
@@ -27,6 +28,7 @@ from iris_session.protocol.status import (
     ParticipantReport,
     StatusReport,
 )
+from tests.client.harness import LiveSession
 
 S = 1_000_000_000
 ANN = ParticipantReport(
@@ -252,3 +254,28 @@ def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert all("is not HOST:PORT" in line for line in lines)
+
+
+def test_a_running_session_takes_what_a_director_says(capsys: pytest.CaptureFixture[str]) -> None:
+    """The same commands with a real front and authority."""
+    config = AuthorityConfig(anchors={"table": IDENTITY})
+    live = LiveSession(config)
+    events: list[Event] = []
+    try:
+        with Client(live.address, name="ann", alignment="measured", on_event=events.append) as ann:
+            there = ["--address", live.address]
+            assert main(["anchors", "place", "ann", "--pose", "0.4,0,0,1,0,0,0", *there]) == 0
+            assert main(["anchors", "align", "stop", ann.participant_id, *there]) == 0
+            assert main(["anchors", "align", "start", *there]) == 0
+            assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,1,0,0,0", *there]) == 0
+            assert ann.wait_for(lambda _: any(isinstance(e.body, AnchorMoved) for e in events))
+            assert ann.alignment is not None
+            assert ann.alignment.kind == "placed"
+            runs = [(e.body.participant, e.body.running) for e in events if isinstance(e.body, AlignmentRun)]
+            assert runs == [(ann.participant_id, False), (ann.participant_id, True)]
+            assert [e.body.T_world_anchor.p for e in events if isinstance(e.body, AnchorMoved)] == [(-0.2, 0.1, 0.0)]
+            capsys.readouterr()
+            assert main(["anchors", "move", "shelf", "--pose", "0,0,0,1,0,0,0", *there]) == 2
+            assert "denied" in capsys.readouterr().err
+    finally:
+        live.close()

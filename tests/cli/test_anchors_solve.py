@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -237,3 +238,21 @@ def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
     assert distance(half.T_world_tracking[0], T[0]) == pytest.approx(0.002, abs=1e-4)
     apart = fused(known(0.0, 0.002), known(0.05, 0.002))
     assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
+
+
+def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the live estimator sees no majority."""
+    solve = Resolver._solve
+
+    def blind(self: Resolver, moment: int, places: dict[str, PoseTuple]) -> AlignmentEstimate:
+        return replace(solve(self, moment, places), refused="shelf" in places)
+
+    monkeypatch.setattr(Resolver, "_solve", blind)
+    with Recording.open(recording) as opened:
+        looks = read_looks(opened)
+    resolver = Resolver(looks.looks["p1", 1, 0], Anchors(looks, BELIEVED, None), {})
+    solved = resolver.at(10_000_000_000)
+    assert (solved.refused, solved.moved) == (False, ("shelf",))
+    assert "sheet 'shelf'; it is not used" in solved.advice
+    two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
+    assert Resolver(looks.looks["p1", 1, 0], Anchors(looks, two, None), {}).at(10_000_000_000).refused
