@@ -210,10 +210,6 @@ class AlignmentEstimator:
         self._memory.clear()
         self._against_gravity, self._misprints, self._near = 0, {}, None
 
-    def anchors_moved(self) -> None:
-        """The `T_world_anchor` of some were changed: what was observed still holds, the last solution does not."""
-        self._near = None
-
     def _upright(
         self, T_world_anchor: PoseTuple, seen: PoseTuple, p_head: Vec3 | None, alternative: PoseTuple | None
     ) -> PoseTuple | None:

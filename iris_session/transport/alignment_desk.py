@@ -69,7 +69,6 @@ class AlignmentDesk:
 
     def anchors_moved(self) -> None:
         """Anchors are elsewhere: what was observed holds, what was made of it does not."""
-        self._estimator.anchors_moved()
         self._touches.anchors_moved()
         self._refused = self._touched = self.newest = None
         self._pending = self._used > 0
