@@ -125,6 +125,12 @@ class ClientTable:
         """The connection that this peer lost lately."""
         return self._given_up.get((route, peer))
 
+    def forget_given_up(self, heard_before_ns: int) -> None:
+        """Who has said nothing since then is nobody any more: its TCP connection may be closed like a stranger's."""
+        for key, connection in list(self._given_up.items()):
+            if connection.last_heard_ns < heard_before_ns:
+                del self._given_up[key]
+
     @property
     def lost_lately(self) -> Collection[Connection]:
         """Connections that were given up while their TCP connections stood."""

@@ -21,7 +21,8 @@ from iris_session.transport.status_desk import StatusDesk
 
 #: How long what a closed connection has sent may wait behind the messages of others.
 LAST_WORDS_NS = 100 * MILLISECOND
-#: Whoever ended like this is still there: an e-stop of theirs counts until their TCP connection is closed.
+#: Whoever ended like this is still there: an e-stop of theirs counts until their TCP connection is closed, which it is
+#: after a minute at the latest.
 STILL_THERE = ("silent", "gateway", "heartbeat", "replaced")
 
 

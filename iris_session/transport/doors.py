@@ -29,6 +29,9 @@ BARRED_NS: Final = 3 * SECOND
 OPENED_PER_S: Final = 100
 #: What is borne of somebody before hello, as a share of what is of a client.
 STRANGERS_SHARE: Final = 0.25
+#: Who was given up as silent may still stop everything for so long. Then its TCP connection goes, too: a headset that
+#: sleeps, or a network in between, can keep it open for ever.
+GIVEN_UP_NS: Final = 60 * SECOND
 #: A flood is shown in the status for so long.
 SHOWN_NS: Final = 60 * SECOND
 MAX_REMEMBERED: Final = 256
@@ -170,6 +173,7 @@ class Doors:
         return owners
 
     def _silent(self, now_ns: int) -> None:
+        self._clients.forget_given_up(now_ns - GIVEN_UP_NS)
         owners = self._owners()
         quiet: list[tuple[int, Visitor]] = []
         for descriptor, visitor in self._visitors.items():

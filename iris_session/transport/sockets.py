@@ -41,6 +41,9 @@ _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
 #: Linux, `struct tcp_info`: `tcpi_bytes_acked`, and `tcpi_bytes_received` after it.
 _COUNTS_AT: Final = 120
+#: A peer that takes nothing of what waits for it for so long is cut off by the kernel, be it gone without a word or
+#: asleep: else its connection, and what waits in it, would stay for a quarter of an hour, or for ever.
+STUCK_MS: Final = 30_000
 #: Connections that were opened and say nothing take a file descriptor each.
 FILE_DESCRIPTORS = 4096
 
@@ -223,6 +226,7 @@ def _prepare(bound: zmq.Socket[bytes], key: KeyPair | None, name: str) -> None:
     bound.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)
     bound.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 2)
     bound.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
+    bound.setsockopt(zmq.TCP_MAXRT, STUCK_MS)
     bound.setsockopt(zmq.HANDSHAKE_IVL, 5000)
     bound.setsockopt(zmq.BACKLOG, 512)
     if key is not None:

@@ -108,13 +108,19 @@ def test_who_lost_its_connection_has_as_long_to_say_hello_again(hall: Hall) -> N
     assert is_closed(theirs)
 
 
-def test_who_was_given_up_keeps_its_connection_for_an_estop(hall: Hall) -> None:
+def test_who_was_given_up_keeps_its_connection_for_an_estop_for_a_minute(hall: Hall) -> None:
+    """A headset that sleeps answers keep-alives for ever: its connections must not gather."""
     peer, theirs = hall.open()
     connection = hall.hello(peer)
     hall.clients.remove(connection)
     hall.clients.give_up(connection)
-    hall.look(100 * SECOND)
+    hall.look(59 * SECOND)
     assert not is_closed(theirs)
+    assert hall.clients.given_up(connection.route, connection.peer) is connection
+    hall.look(2 * SECOND)
+    assert hall.clients.given_up(connection.route, connection.peer) is None
+    hall.look(11 * SECOND)
+    assert is_closed(theirs)
 
 
 def test_the_oldest_silent_ones_make_room(hall: Hall) -> None:
