@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from itertools import combinations
@@ -45,7 +46,10 @@ class Emulated:
         if size != self._size:
             *lines, _unfinished = self._out.read_bytes().split(b"\n")
             self._size = size
-            self._report = msgspec.json.decode(lines[-1], type=HeadsetReport) if lines else self._report
+            known = {
+                k: v for k, v in json.loads(lines[-1] if lines else b"{}").items() if v is not None
+            }  # no NaN in JSON
+            self._report = msgspec.convert({"name": self.spec.name, **known}, HeadsetReport)
         return self._report
 
     def order(self, kind: str) -> None:
