@@ -60,7 +60,7 @@ class Measured:
     """One window, from session time `begin_ns` on.
 
     `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
-    session time of receipt. `logs`: by client name."""
+    session time of receipt. `logs`: by client name. `late_causes`: late ticks of its last ten seconds."""
 
     seconds: float
     stats: PacerStats
@@ -72,6 +72,7 @@ class Measured:
     rejected: dict[str, int] = field(default_factory=dict)
     connections: dict[str, int] = field(default_factory=dict)
     drops: dict[str, int] = field(default_factory=dict)
+    late_causes: dict[str, int] = field(default_factory=dict)
     begin_ns: int = 0
 
 
@@ -230,6 +231,7 @@ def _run(
         {"/".join(key): count for key, count in ledger.rejected.items()},
         {names[p]: c for c, p in connections.items()},
         status.drops,
+        meter.late_causes,
         begin,
     )
 
@@ -267,11 +269,14 @@ class _Meter:
         self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
         self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
         self._readings: list[tuple[PacerStats, float]] = []
+        self.late_causes: dict[str, int] = {}
 
     def passed(self) -> bool:
         """Whether the window is over; for `Session.run(until=...)`."""
         now = self._session.clock()
         if now >= (self._end_ns if self._readings else self._begin_ns):
+            times = self._session.processes.reporter.times
+            self.late_causes = {} if times is None else times.late_causes()
             stats = self._session.lateness(anew=not self._readings)
             assert stats is not None
             self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))

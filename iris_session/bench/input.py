@@ -56,6 +56,7 @@ def run_input(
         "rejected": got.rejected,
         "server_cpu_share": round(got.cpu_share, 3),
         "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
+        "late_causes": got.late_causes,
         "scheduling": got.scheduling,
         "drops": got.drops,
     }

@@ -63,6 +63,7 @@ def run_state(
         "ticks": got.stats.ticks,
         "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
         "frames_not_logged": sum(int(log["counts"][1]) for log in got.logs.values()),
+        "late_causes": got.late_causes,
         "scheduling": got.scheduling,
         "drops": got.drops,
     }

@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import msgspec
 
+from iris_session.protocol.alignment_events import AlignmentAlarmed as AlignmentAlarmed  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.alignment_events import AlignmentRun as AlignmentRun  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.alignment_events import AnchorMoved as AnchorMoved  # noqa: PLC0414 (offered here too)
+from iris_session.protocol.alignment_events import HeadsetsCompared as HeadsetsCompared  # noqa: PLC0414 (offered here too)
 from iris_session.protocol.common import (
     Alignment,
     Count,
@@ -15,11 +19,9 @@ from iris_session.protocol.common import (
     Lease,
     Message,
     Name,
-    Names,
     Nanoseconds,
     Pose,
     Text,
-    Vec3,
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.security import Audited, Paired
@@ -208,50 +210,6 @@ class ScaleChanged(EventBody, frozen=True, tag="scale_changed"):
 class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
     participant: Name
     alignment: Alignment
-
-
-class AlignmentRun(EventBody, frozen=True, tag="alignment_run"):
-    """The alignment run of a participant was started anew (`running`), or stopped. `run` counts the starts."""
-
-    participant: Name
-    running: bool
-    run: Count
-    by: Name = ""
-
-
-class AlignmentAlarmed(EventBody, frozen=True, tag="alignment_alarmed"):
-    """The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
-    anchors that stayed where they were meanwhile: then the anchor was moved, not the headset."""
-
-    participant: Name
-    kind: Name
-    anchor_id: Name
-    size_m: float
-    beside: Names = ()
-
-
-class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):
-    """A director moved an anchor: alignments to it follow."""
-
-    anchor_id: Name
-    T_world_anchor: Pose
-    by: Name = ""
-
-
-class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
-    """Measured: participants `a` and `b` put one thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
-
-    `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
-    """
-
-    a: Name
-    b: Name
-    anchor_id: Name
-    error_m: float
-    error_rad: float
-    expected_p95_m: float
-    p_world: Vec3
-    n: Count
 
 
 class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
