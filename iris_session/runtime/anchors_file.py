@@ -52,7 +52,7 @@ def dump_anchors(anchors: Mapping[str, PoseTuple], sizes: Mapping[str, float]) -
     head = (
         "# Where anchors are: T_world_anchor, metres and a unit quaternion, w first. The origin of a sheet is the\n"
         "# centre of its code, x right, y up along the upright sheet, z out of the paper. `size_m`: edge of the code\n"
-        "# as measured; leave it out where it is not known. `error_m`: 95 % of how well the place is known relative to\n"
+        "# as measured; leave it out where not known. `error_m`: 95 % of how well the place is known relative to\n"
         "# the reference.\n"
     )
     errors = dict.fromkeys(anchors, 0.0)
