@@ -2,7 +2,8 @@
 
     python tools/soak_worker.py < job.json        {"address": ..., "specs": [HeadsetSpec, ...], "log": "folder/worker3"}
 
-One log per person: `<log>-<name>.events`, records of (connection generation, event_seq, CRC-32 of the event), and one
+One log per person: `<log>-<name>.events`, records of (connection generation, gaps that a snapshot has filled on it,
+event_seq, CRC-32 of the event), and one
 `<log>-<name>.json` with the person's report, written every second. Ends at SIGTERM.
 """
 
@@ -23,7 +24,7 @@ from iris_session.emulator.person import Person
 from iris_session.emulator.specs import HeadsetSpec
 from iris_session.protocol.server_messages import Event
 
-RECORD: Final = struct.Struct("<IQI")
+RECORD: Final = struct.Struct("<IIQI")
 REPORT_NS: Final = 1_000_000_000
 
 
@@ -72,8 +73,9 @@ class Witness:
         os.replace(f"{path}.new", path)
 
     def _note(self, event: Event) -> None:
-        generation = self.person.client.connection.generation
-        os.write(self._file, RECORD.pack(generation, event.event_seq, fingerprint(event)))
+        connection = self.person.client.connection
+        record = RECORD.pack(connection.generation, connection.mirror.gaps, event.event_seq, fingerprint(event))
+        os.write(self._file, record)
         if self._pass_on is not None:
             self._pass_on(event)
 

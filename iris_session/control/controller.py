@@ -111,16 +111,17 @@ class Controller:
                 self._hold(i)
         self._grasps.command(decision.objects)
 
-    def tick(self, data: mujoco.MjData) -> None:
+    def tick(self, data: mujoco.MjData, crowded: bool = False) -> None:
         """One physics tick: writes `data.ctrl` of the robots and `data.xfrc_applied` of grasped objects.
 
+        `crowded`: its step had much else to do, so it solves less; it must follow from the journal.
         Raises `ControlError` when neither `reset` nor `restore` was called: where the robots stand is not known then.
         """
         if not self._ready:
             raise ControlError("control does not know where the robots stand: call reset(data) or restore(bytes) first")
         if self._writes_ctrl:
             checks = self._tick % self._check_ticks == 0
-            self._solve_due(data, checks)
+            self._solve_due(data, checks, crowded)
             if checks:
                 self._check_tracking(data)
                 if self._proximity.active:
@@ -251,14 +252,16 @@ class Controller:
 
     # --- once a tick --------------------------------------------------------------------------------------------------
 
-    def _solve_due(self, data: mujoco.MjData, checks: bool) -> None:
+    def _solve_due(self, data: mujoco.MjData, checks: bool, crowded: bool) -> None:
         """Integrates twists; solves for a bounded number of robots, taking turns.
 
-        A tick that `checks` distances too solves less: ticks with all the work at once would be the late ones.
+        A tick that `checks` distances too, or whose step was `crowded`, solves less: ticks with all the work at once
+        would be the late ones.
         """
         n, start = len(self._states), self._cursor
         usual, besides_checks = self._solves
-        left = besides_checks if checks and self._proximity.active and self._joints.moving else usual
+        busy = crowded or (checks and self._proximity.active and self._joints.moving)
+        left = besides_checks if busy else usual
         self._follow_bases(data)
         for i in (*range(start, n), *range(start)):
             r = self._states[i]

@@ -51,7 +51,8 @@ class Reach:
         self._refine_ticks = math.ceil(self._slow_interval / joints.dt - 1e-9)
 
     def solves_per_tick(self, check_ticks: int) -> tuple[int, int]:
-        """How many robots may be solved in a tick, and in each `check_ticks`th one, in which distances are checked too.
+        """How many robots may be solved in a tick, and in one with other work, as each `check_ticks`th: distances are
+        checked in it, too.
 
         Two, or as many as all robots at their rate need (eight at 100 Hz: 1.6 in a tick of 2 ms, 4 in one of 5 ms), up
         to `max_solves_per_tick`; one less in a tick with a check, where the others make up for it.

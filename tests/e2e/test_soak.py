@@ -36,11 +36,17 @@ def test_a_minute_of_disturbances(tmp_path: Path) -> None:
 
 
 def test_check_of_events_finds_gaps_repeats_and_changes() -> None:
-    assert check_log("a", [(1, 1, 11), (1, 2, 22), (2, 4, 44), (2, 5, 55)], RECORDED) == []
-    assert "event 4 came after 2 on one connection" in check_log("a", [(1, 2, 22), (1, 4, 44)], RECORDED)[0]
-    assert "event 2 came after 2" in check_log("a", [(1, 2, 22), (2, 2, 22)], RECORDED)[0]
-    assert "event 3 is not that of the recording" in check_log("a", [(1, 2, 22), (1, 3, 22)], RECORDED)[0]
-    assert "event 6 is not that of the recording" in check_log("a", [(1, 5, 55), (1, 6, 66)], RECORDED)[0]
+    def problem(*records: tuple[int, int, int, int]) -> str:
+        return check_log("a", list(records), RECORDED)[1][0]
+
+    whole = [(1, 0, 1, 11), (1, 0, 2, 22), (2, 0, 4, 44), (2, 0, 5, 55)]
+    assert check_log("a", whole, RECORDED) == (0, [])
+    assert check_log("a", [(1, 0, 1, 11), (1, 1, 3, 33), (1, 1, 4, 44)], RECORDED) == (1, [])
+    assert "event 4 came after 2 without a snapshot" in problem((1, 0, 2, 22), (1, 0, 4, 44))
+    assert "event 5 came after 3 without a snapshot" in problem((1, 0, 1, 11), (1, 1, 3, 33), (1, 1, 5, 55))
+    assert "event 2 came after 2" in problem((1, 0, 2, 22), (2, 0, 2, 22))
+    assert "event 3 is not that of the recording" in problem((1, 0, 2, 22), (1, 0, 3, 22))
+    assert "event 6 is not that of the recording" in problem((1, 0, 5, 55), (1, 0, 6, 66))
 
 
 def test_check_of_memory_finds_a_leak_and_nothing_else() -> None:

@@ -66,7 +66,7 @@ def test_two_people_align_and_drive_while_one_watches(session: LiveSession) -> N
         assert report.observations >= 12
         assert report.samples > 100
         assert report.frames > 50
-        assert set(report.rejected) <= {"alignment_version"}
+        assert set(report.rejected) <= {"alignment_version", "stale"}  # stale: this machine stood still
     samples = [(e.connection, e.receive_ns, e.message.device) for e in session.kinds(Sample)]  # type: ignore[union-attr]
     heads = {(connection, at) for connection, at, device in samples if device == Device.HEAD}
     hands = {(connection, at) for connection, at, device in samples if device != Device.HEAD}
@@ -107,8 +107,9 @@ def test_what_is_seen_travels_with_the_head_pose_of_that_moment(session: LiveSes
 
 
 def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSession) -> None:
-    """An idle hand: it jumps with the tracking frame, and returns to where it is shown in its place. Nobody is told."""
-    spec = HeadsetSpec(name="ann", behaviour="idle", robot="left", bump_m=(0.0, 0.0, 0.05), **QUICK)
+    """An idle hand: it jumps with the tracking frame, and returns to where it is shown in its place. So little
+    could be the person: nobody is told."""
+    spec = HeadsetSpec(name="ann", behaviour="idle", robot="left", bump_m=(0.0, 0.0, 0.02), **QUICK)
     phase: list[str] = [""]
     bumped_ns: list[int] = []
 
@@ -131,7 +132,7 @@ def test_a_bump_moves_head_and_hand_and_the_hand_is_brought_back(session: LiveSe
     hand = [s for s in samples_of(session, Device.CONTROLLER_RIGHT) if s.capture_ns > at - 200_000_000]
     up = [s.pose.p[2] for s in hand if s.pose is not None]  # the frame rose: what is tracked sank
     before = np.mean([z for s, z in zip(hand, up, strict=True) if s.capture_ns < at])
-    assert min(up) - before == pytest.approx(-0.05, abs=0.008)
+    assert min(up) - before == pytest.approx(-0.02, abs=0.008)
     assert up[-1] - before == pytest.approx(0.0, abs=0.003)
 
 

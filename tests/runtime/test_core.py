@@ -16,7 +16,7 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.entries import ExternalReset
 from iris_session.protocol.names import CommandKind
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.runtime.core import SessionCore, plant_state
+from iris_session.runtime.core import CROWDED, SessionCore, plant_state
 from tests.runtime.play import TICK_NS, entries, host, make_core, play
 
 
@@ -48,6 +48,21 @@ def test_restoring_a_snapshot_is_invisible(at: int) -> None:
     other.restore(state)
     assert play(restored, at, 200) == expected
     assert play(other, at, 200) == expected
+
+
+@pytest.mark.parametrize(("n", "crowded"), [(0, False), (CROWDED - 1, False), (CROWDED, True)])
+def test_a_step_with_many_entries_is_crowded(n: int, crowded: bool) -> None:
+    core = make_core()
+    told: list[bool] = []
+    tick = core.controller.tick
+
+    def noted(data: mujoco.MjData, crowded: bool = False) -> None:
+        told.append(crowded)
+        tick(data, crowded)
+
+    core.controller.tick = noted  # type: ignore[method-assign]
+    core.step(TICK_NS, [host(TICK_NS, Control(0, "resume")) for _ in range(n)], 2)
+    assert told == [crowded, crowded]
 
 
 def test_another_entry_gives_another_digest() -> None:
