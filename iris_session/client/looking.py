@@ -81,23 +81,27 @@ class Looking:
         viewpoint_id: int | None = None,
         device: str = "head",
         camera_sigma: tuple[float, float] = CAMERA_SIGMA,
+        tracking_epoch: int | None = None,
     ) -> list[Sighting]:
         """Finds `sheets` in a picture, (height, width[, 3]) uint8, and reports them. Returns those that were reported.
 
         `T_tracking_camera`: where the camera was when it took the picture (x right, y down, z into the scene), at
         `capture_ns` of session time (default: now), known to `camera_sigma` ([m], [rad], standard deviations).
-        `viewpoint_id`: by default counted by where the camera goes. Sightings of which nobody can tell which of the two
-        poses of a plane is right are left out. Takes tenths of a second: not for the loop that sends samples.
+        `viewpoint_id`: by default counted by where the camera goes. `tracking_epoch`: of the frame that
+        `T_tracking_camera` is in, by default the present one when this is called. Sightings of which nobody can tell
+        which of the two poses of a plane is right are left out. Takes tenths of a second: not for the loop that sends
+        samples.
 
         Raises `InvalidMessageError` for a picture, camera or pose that cannot be, `ClientError` without OpenCV.
         """
+        epoch = self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
         now_ns = self.session_now_ns() if capture_ns is None else capture_ns
         pose = pose_of("T_tracking_camera", T_tracking_camera)
         T: PoseTuple = (pose.p, pose.q)
         found = [one for one in self._sightings(image, camera, sheets) if not one.ambiguous]
         if viewpoint_id is None:
             with self._lock:
-                viewpoint_id = self._viewpoints.at(self.connection.tracking_epoch, T)
+                viewpoint_id = self._viewpoints.at(epoch, T)
         for one in found:
             self.send(
                 Observation(
@@ -105,7 +109,7 @@ class Looking:
                     one.kind,
                     Pose(*compose(T, one.T_camera_sheet)),
                     now_ns,
-                    self.connection.tracking_epoch,
+                    epoch,
                     viewpoint_id,
                     one.edge_m,
                     device=device,

@@ -224,11 +224,13 @@ class Requests:
         quality: float = 1.0,
         device: str = "head",
         covariance: Numbers = (),
+        tracking_epoch: int | None = None,
     ) -> None:
         """Reports that a device saw an anchor, in the tracking frame.
 
         `viewpoint_id`: the same for what was seen from one place. `covariance`: 36 values, 6x6 row-major, (x, y, z [m],
-        rx, ry, rz [rad]), tracking axes; without it the session assumes that of a headset's camera.
+        rx, ry, rz [rad]), tracking axes; without it the session assumes that of a headset's camera. `tracking_epoch`:
+        of the tracking frame that it was seen in, by default the present one.
         """
         stated = numbers("covariance", covariance)
         if len(stated) not in (0, 36):
@@ -239,7 +241,7 @@ class Requests:
                 kind=kind,
                 T_tracking_anchor=pose_of("T_tracking_anchor", T_tracking_anchor),
                 capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
-                tracking_epoch=self.connection.tracking_epoch,
+                tracking_epoch=self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch,
                 viewpoint_id=viewpoint_id,
                 size_m=size_m,
                 quality=quality,

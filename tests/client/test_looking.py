@@ -127,6 +127,30 @@ def test_ambiguous_sightings_are_left_out(ann: Quiet, picture: Any, monkeypatch:
     assert ann.sent == []
 
 
+def test_looks_are_of_the_tracking_frame_that_the_picture_was_taken_in(
+    ann: Quiet, picture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding sheets takes tenths of a second, and the frame may jump meanwhile."""
+    honest = ann._sightings
+
+    def slow(*given: Any) -> Any:
+        ann.new_tracking_frame()
+        return honest(*given)
+
+    monkeypatch.setattr(ann, "_sightings", slow)
+    ann.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA)
+    ann.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA, tracking_epoch=0)
+    assert ann.connection.tracking_epoch == 2
+    assert [(one.tracking_epoch, one.viewpoint_id) for one in ann.sent] == [(0, 1), (0, 1)]
+
+
+def test_observations_can_be_of_an_earlier_tracking_frame(ann: Quiet) -> None:
+    ann.new_tracking_frame()
+    ann.observe("table", ZERO, tracking_epoch=0)
+    ann.observe("table", ZERO)
+    assert [one.tracking_epoch for one in ann.sent] == [0, 1]
+
+
 def test_viewpoints_are_counted_by_where_the_camera_goes() -> None:
     viewpoints = Viewpoints()
     turned: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, 0.5, 0.0)))
