@@ -108,8 +108,11 @@ class AlignAction:
 
 
 class AlarmKind:
-    """How an alignment was found to be wrong. `changed`: an anchor is seen elsewhere than seconds ago; `differs`: and
-    elsewhere than the alignment says; `jump`: the tracking frame moved at once, which voids the alignment."""
+    """How an alignment was found to be wrong.
+
+    `changed`: an anchor is seen elsewhere than seconds ago. `differs`: and elsewhere than the alignment says. `jump`:
+    the tracking frame moved at once, which voids the alignment.
+    """
 
     CHANGED: Final = "changed"
     DIFFERS: Final = "differs"

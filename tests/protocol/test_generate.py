@@ -66,6 +66,22 @@ def test_every_struct_is_in_the_schema() -> None:
     assert len(listed) == len(schema.all_structs())
 
 
+def test_open_enumerations_are_explained_whole() -> None:
+    """Not up to the first line, which may end within a sentence."""
+    for name in schema.enums():
+        doc = schema.enum_doc(name)
+        assert doc.split() == (getattr(names, name).__doc__ or "").split()
+        assert not doc or doc.endswith("."), name
+    document = (ROOT / "docs/protocol.md").read_text()
+    alarms = " ".join(document.split("#### AlarmKind\n")[1].split("\n#### ")[0].split())
+    for text in (
+        "`changed`: an anchor is seen",
+        "`differs`: and elsewhere",
+        "`jump`: the tracking frame moved at once",
+    ):
+        assert text in alarms
+
+
 def test_schema_follows_the_definitions() -> None:
     by_name = {struct.name: struct for struct in schema.all_structs()}
     sample = {field.name: field for field in by_name["Sample"].fields}

@@ -181,8 +181,8 @@ def enums() -> dict[str, dict[str, str]]:
 
 
 def enum_doc(name: str) -> str:
-    """First line of the docstring of an open enumeration, or empty."""
-    return (inspect.getdoc(getattr(names, name)) or "").split("\n")[0]
+    """The docstring of an open enumeration, unindented, or empty."""
+    return inspect.getdoc(getattr(names, name)) or ""
 
 
 def _struct(cls: type[msgspec.Struct]) -> Struct:

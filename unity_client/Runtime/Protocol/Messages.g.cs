@@ -114,7 +114,10 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// How an alignment was found to be wrong. changed: an anchor is seen elsewhere than seconds ago; differs: and
+    /// How an alignment was found to be wrong.
+    ///
+    /// changed: an anchor is seen elsewhere than seconds ago. differs: and elsewhere than the alignment says. jump:
+    /// the tracking frame moved at once, which voids the alignment.
     /// </summary>
     public static class AlarmKind
     {

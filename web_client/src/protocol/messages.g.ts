@@ -88,7 +88,12 @@ export const AlignAction = {
 } as const;
 export type AlignAction = (typeof AlignAction)[keyof typeof AlignAction] | (string & {});
 
-/** How an alignment was found to be wrong. `changed`: an anchor is seen elsewhere than seconds ago; `differs`: and */
+/**
+ * How an alignment was found to be wrong.
+ *
+ * `changed`: an anchor is seen elsewhere than seconds ago. `differs`: and elsewhere than the alignment says. `jump`:
+ * the tracking frame moved at once, which voids the alignment.
+ */
 export const AlarmKind = {
   CHANGED: "changed",
   DIFFERS: "differs",
