@@ -25,6 +25,7 @@ from iris_session.protocol.server_messages import (
     AnchorMoved,
     Event,
     ParticipantChanged,
+    ParticipantInfo,
     ParticipantJoined,
     ParticipantLeft,
 )
@@ -203,13 +204,16 @@ def _take(
         aligned = info.alignment is None or info.alignment.kind != AlignmentKind.NOT_NEEDED
         person = found.people.setdefault(info.id, Person(info.id, info.name, info.role, aligned))
         if isinstance(body, ParticipantJoined):
-            _own(person, joins, owners)
+            _own(person, info, joins, owners)
 
 
-def _own(person: Person, joins: list[tuple[int, Join]], owners: dict[int, tuple[str, int]]) -> None:
-    """The join that this person came with: those of one step are answered in their order, but for refused ones."""
+def _own(
+    person: Person, info: ParticipantInfo, joins: list[tuple[int, Join]], owners: dict[int, tuple[str, int]]
+) -> None:
+    """The join that this person came with, by its name and role (`info`), as who resumes may have another name. Those
+    of one step are answered in their order, but for refused ones."""
     for i, (connection, join) in enumerate(joins):
-        if (join.name, join.role) == (person.name, person.role):
+        if (join.name, join.role) == (info.name, info.role):
             run = next((c for c in join.capabilities if c.startswith(RUN_PREFIX)), f"connection {connection}")
             if not person.runs or person.runs[-1] != run:
                 person.runs.append(run)

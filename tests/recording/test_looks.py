@@ -65,6 +65,16 @@ def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_
     }
 
 
+def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tmp_path: Path) -> None:
+    played.join(1, "p1", "ann", run="run:a")
+    played.look(1, "table", TABLE, HERE, 1, n=2)
+    played.join(2, "p1", "anna", run="run:a")
+    played.look(2, "table", TABLE, HERE, 2, n=3)
+    found = read(played, tmp_path)
+    assert {frame: len(looks) for frame, looks in found.looks.items()} == {Frame("p1", 1, 0): 5}
+    assert found.unowned == 0
+
+
 @pytest.mark.parametrize(("late_ns", "known"), [(5_000_000, True), (-50_000_000, True), (50_000_001, False)])
 def test_the_head_pose_nearest_in_time_goes_with_a_look(
     played: Played, tmp_path: Path, late_ns: int, known: bool
