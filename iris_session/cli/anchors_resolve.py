@@ -221,7 +221,7 @@ def _seen(looks: Looks) -> Iterable[Seen]:
             key = (o.anchor_id, o.viewpoint_id)
             groups[key] = groups.get(key, 0) + 1
             if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(pose_of(o)):
-                headset = f"{frame.participant} {frame.run}"  # a new run has a tracking frame of its own
+                headset = f"{frame.participant} {frame.run} {frame.jumps}"  # a tracking frame of its own after each
                 yield Seen(headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, pose_of(o), look.p_tracking_head)
 
 

@@ -157,6 +157,7 @@ def lines(looks: Looks, results: list[Result], relative: Relative, damage: list[
 
 def _result(person: Person, r: Result) -> Iterator[str]:
     run = f", run {r.frame.run}" if len(person.runs) > 1 else ""
+    run += f", after jump {r.frame.jumps}" if r.frame.jumps else ""
     sheets = ", ".join(f"{name} {n}" for name, n in sorted(r.sheets.items()))
     unused = "".join(f"; {n} {why}" for why, n in r.unused.items())
     yield (
@@ -263,6 +264,7 @@ def _frame(r: Result) -> dict[str, Any]:
     return {
         "run": r.frame.run,
         "tracking_epoch": r.frame.tracking_epoch,
+        "jumps": r.frame.jumps,
         "looks": r.looks,
         "viewpoints": r.viewpoints,
         "sheets": r.sheets,

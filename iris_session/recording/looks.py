@@ -1,13 +1,13 @@
 """Reads back what headsets saw of anchors, where their heads were, and which alignments were in force meanwhile.
 
 Observations and samples lie in the recording as they came, by connection. Whose connection that was is told by the
-joins in the journal and the events of the same step.
+joins in the journal and the events of the same step; when a tracking frame jumped, by the alarms likewise.
 """
 
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -17,7 +17,7 @@ import msgspec
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose, Vec3
 from iris_session.protocol.decoding import BAD_BYTES
-from iris_session.protocol.entries import Join, decode_entries
+from iris_session.protocol.entries import AlignmentAlarm, Join, decode_entries
 from iris_session.protocol.names import AlarmKind, AlignmentKind, Device
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
@@ -49,11 +49,13 @@ _decode = msgspec.msgpack.Decoder(Sample | Observation).decode
 
 
 class Frame(NamedTuple):
-    """One tracking frame: of a participant, in one run of its app (counted from 1), in one tracking epoch."""
+    """One tracking frame: of a participant, in one run of its app (counted from 1), in one tracking epoch. `jumps`: how
+    often in this run an alarm said that the frame had moved, which a client that did not notice tells by no epoch."""
 
     participant: str
     run: int
     tracking_epoch: int
+    jumps: int = 0
 
 
 class Look(NamedTuple):
@@ -104,6 +106,24 @@ class Looks:
     unowned: int = 0
 
 
+@dataclass
+class _Roster:
+    """`owners`: participant and run, by connection. `jumps`: times of capture of jumps, sorted, by participant and run.
+    `present`: alignments in force, by participant."""
+
+    owners: dict[int, tuple[str, int]] = field(default_factory=dict)
+    jumps: dict[tuple[str, int], list[int]] = field(default_factory=dict)
+    present: dict[str, InForce] = field(default_factory=dict)
+
+
+@dataclass
+class _Said:
+    """What the journal says of one step that no event has answered yet, with connections."""
+
+    joins: list[tuple[int, Join]] = field(default_factory=list)
+    jumps: list[tuple[int, AlignmentAlarm]] = field(default_factory=list)
+
+
 class _Heads:
     """Where one head was, over time."""
 
@@ -142,58 +162,63 @@ def read_looks(recording: Recording, told: Callable[[int, int], None] | None = N
     say = told or (lambda done, total: None)
     events = [event for event in recording.events() if isinstance(event.body, _KINDS)]
     found = Looks()
-    owners = _roster(recording, events, found, lambda done: say(done, n_rows + n_samples))
-    _messages(recording, owners, found, lambda done: say(n_rows + done, n_rows + n_samples))
+    roster = _roster(recording, events, found, lambda done: say(done, n_rows + n_samples))
+    _messages(recording, roster, found, lambda done: say(n_rows + done, n_rows + n_samples))
     say(n_rows + n_samples, n_rows + n_samples)
     return found
 
 
-def _roster(
-    recording: Recording, events: list[Event], found: Looks, say: Callable[[int], None]
-) -> dict[int, tuple[str, int]]:
-    """Fills in people, alignments and moved anchors; gives participant and run by connection."""
-    joined = {event.step for event in events if isinstance(event.body, ParticipantJoined)}
-    joins: dict[int, list[tuple[int, Join]]] = {}
+def _roster(recording: Recording, events: list[Event], found: Looks, say: Callable[[int], None]) -> _Roster:
+    """Fills in people, alignments and moved anchors."""
+    wanted = {event.step for event in events if isinstance(event.body, ParticipantJoined) or _is_jump(event.body)}
+    said: dict[int, _Said] = {}
     for done, row in enumerate(recording.rows()):
         if done % TOLD_EVERY == 0:
             say(done)
-        if row.step in joined:
-            joins[row.step] = _joins(row.entries)
-    owners: dict[int, tuple[str, int]] = {}
-    present: dict[str, InForce] = {}
+        if row.step in wanted:
+            said[row.step] = _said(row.entries)
+    roster = _Roster()
     for event in events:
-        _take(event, joins.get(event.step, []), owners, present, found)
-    found.in_force.extend(present.values())
+        _take(event, said.get(event.step, _Said()), roster, found)
+    found.in_force.extend(roster.present.values())
     found.in_force.sort(key=lambda one: one.since_ns)
-    return owners
+    return roster
 
 
-def _joins(entries: bytes) -> list[tuple[int, Join]]:
+def _is_jump(body: object) -> bool:
+    return isinstance(body, AlignmentAlarmed | AlignmentAlarm) and body.kind == AlarmKind.JUMP
+
+
+def _said(entries: bytes) -> _Said:
+    said = _Said()
     try:
-        return [(e.connection, e.message) for e in decode_entries(entries) if isinstance(e.message, Join)]
+        for entry in decode_entries(entries):
+            if isinstance(entry.message, Join):
+                said.joins.append((entry.connection, entry.message))
+            elif isinstance(entry.message, AlignmentAlarm) and _is_jump(entry.message):
+                said.jumps.append((entry.connection, entry.message))
     except msgspec.DecodeError:  # damaged: those who came in this step stay unknown
-        return []
+        return _Said()
+    return said
 
 
-def _take(
-    event: Event,
-    joins: list[tuple[int, Join]],
-    owners: dict[int, tuple[str, int]],
-    present: dict[str, InForce],
-    found: Looks,
-) -> None:
-    """One event of the history. `joins`: those of its step that no event has answered yet."""
-    body, now_ns = event.body, event.session_time
+def _take(event: Event, said: _Said, roster: _Roster, found: Looks) -> None:
+    """One event of the history. `said`: by the journal, in its step."""
+    body, now_ns, present = event.body, event.session_time, roster.present
     if isinstance(body, AnchorMoved):
         found.moved.append(Moved(now_ns, body.anchor_id, body.T_world_anchor))
     elif isinstance(body, AlignmentChanged):
         _end(body.participant, now_ns, present, found)
         person = found.people.get(body.participant)
-        frame = Frame(body.participant, len(person.runs) if person else 0, body.alignment.tracking_epoch)
+        run = len(person.runs) if person else 0
+        jumps = len(roster.jumps.get((body.participant, run), ()))
+        frame = Frame(body.participant, run, body.alignment.tracking_epoch, jumps)
         present[body.participant] = InForce(frame, body.alignment, now_ns)
     elif isinstance(body, AlignmentAlarmed):
-        if body.kind == AlarmKind.JUMP:
+        if _is_jump(body):
             _end(body.participant, now_ns, present, found)
+            person = found.people.get(body.participant)
+            _jump(body.participant, len(person.runs) if person else 0, now_ns, said.jumps, roster)
     elif isinstance(body, ParticipantLeft):
         if not body.grace:
             _end(body.participant, now_ns, present, found)
@@ -204,7 +229,7 @@ def _take(
         aligned = info.alignment is None or info.alignment.kind != AlignmentKind.NOT_NEEDED
         person = found.people.setdefault(info.id, Person(info.id, info.name, info.role, aligned))
         if isinstance(body, ParticipantJoined):
-            _own(person, info, joins, owners)
+            _own(person, info, said.joins, roster.owners)
 
 
 def _own(
@@ -223,15 +248,24 @@ def _own(
     person.runs.append("unknown")
 
 
+def _jump(participant: str, run: int, now_ns: int, alarms: list[tuple[int, AlignmentAlarm]], roster: _Roster) -> None:
+    """Notes when it was captured, as the alarm in the journal says: the event is later by what messages take."""
+    at_ns = now_ns
+    for i, (connection, alarm) in enumerate(alarms):
+        if roster.owners.get(connection, ("", 0))[0] == participant:
+            at_ns = alarm.capture_ns or now_ns
+            del alarms[i]
+            break
+    insort(roster.jumps.setdefault((participant, run), []), at_ns)
+
+
 def _end(participant: str, now_ns: int, present: dict[str, InForce], found: Looks) -> None:
     was = present.pop(participant, None)
     if was is not None:
         found.in_force.append(was._replace(until_ns=now_ns))
 
 
-def _messages(
-    recording: Recording, owners: dict[int, tuple[str, int]], found: Looks, say: Callable[[int], None]
-) -> None:
+def _messages(recording: Recording, roster: _Roster, found: Looks, say: Callable[[int], None]) -> None:
     """Fills in the looks: observations with the head pose nearest in time."""
     heads: dict[Frame, _Heads] = {}
     seen: dict[Frame, list[Observation]] = {}
@@ -243,11 +277,12 @@ def _messages(
         except BAD_BYTES:
             found.unreadable += 1
             continue
-        owner = owners.get(raw.connection)
+        owner = roster.owners.get(raw.connection)
         if owner is None:
             found.unowned += isinstance(message, Observation)
             continue
-        frame = Frame(*owner, message.tracking_epoch)
+        jumps = bisect_right(roster.jumps.get(owner, ()), message.capture_ns)
+        frame = Frame(*owner, message.tracking_epoch, jumps)
         if isinstance(message, Observation):
             seen.setdefault(frame, []).append(message)
         elif message.device == Device.HEAD and message.pose is not None and message.tracked:

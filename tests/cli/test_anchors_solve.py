@@ -16,8 +16,8 @@ from anchors.pose import PoseTuple, compose, distance, inverse
 from iris_session.cli.anchors_around import Anchors, Resolver, fused
 from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
-from iris_session.protocol.server_messages import AnchorMoved
-from iris_session.recording import Recording, read_looks
+from iris_session.protocol.server_messages import AlignmentAlarmed, AnchorMoved
+from iris_session.recording import Frame, Recording, read_looks
 from iris_session.runtime.anchors_file import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.recording.headsets import Played
@@ -146,7 +146,7 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
     played.wait(20.0)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
         looks = read_looks(recording)
-    resolver = Resolver(looks.looks["p1", 1, 0], Anchors(looks, {"table": TRUE["table"]}, None), {})
+    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {})
     before, after = resolver.at(moved_ns - 1), resolver.at(moved_ns)
     x, y, z = before.T_world_tracking[0]
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
@@ -162,7 +162,7 @@ def test_what_came_later_counts_too(tmp_path: Path) -> None:
     played.look(1, "table", TRUE["table"], T, 2)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
         looks = read_looks(recording)
-    solution = Resolver(looks.looks["p1", 1, 0], Anchors(looks, {"table": TRUE["table"]}, None), {}).at(early_ns)
+    solution = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {}).at(early_ns)
     assert (solution.refused, solution.n_observations) == (False, 20)
 
 
@@ -240,6 +240,26 @@ def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
     assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
 
 
+def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, capsys: Capture) -> None:
+    """A headset that does not notice its jump tells no new epoch: each side of it is a tracking frame of its own."""
+    played, (ann, _) = Played(TRUE, {"table": 0.16}), frames()
+    jumped = shifted(ann, (0.2, 0.0, 0.0))
+    played.join(1, "p1", "ann")
+    for viewpoint, name in enumerate(("table", "door", "shelf"), 1):
+        played.look(1, name, TRUE[name], ann, viewpoint)
+    played.wait(0.5)
+    played.event(AlignmentAlarmed("p1", "jump", "", 0.2))
+    for viewpoint, name in enumerate(("table", "door"), 4):
+        played.look(1, name, TRUE[name], jumped, viewpoint)
+    played.aligned("p1", 1, jumped, 0.003)
+    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    before, after = told["participants"][0]["frames"]
+    assert [(one["jumps"], one["looks"]) for one in (before, after)] == [(0, 60), (1, 40)]
+    assert (before["outliers"], after["outliers"], told["constellation"]["moved"]) == ([], [], [])
+    (alignment,) = after["alignments"]
+    assert alignment["off_m"] < 0.01
+
+
 def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the live estimator sees no majority."""
     solve = Resolver._solve
@@ -250,9 +270,9 @@ def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monke
     monkeypatch.setattr(Resolver, "_solve", blind)
     with Recording.open(recording) as opened:
         looks = read_looks(opened)
-    resolver = Resolver(looks.looks["p1", 1, 0], Anchors(looks, BELIEVED, None), {})
+    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, BELIEVED, None), {})
     solved = resolver.at(10_000_000_000)
     assert (solved.refused, solved.moved) == (False, ("shelf",))
     assert "sheet 'shelf'; it is not used" in solved.advice
     two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
-    assert Resolver(looks.looks["p1", 1, 0], Anchors(looks, two, None), {}).at(10_000_000_000).refused
+    assert Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, two, None), {}).at(10_000_000_000).refused

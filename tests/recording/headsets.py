@@ -10,8 +10,9 @@ import numpy as np
 from anchors.pose import PoseTuple, apply, inverse
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
-from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.entries import AlignmentAlarm, Entry, Join
 from iris_session.protocol.server_messages import (
+    AlignmentAlarmed,
     AlignmentChanged,
     Event,
     EventKind,
@@ -69,6 +70,13 @@ class Played:
         self._entries.setdefault(self.step, []).append(entry)
         if not refused:
             self.event(ParticipantJoined(ParticipantInfo(id, name, role, True, alignment=alignment), resumed=False))
+
+    def jumped(self, connection: int, id: str, late_s: float) -> None:
+        """The tracking frame jumps now; the session hears of it so much later."""
+        alarm = AlignmentAlarm("jump", 0, "", 0.2, self.now_ns)
+        self.wait(late_s)
+        self._entries.setdefault(self.step, []).append(Entry(connection, connection, self.now_ns, alarm))
+        self.event(AlignmentAlarmed(id, "jump", "", 0.2))
 
     def aligned(self, id: str, version: int, T_world_tracking: PoseTuple, stated_m: float, epoch: int = 0) -> None:
         """The session accepts an alignment."""

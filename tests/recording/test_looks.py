@@ -65,6 +65,32 @@ def test_every_run_and_epoch_is_a_tracking_frame_of_its_own(played: Played, tmp_
     }
 
 
+def test_a_jump_begins_a_tracking_frame(played: Played, tmp_path: Path) -> None:
+    """From its capture on, although the session hears of it later, and only in that run of that person."""
+    played.join(1, "p1", "ann", run="run:a")
+    played.join(2, "p2", "bob")
+    played.look(1, "table", TABLE, HERE, 1, n=2)
+    played.wait(0.05)
+    before_ns = played.now_ns
+    played.jumped(1, "p1", late_s=0.3)
+    heard_ns, played.now_ns = played.now_ns, before_ns - 2 * S + 100_000_000
+    played.look(1, "table", TABLE, HERE, 2, n=1)  # 0.1 s after the jump, 0.2 s before it is heard of
+    played.look(2, "table", TABLE, HERE, 1, n=4)
+    played.now_ns = max(played.now_ns, heard_ns)
+    played.aligned("p1", 1, HERE, 0.004)
+    played.join(3, "p1", "ann", run="run:b")
+    played.look(3, "table", TABLE, HERE, 3, n=3)
+    found = read(played, tmp_path)
+    assert {frame: len(looks) for frame, looks in found.looks.items()} == {
+        Frame("p1", 1, 0): 2,
+        Frame("p1", 1, 0, 1): 1,
+        Frame("p1", 2, 0): 3,
+        Frame("p2", 1, 0): 4,
+    }
+    assert all(look.p_tracking_head is not None for look in found.looks[Frame("p1", 1, 0, 1)])
+    assert [one.frame for one in found.in_force] == [Frame("p1", 1, 0, 1)]
+
+
 def test_who_comes_back_under_another_name_is_the_same_person(played: Played, tmp_path: Path) -> None:
     played.join(1, "p1", "ann", run="run:a")
     played.look(1, "table", TABLE, HERE, 1, n=2)
@@ -82,7 +108,7 @@ def test_the_head_pose_nearest_in_time_goes_with_a_look(
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=late_ns)
     played.sample(1, (9.0, 9.0, 9.0), played.now_ns + 2 * abs(late_ns))
-    (look,) = read(played, tmp_path).looks["p1", 1, 0]
+    (look,) = read(played, tmp_path).looks[Frame("p1", 1, 0)]
     assert (look.p_tracking_head is not None) == known
     if look.p_tracking_head is not None:
         assert distance(look.p_tracking_head, look.seen.T_tracking_anchor.p) < 0.7
@@ -92,7 +118,7 @@ def test_heads_of_another_tracking_epoch_say_nothing(played: Played, tmp_path: P
     played.join(1, "p1", "ann")
     played.look(1, "table", TABLE, HERE, 1, n=1, head_late_ns=S)
     played.sample(1, (1.0, 2.0, 3.0), played.now_ns, epoch=1)
-    (look,) = read(played, tmp_path).looks["p1", 1, 0]
+    (look,) = read(played, tmp_path).looks[Frame("p1", 1, 0)]
     assert look.p_tracking_head is None
 
 
@@ -124,7 +150,7 @@ def test_alignments_hold_until_something_ends_them(played: Played, tmp_path: Pat
         (4, 5, 7),
         (1, 7, -1),
     ]
-    assert found[3].frame == Frame("p1", 1, 1)
+    assert found[3].frame == Frame("p1", 1, 1, 1), "jumps are counted through a run, whatever epochs it tells"
 
 
 def test_moved_anchors_are_told(played: Played, tmp_path: Path) -> None:
@@ -140,7 +166,7 @@ def test_what_does_not_decode_is_counted(played: Played, tmp_path: Path) -> None
     played.raw(1, b"\x81\xa4type\xa3bye")
     played.look(1, "table", TABLE, HERE, 1, n=2)
     found = read(played, tmp_path)
-    assert (found.unreadable, len(found.looks["p1", 1, 0])) == (2, 2)
+    assert (found.unreadable, len(found.looks[Frame("p1", 1, 0)])) == (2, 2)
 
 
 def test_recordings_of_any_session_can_be_read(played: Played, tmp_path: Path) -> None:
