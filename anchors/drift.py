@@ -3,8 +3,8 @@
 A change is found in two ways. (1) Against what was seen just before: the same anchor, the last second against the ten
 before it; what is common to a viewpoint cancels, so small changes show. (2) Against the alignment in force, also after
 the anchor was out of sight; here all uncertainties count. A jump (the tracking frame moved at once) needs no
-statistics: a new `tracking_epoch`, a head that is faster or starts faster than people can, or three detections in a row
-that agree with each other far away. Pure: times are passed in.
+statistics: a new `tracking_epoch`, a head faster than people are, or three detections in a row that agree with each
+other far away. Pure: times are passed in.
 """
 
 from __future__ import annotations
@@ -48,11 +48,10 @@ class Alarm(NamedTuple):
 @dataclass(frozen=True)
 class DriftConfig:
     """`window_ns`: what counts as now; `reference_ns`: what counts as before, summed up anew every
-    `reference_every_ns`. `min_change_m`: less is left to smooth updates. `jump_m`: detections that far away, three in a
-    row, are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`: no head is faster. `max_acceleration_m_per_s2`: no head
-    changes its speed faster (a turn that speeds up by 500 rad/s^2, 0.15 m before the neck, has 75), `start_m` of noise
-    apart. `quiet_ns`: an anchor that raised an alarm raises no other for so long. `unseen_sigma_m`: noise per axis of
-    detections from where nobody knows."""
+    `reference_every_ns`. `min_change_m`: less is left to smooth
+    updates. `jump_m`: detections that far away, three in a row, are a jump. `max_speed_m_per_s`, `max_turn_rad_per_s`:
+    no head is faster. `quiet_ns`: an anchor that raised an alarm raises no other for so long. `unseen_sigma_m`: noise
+    per axis of detections from where nobody knows."""
 
     window_ns: int = 1_000_000_000
     reference_ns: int = 10_000_000_000
@@ -64,8 +63,6 @@ class DriftConfig:
     jump_in_a_row: int = 3
     max_speed_m_per_s: float = 6.0
     max_turn_rad_per_s: float = 20.0
-    max_acceleration_m_per_s2: float = 100.0
-    start_m: float = 0.02
     quiet_ns: int = 2_000_000_000
     max_seen: int = 600
     unseen_sigma_m: float = 0.005
@@ -100,15 +97,13 @@ class DriftMonitor:
     _references: dict[str, tuple[int, int, _Window | None]] = field(default_factory=dict)
     _steady_ns: dict[str, int] = field(default_factory=dict)
     _head: tuple[int, PoseTuple] | None = None
-    _velocity: Vec3 | None = None  # of the head, between its last two poses [m/s]
 
     def head(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
-        """A head pose as tracked: a new epoch, an impossible speed or an impossible start is a jump."""
+        """A head pose as tracked: a new epoch or an impossible speed is a jump."""
         if tracking_epoch < self.tracking_epoch or not is_rigid(T_tracking_head):
             return None  # of a frame that is void, or no pose: nothing to compare with
         alarm = self._epoch(capture_ns, tracking_epoch)
         last, self._head = self._head, (capture_ns, T_tracking_head)
-        velocity, self._velocity = self._velocity, None
         if alarm is not None or last is None or not 0 < capture_ns - last[0] <= 500_000_000:
             return alarm
         seconds = (capture_ns - last[0]) * 1e-9
@@ -117,14 +112,6 @@ class DriftMonitor:
         if moved > c.jump_m + c.max_speed_m_per_s * seconds or turned > 0.2 + c.max_turn_rad_per_s * seconds:
             self._forget()
             return Alarm("jump", "", moved, capture_ns)
-        x, y, z = (T_tracking_head[0][i] - last[1][0][i] for i in range(3))
-        if velocity is not None:
-            start = math.dist((x, y, z), [v * seconds for v in velocity])
-            if start > c.start_m + 0.5 * c.max_acceleration_m_per_s2 * seconds * seconds:
-                self._forget()
-                return Alarm("jump", "", start, capture_ns)
-        if seconds <= 0.1:  # of a longer time it says little about now
-            self._velocity = (x / seconds, y / seconds, z / seconds)
         return None
 
     def observe(
@@ -285,7 +272,7 @@ class DriftMonitor:
         self._references.clear()
         self._quiet_until_ns.clear()
         self._steady_ns.clear()
-        self._head = self._velocity = None
+        self._head = None
 
 
 def _median(points: list[Vec3]) -> Array:

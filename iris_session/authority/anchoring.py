@@ -87,7 +87,8 @@ def _move(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
         ctx.emit(AnchorMoved(name, anchors[name], by))
     for p in ctx.state.participants.values():
         p.correction = None
-        if p.alarm is not None and (p.alarm.anchor_id in moved or p.alarm.anchor_id not in anchors):
+        about = "" if p.alarm is None else p.alarm.anchor_id  # empty too where a head jumped: no anchor answers that
+        if about and (about in moved or about not in anchors):
             _clear(ctx, p)
 
 
@@ -103,8 +104,8 @@ def alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
         return
     if m.tracking_epoch > p.tracking_epoch:
         alignment.tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
-    if m.kind == AlarmKind.DIFFERS and p.correction is not None and not m.beside:
-        return  # known: what was measured is not in force yet
+    if m.kind == AlarmKind.DIFFERS and not m.beside and (p.correction is not None or p.alignment is None):
+        return  # known: what was measured is not in force (yet)
     size_m = min(max(0.0, m.size_m), ctx.config.reach_m) if math.isfinite(m.size_m) else ctx.config.reach_m
     if m.kind == AlarmKind.JUMP:
         p.proposals_from_ns = max(p.proposals_from_ns, ctx.entry_ns)

@@ -11,7 +11,7 @@ from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
 from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import ParticipantJoined, ParticipantLeft
+from iris_session.protocol.server_messages import AlignmentRun, ParticipantJoined, ParticipantLeft
 from iris_session.protocol.steps import Admitted, Dropped
 
 NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
@@ -75,8 +75,10 @@ def _resume(ctx: Context, connection: int, m: Join, p: Participant) -> None:
     needs_alignment = m.alignment == AlignmentKind.MEASURED
     if not p.run or p.run not in _runs(m) or needs_alignment != p.needs_alignment:
         p.tracking_epoch = 0
-        p.aligning = True
         corrections.void(p)
+        if not p.aligning:
+            p.aligning, p.alignment_run = True, p.alignment_run + 1
+            ctx.emit(AlignmentRun(p.id, True, p.alignment_run))
     p.name, p.needs_alignment = m.name, needs_alignment
     p.seen.clear()
     return _admit(ctx, p, connection, m, resumed=True)
@@ -97,6 +99,8 @@ def _admit(ctx: Context, p: Participant, connection: int, m: Join, resumed: bool
     ctx.by_connection[connection] = p
     ctx.admitted.append(Admitted(connection, p.id, p.role, resumed))
     ctx.emit(ParticipantJoined(ctx.info(p), resumed))
+    if not p.aligning:  # a front that was started anew has heard nothing of it
+        ctx.emit(AlignmentRun(p.id, False, p.alignment_run))
     if resumed:
         leases.fence(ctx, p)
 

@@ -22,7 +22,9 @@ from iris_session.protocol.server_messages import (
     AlignmentRun,
     AnchorMoved,
     EventKind,
+    ParticipantChanged,
     ParticipantInfo,
+    ParticipantJoined,
     ParticipantLeft,
 )
 from iris_session.protocol.status import AlignmentReport
@@ -40,14 +42,25 @@ _REMEMBERED: Final = 4
 
 
 class _Person:
-    """What is kept of one connection. Alarms and proposals are stamped so that their order shows in their times."""
+    """What is kept of one connection. Alarms and proposals are stamped so that their order shows in their times.
 
-    __slots__ = ("alarm_ns", "desk", "proposal_ns", "watch")
+    `jumped`: tracking epoch and time of the last jump: what was seen before it was seen in another frame, though it may
+    come later (sheets are found in pictures that are tenths of a second old).
+    """
+
+    __slots__ = ("alarm_ns", "desk", "jumped", "proposal_ns", "watch")
 
     def __init__(self, desk: AlignmentDesk, watch: AlignmentWatch) -> None:
         self.desk = desk
         self.watch = watch
         self.alarm_ns = self.proposal_ns = -1
+        self.jumped: tuple[int, int] | None = None
+
+    def is_of_before(self, observation: Observation) -> bool:
+        """Whether it is of the frame before the last jump."""
+        if self.jumped is None or observation.tracking_epoch != self.jumped[0]:
+            return False
+        return observation.capture_ns < self.jumped[1]
 
 
 class Anchoring:
@@ -78,19 +91,22 @@ class Anchoring:
         pose = sample.pose
         alarm = person.watch.head((pose.p, pose.q), sample.capture_ns, sample.tracking_epoch)
         if alarm is not None:
-            self._alarmed(connection.number, person, alarm, now_ns)
+            self._alarmed(connection.number, person, alarm, sample.tracking_epoch, now_ns)
 
     def observed(self, connection: Connection, observation: Observation, now_ns: int) -> None:
         """Every observation: for the watch first, then for the estimate."""
         number = connection.number
         person = self._people.get(number) or self._meet(connection)
+        if person.is_of_before(observation):
+            self._drops.count("observation_before_jump", number)
+            return
         p_tracking_head = self._head_of(person, observation)
         known = observation.anchor_id in self.anchors
         touch, tracked = observation.kind == AnchorKind.TOUCH, observation.kind == AnchorKind.CONTROLLER
         if known and not touch:
             alarm = person.watch.observe(observation, p_tracking_head)
             if alarm is not None:
-                self._alarmed(number, person, alarm, now_ns)
+                self._alarmed(number, person, alarm, observation.tracking_epoch, now_ns)
         used = True
         if known or not tracked:
             used = person.desk.observe(observation, p_tracking_head, now_ns)
@@ -127,8 +143,10 @@ class Anchoring:
         self._put_in_force(person, self._in_force.get(connection.participant_id))
         return person
 
-    def _alarmed(self, number: int, person: _Person, alarm: Alarm, now_ns: int) -> None:
+    def _alarmed(self, number: int, person: _Person, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
         """Tells, and forgets what holds no more: of the sheet that was moved, else of the headset."""
+        if alarm.kind == AlarmKind.JUMP:
+            person.jumped = (tracking_epoch, min(alarm.capture_ns, now_ns))
         told = person.watch.told(alarm, now_ns)
         if told is None:
             self._drops.count("alarms_repeated", number)
@@ -156,6 +174,9 @@ class Anchoring:
         elif isinstance(event, AlignmentAlarmed):
             if event.kind == AlarmKind.JUMP:
                 self._changed(event.participant, None)
+        elif isinstance(event, ParticipantJoined | ParticipantChanged):
+            if event.participant.alignment is None:
+                self._changed(event.participant.id, None)
         elif isinstance(event, AlignmentRun):
             self._ran(event)
         elif isinstance(event, AnchorMoved):

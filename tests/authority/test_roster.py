@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.protocol.client_messages import Acquire, Bye, GetSnapshot, Heartbeat, Release
+from iris_session.protocol.client_messages import Acquire, Align, Bye, GetSnapshot, Heartbeat, Release
 from iris_session.protocol.entries import Entry, FrontRestarted, Join, Lost, SessionResumed
 from iris_session.protocol.server_messages import (
+    AlignmentRun,
     LeaseChanged,
     ParticipantChanged,
     ParticipantJoined,
@@ -236,6 +237,19 @@ def test_alignment_survives_a_resume_only_within_one_run_of_the_app(run: str, ke
     anna = t.operator("left", capabilities=("run:a",))
     rejoin(t, anna, capabilities=(run,))
     assert (t.last(ParticipantJoined).participant.alignment is not None) == kept
+
+
+@pytest.mark.parametrize(("run", "running"), [("run:a", False), ("run:b", True)])
+def test_a_stopped_alignment_run_is_told_to_a_new_front_and_ends_with_the_run_of_the_app(
+    run: str, running: bool
+) -> None:
+    """Else nobody would measure who starts the app anew: there is nothing in force that could be kept."""
+    t = Table()
+    anna = t.operator("left", capabilities=("run:a",))
+    t.step(anna.says(Align(1, "stop")))
+    rejoin(t, anna, capabilities=(run,))
+    assert t.last(AlignmentRun).running is running
+    assert t.last(AlignmentRun).participant == anna.id
 
 
 def test_resume_needs_the_same_key_and_role() -> None:

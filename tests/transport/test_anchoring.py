@@ -16,12 +16,13 @@ from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
     AlignmentRun,
     AnchorMoved,
+    ParticipantChanged,
     ParticipantInfo,
     ParticipantLeft,
 )
 from iris_session.protocol.status import AlignmentReport
 from tests.anchors.worlds import shifted
-from tests.transport.anchor_world import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, misplaced_m
+from tests.transport.anchor_world import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, inverse_head, misplaced_m
 
 
 def test_heads_make_the_noise_model_known() -> None:
@@ -156,6 +157,39 @@ def test_a_second_jump_is_told_at_once_when_something_came_into_force_between() 
         ann.head(((x, 0.0, 1.6), (1.0, 0.0, 0.0, 0.0)))
         ann.accept()
     assert [a.kind for a in ann.alarms()][-2:] == ["jump", "jump"]
+
+
+def test_looks_from_before_a_jump_that_come_after_it_do_not_count() -> None:
+    """A sheet is found in a picture tenths of a second old; the head shows the jump within a frame."""
+    lab = Lab()
+    ann = lab.wearer()
+    ann.survey()
+    look = ann.place(d=0.6)
+    ann.watch(look, 5)
+    seen_at_ns, old_frame, told = lab.now_ns, ann.frame, len(ann.entries())
+    lab.now_ns += 10 * MS
+    ann.bump(0.5)
+    ann.head(inverse_head(ann.frame, look))
+    assert [a.kind for a in ann.alarms()] == ["jump"]
+    for i in range(10):
+        lab.now_ns += 30 * MS
+        p, q = look.new(old_frame, lab.world["sheet"])
+        ann.observe(Observation("sheet", "qr", Pose(p, q), seen_at_ns + i * MS, ann.epoch, ann.viewpoint))
+        lab.turn()
+    assert lab.drops.by_reason["observation_before_jump"] == 10
+    assert not [e for e in ann.entries()[told:] if isinstance(e.message, AlignmentProposal)]
+    ann.watch(look, 15)
+    assert misplaced_m(ann, ann.proposals()[-1]) < 0.015
+
+
+def test_who_has_no_alignment_any_more_has_none_in_force_here() -> None:
+    lab = Lab()
+    ann = lab.wearer()
+    ann.survey()
+    info = ParticipantInfo("p1", "Ann", "operator", True)
+    assert lab.anchoring._people[1].watch.in_force is not None
+    lab.anchoring.heard(ParticipantChanged(info))
+    assert lab.anchoring._people[1].watch.in_force is None
 
 
 def test_a_stopped_run_proposes_nothing_but_is_watched_and_a_new_one_forgets() -> None:
