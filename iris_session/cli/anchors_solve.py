@@ -62,7 +62,8 @@ def run_solve(arguments: argparse.Namespace) -> int:
         results = _resolved(looks, anchors, saved.sizes)
         relative = constellation(looks, _with(saved, anchors.last))
         damage = recording.damage + recording.missing
-    written = _write(arguments.out, relative) if arguments.out is not None else ""
+    wanted = arguments.out is not None
+    written = _write(arguments.out, relative) if wanted and relative.solved is not None else ""
     if arguments.json:
         print_json(as_dict(str(arguments.recording), looks, results, relative, damage, written))
     else:
@@ -70,6 +71,8 @@ def run_solve(arguments: argparse.Namespace) -> int:
             print(printable(line))
         if written:
             print(f"written: {written}    use it: iris-session serve SCENE --anchors {written}")
+    if wanted and not written:  # after what was found out all the same
+        raise CommandError(f"{arguments.out} is not written: {relative.advice}", status=1)
     return 0
 
 
@@ -124,8 +127,7 @@ def _resolved(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Resul
 
 def _write(path: Path, relative: Relative) -> str:
     """The constellation as a file for `serve --anchors`."""
-    if relative.solved is None:
-        raise CommandError(f"{path} is not written: {relative.advice}", status=1)
+    assert relative.solved is not None
     try:
         path.write_text(relative.solved.constellation.to_toml(), encoding="utf-8")
     except OSError as error:
