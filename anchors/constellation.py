@@ -93,11 +93,17 @@ def _quoted(name: str) -> str:
     return json.dumps(name, ensure_ascii=False)
 
 
+_KEYS: Final = ("position_m", "quaternion_wxyz", "error_m", "size_m")
+
+
 def _read_anchor(name: str, table: Any) -> tuple[PoseTuple, float, float]:
     p, q = _numbers(name, table, "position_m", 3), _numbers(name, table, "quaternion_wxyz", 4)
     if abs(math.sqrt(sum(c * c for c in q)) - 1.0) > 1e-3:
         raise ConstellationError(f"anchors.{name}.quaternion_wxyz is no unit quaternion: {q}")
     pose: PoseTuple = ((p[0], p[1], p[2]), quat_normalize((q[0], q[1], q[2], q[3])))
+    unknown = sorted(set(table) - set(_KEYS))
+    if unknown:
+        raise ConstellationError(f"anchors.{name}.{unknown[0]} is not known; known: {', '.join(_KEYS)}")
     extra = []
     for key in ("error_m", "size_m"):
         value = table.get(key, 0.0)

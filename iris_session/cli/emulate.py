@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from iris_session.cli.common import add_way_to_session, positive_seconds
+from iris_session.cli.common import CommandError, add_way_to_session, positive_seconds
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -54,6 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Runs the people in this process; exit status 0 when nobody failed."""
     from iris_session.emulator.__main__ import main
 
+    if arguments.headset and (arguments.drift is not None or arguments.bump_at or arguments.glance_every):
+        raise CommandError(
+            "--drift, --bump-at and --glance-every are for people without --headset; with it write, for example, "
+            "--headset name=ann,model.drift_m_per_min=0.03,bump_at_s=20,glance_every_s=5"
+        )
     headsets = arguments.headset or [
         f"name={arguments.behaviour}{i + 1},behaviour={arguments.behaviour},robot={arguments.robot},"
         f"seed={arguments.seed + i}{_headset_options(arguments)}"

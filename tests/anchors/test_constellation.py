@@ -129,6 +129,11 @@ def test_saved_and_read_back_exactly() -> None:
         ),
         (
             'format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]\n'
+            "size_mm = 160",
+            "size_mm is not known",
+        ),
+        (
+            'format = 1\nreference = "x"\n[anchors.x]\nposition_m = [0, 0, 0]\nquaternion_wxyz = [1, 0, 0, 0]\n'
             "size_m = -1",
             "size_m must be a length",
         ),
