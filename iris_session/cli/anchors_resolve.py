@@ -198,7 +198,8 @@ def constellation(looks: Looks, saved: Constellation) -> Relative:
     seen = list(_seen(looks))
     names = {one.anchor_id for one in seen}
     if len(names) < 2:
-        return Relative(None, f"{len(names)} sheets were seen: 2 are needed to say where they lie to each other")
+        were = "sheet was" if len(names) == 1 else "sheets were"
+        return Relative(None, f"{len(names)} {were} seen: 2 are needed to say where they lie to each other")
     known = [name for name in (saved.reference, *saved.anchors) if name in names]
     reference = known[0] if known else min(names)
     try:

@@ -1,7 +1,8 @@
 """Reads back what headsets saw of anchors, where their heads were, and which alignments were in force meanwhile.
 
 Observations and samples lie in the recording as they came, by connection. Whose connection that was is told by the
-joins in the journal and the events of the same step; when a tracking frame jumped, by the alarms likewise.
+joins in the journal and the events of the same step; when a tracking frame jumped, by the alarms likewise. A step is
+known by its session time, which strictly grows: rows of the journal and events number steps differently.
 """
 
 from __future__ import annotations
@@ -170,16 +171,16 @@ def read_looks(recording: Recording, told: Callable[[int, int], None] | None = N
 
 def _roster(recording: Recording, events: list[Event], found: Looks, say: Callable[[int], None]) -> _Roster:
     """Fills in people, alignments and moved anchors."""
-    wanted = {event.step for event in events if isinstance(event.body, ParticipantJoined) or _is_jump(event.body)}
+    wanted = {e.session_time for e in events if isinstance(e.body, ParticipantJoined) or _is_jump(e.body)}
     said: dict[int, _Said] = {}
     for done, row in enumerate(recording.rows()):
         if done % TOLD_EVERY == 0:
             say(done)
-        if row.step in wanted:
-            said[row.step] = _said(row.entries)
+        if row.now_ns in wanted:
+            said[row.now_ns] = _said(row.entries)
     roster = _Roster()
     for event in events:
-        _take(event, said.get(event.step, _Said()), roster, found)
+        _take(event, said.get(event.session_time, _Said()), roster, found)
     found.in_force.extend(roster.present.values())
     found.in_force.sort(key=lambda one: one.since_ns)
     return roster

@@ -7,6 +7,7 @@ true world.
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -21,7 +22,7 @@ from iris_session.emulator.specs import HeadsetSpec
 from iris_session.physics.scenes import n_arms_scene
 from iris_session.protocol.names import AlarmKind, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentAlarmed, HeadsetsCompared, Notice, SamplesRejected
-from tests.e2e.conftest import DEADLINE_S, Hand, Server, Stage
+from tests.e2e.conftest import DEADLINE_S, Hand, Server, Stage, here
 from tests.e2e.crew import BEYOND_CHANCE, Emulated, agree, differences, views
 
 pytestmark = pytest.mark.e2e
@@ -204,9 +205,25 @@ def test_who_saw_no_sheet_is_told_and_moves_nothing(seat: Callable[..., Table]) 
     eve.release("arm5")
     for name, role in (("policy", "agent"), ("desk", "operator")):
         _moves(table, stage.join(name, role), "arm5")
+    ann = table.crew["ann"].report
     for person in table.crew.values():
         person.close()
     stage.server.finish()
+    _solved_again(stage.server.recording, ann.participant)
+
+
+def _solved_again(recording: Path, participant: str) -> None:
+    """`anchors solve` finds whose looks they were, and the alignment of then as it was."""
+    code, out, errors = here("anchors", "solve", "--json", str(recording))
+    assert code == 0, errors
+    solved = json.loads(out)
+    assert (solved["unowned"], solved["unreadable"], solved["damage"]) == (0, 0, [])
+    (person,) = (one for one in solved["participants"] if one["id"] == participant)
+    (frame,) = person["frames"]
+    assert frame["looks"] >= 5
+    assert not frame["refused"], frame
+    assert frame["alignments"]
+    assert all(one["solved_m"] is not None and one["off_m"] < 0.02 for one in frame["alignments"])
 
 
 def _moves(table: Table, client: Client, robot: str) -> None:

@@ -26,12 +26,12 @@ from tests.anchors.worlds import Look, around
 from tests.recording.support import make_header
 
 S = 1_000_000_000
-STEP_NS = S // 10
 _encode = msgspec.msgpack.Encoder().encode
 
 
 class Played:
-    """What happened, step by step; `write` makes a recording of it. `anchors`: as the session has them."""
+    """What happened, step by step; `write` makes a recording of it, with a step at every instant at which something
+    did. As in a session, rows are numbered from 0 and steps of events from 1. `anchors`: as the session has them."""
 
     def __init__(self, anchors: dict[str, PoseTuple], sizes: dict[str, float] | None = None, seed: int = 1) -> None:
         poses = {name: Pose(p, q) for name, (p, q) in anchors.items()}
@@ -41,18 +41,14 @@ class Played:
         self.now_ns = 0
         self.samples: list[tuple[int, int, bytes]] = []
         self._entries: dict[int, list[Entry]] = {}
-        self._events: list[Event] = []
+        self._events: list[tuple[int, EventKind]] = []  # with their time
         self._people: dict[str, ParticipantInfo] = {}
-
-    @property
-    def step(self) -> int:
-        return self.now_ns // STEP_NS
 
     def wait(self, seconds: float) -> None:
         self.now_ns += round(seconds * 1e9)
 
     def event(self, body: EventKind) -> None:
-        self._events.append(Event(len(self._events) + 1, self.step, self.now_ns, body))
+        self._events.append((self.now_ns, body))
 
     def join(
         self,
@@ -67,7 +63,7 @@ class Played:
     ) -> None:
         """`refused`: the session did not take it, so there is no event."""
         entry = Entry(connection, connection, self.now_ns, Join("key", role, name, capabilities=(run,) if run else ()))
-        self._entries.setdefault(self.step, []).append(entry)
+        self._entries.setdefault(self.now_ns, []).append(entry)
         if not refused:
             self.event(ParticipantJoined(ParticipantInfo(id, name, role, True, alignment=alignment), resumed=False))
 
@@ -75,7 +71,7 @@ class Played:
         """The tracking frame jumps now; the session hears of it so much later."""
         alarm = AlignmentAlarm("jump", 0, "", 0.2, self.now_ns)
         self.wait(late_s)
-        self._entries.setdefault(self.step, []).append(Entry(connection, connection, self.now_ns, alarm))
+        self._entries.setdefault(self.now_ns, []).append(Entry(connection, connection, self.now_ns, alarm))
         self.event(AlignmentAlarmed(id, "jump", "", 0.2))
 
     def aligned(self, id: str, version: int, T_world_tracking: PoseTuple, stated_m: float, epoch: int = 0) -> None:
@@ -121,10 +117,12 @@ class Played:
         writer = RrdWriter(path, "id")
         writer.header(self.header)
         chain, rows = header_root(self.header), []
-        for step in range(self.step + 1):
-            rows.append(make_row(chain, step, step * STEP_NS, 1, self._entries.get(step, []), b"\0" * 16, b""))
+        times = sorted({0, self.now_ns, *self._entries, *(now_ns for now_ns, _ in self._events)})
+        for step, now_ns in enumerate(times):
+            rows.append(make_row(chain, step, now_ns, 1, self._entries.get(now_ns, []), b"\0" * 16, b""))
             chain = rows[-1].chain
-        writer.add(Batch(rows=rows, events=self._events))
+        events = [Event(n, times.index(now_ns) + 1, now_ns, body) for n, (now_ns, body) in enumerate(self._events, 1)]
+        writer.add(Batch(rows=rows, events=events))
         for sample in self.samples:
             writer.add_sample(*sample)
         writer.close()
