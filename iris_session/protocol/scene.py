@@ -1,0 +1,328 @@
+"""The scene specification, version 1: what a client needs to draw a scene, apart from the bytes of meshes and textures.
+
+A specification is itself an asset: `encode_scene` gives its bytes, and the SHA-256 of these is the scene's hash. All
+references are indices into the lists of the specification, -1 for none; bodies are referred to by `Body.id`. World
+frame right-handed, Z up; metres, radians where nothing else is said; colours are red, green, blue (and alpha) in
+0..1, without colour management, as MuJoCo blends them. Names may be empty, and may repeat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+import msgspec
+
+from iris_session.protocol.common import Count, Name, Pose, Text, Vec3
+from iris_session.protocol.decoding import Bytes, decoder
+from iris_session.protocol.scene_looks import (
+    Address,
+    HeightField,
+    Material,
+    Mesh,
+    Ref,
+    Rgb,
+    Rgba,
+    Texture,
+    Vec2,
+)
+from iris_session.protocol.scene_names import SCENE_VERSION, AssetEncoding, Follow
+
+#: Largest specification in bytes that is read: some 100,000 visuals.
+MAX_SCENE_BYTES: Final = 32_000_000
+
+
+class Body(msgspec.Struct, frozen=True):
+    """One rigid body. `id`: that of `BodyInfo` in the state stream; 0 is the world, which is not streamed.
+
+    `T_parent_body`: rest pose in the parent's frame. `T_world_body`: rest pose in the world, of the initial state. A
+    body that is not `moving` stays there for good.
+    """
+
+    id: Count
+    name: Text
+    parent: Ref
+    T_parent_body: Pose
+    T_world_body: Pose
+    moving: bool
+
+
+class Geometry(msgspec.Struct, frozen=True):
+    """A shape, centred in its own frame. `kind` of `GeometryKind`; draw what you do not know as a box of `size`.
+
+    `size` [m]: half lengths along x, y, z of what the shape extends over. plane: half lengths x, y, 0 is without end;
+    its normal is +z, z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius,
+    half length along z, of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: what
+    generated texture coordinates are measured by (see docs/scene.md); the vertices are in metres as they are.
+    """
+
+    kind: Name
+    size: Vec3
+    mesh: Ref = -1
+    hfield: Ref = -1
+
+
+class Visual(msgspec.Struct, frozen=True):
+    """A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is what to draw: a colour of its own,
+    or the material's; 0 alpha is drawn by nobody. `group`: see `SceneSpec.groups_shown`.
+    """
+
+    id: Count
+    body: Count
+    name: Text
+    T_body_visual: Pose
+    group: int
+    geometry: Geometry
+    material: Ref
+    rgba: Rgba
+
+
+class Light(msgspec.Struct, frozen=True):
+    """A light on a body, shining along `direction`, a unit vector in the body's frame.
+
+    `attenuation`: constant, linear [1/m], quadratic [1/m^2]. `cutoff`: half angle of a spot [deg], `exponent`: of the
+    cosine within it. `intensity` [cd]: 0 where the scene does not say. `range` [m]: 0 for no end.
+    """
+
+    name: Text
+    kind: Name
+    body: Count
+    p_body: Vec3
+    direction_body: Vec3
+    ambient: Rgb
+    diffuse: Rgb
+    specular: Rgb
+    attenuation: Vec3 = (1.0, 0.0, 0.0)
+    cutoff: float = 45.0
+    exponent: float = 10.0
+    range: float = 0.0
+    intensity: float = 0.0
+    bulb_radius: float = 0.0
+    texture: Ref = -1
+    castshadow: bool = True
+    active: bool = True
+    follow: Name = Follow.FIXED
+    target: Ref = -1
+
+
+class Camera(msgspec.Struct, frozen=True):
+    """A camera on a body: looks along -z of its own frame, y is up.
+
+    `fovy`: vertical field of view [deg], of an orthographic camera the height of what it sees [m]. `focal`,
+    `principal`: in pixels, `principal` from the centre of the picture, x right, y up; 0 where only `fovy` counts.
+    `resolution`: pixels, 1 x 1 where the scene does not say.
+    """
+
+    name: Text
+    body: Count
+    T_body_camera: Pose
+    fovy: float
+    orthographic: bool = False
+    focal: Vec2 = (0.0, 0.0)
+    principal: Vec2 = (0.0, 0.0)
+    resolution: tuple[int, int] = (1, 1)
+    follow: Name = Follow.FIXED
+    target: Ref = -1
+
+
+class Site(msgspec.Struct, frozen=True):
+    """A marked place on a body, drawn as a shape on request."""
+
+    id: Count
+    body: Count
+    name: Text
+    T_body_site: Pose
+    group: int
+    geometry: Geometry
+    material: Ref
+    rgba: Rgba
+
+
+class Tendon(msgspec.Struct, frozen=True):
+    """A cable, drawn on request as straight pieces of radius `width` [m] through `sites`, ids; wrapping is left out."""
+
+    name: Text
+    group: int
+    width: float
+    sites: tuple[Count, ...]
+    material: Ref
+    rgba: Rgba
+
+
+class Deformable(msgspec.Struct, frozen=True):
+    """A mesh whose vertices move: ropes (`dim` 1), cloths (2), surfaces of soft bodies (3).
+
+    The asset has the elements (edges for `dim` 1, triangles else), texture coordinates, and the vertices of the initial
+    state, in the world. `stream`: of the media channel, whose frames hold the vertices in the same order. `radius` [m]:
+    half the thickness. `flat`: one normal per triangle.
+    """
+
+    name: Text
+    dim: Count
+    group: int
+    vertices: Count
+    elements: Count
+    radius: float
+    flat: bool
+    material: Ref
+    rgba: Rgba
+    stream: Name
+    address: Address
+    bytes: Count
+    encoding: Name = AssetEncoding.ARRAYS
+
+
+class Headlight(msgspec.Struct, frozen=True):
+    """A light without shadow at the viewer's head that shines where it looks."""
+
+    active: bool = True
+    ambient: Rgb = (0.1, 0.1, 0.1)
+    diffuse: Rgb = (0.4, 0.4, 0.4)
+    specular: Rgb = (0.5, 0.5, 0.5)
+
+
+class Environment(msgspec.Struct, frozen=True):
+    """What surrounds the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all."""
+
+    headlight: Headlight = Headlight()
+    skybox: Ref = -1
+    haze_rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
+    haze: float = 0.3
+    fog_rgba: Rgba = (0.0, 0.0, 0.0, 1.0)
+    fog_start: float = 0.0
+    fog_end: float = 0.0
+    znear: float = 0.01
+    zfar: float = 50.0
+    extent: float = 1.0
+    center: Vec3 = (0.0, 0.0, 0.0)
+
+
+class Totals(msgspec.Struct, frozen=True):
+    """What the scene costs with everything exact: each asset once, triangles as often as they are drawn."""
+
+    objects: Count = 0
+    triangles: Count = 0
+    mesh_bytes: Count = 0
+    texture_bytes: Count = 0
+    texture_memory: Count = 0
+    asset_bytes: Count = 0
+
+
+class SceneSpec(msgspec.Struct, frozen=True):
+    """A whole scene. `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
+
+    `source`: what it was made from, for people.
+    """
+
+    version: Count = SCENE_VERSION
+    name: Text = ""
+    source: Text = ""
+    bodies: tuple[Body, ...] = ()
+    visuals: tuple[Visual, ...] = ()
+    materials: tuple[Material, ...] = ()
+    textures: tuple[Texture, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
+    hfields: tuple[HeightField, ...] = ()
+    lights: tuple[Light, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+    sites: tuple[Site, ...] = ()
+    tendons: tuple[Tendon, ...] = ()
+    deformables: tuple[Deformable, ...] = ()
+    environment: Environment = Environment()
+    groups_shown: tuple[int, ...] = (0, 1, 2)
+    totals: Totals = Totals()
+
+
+class SceneError(ValueError):
+    """The bytes are no scene specification that this package reads; the text says why."""
+
+
+class Placed(Protocol):
+    """What is on a body."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def body(self) -> int: ...
+
+
+_encoder: Final = msgspec.msgpack.Encoder()
+_decode: Final = decoder(SceneSpec)
+
+
+def encode_scene(spec: SceneSpec) -> bytes:
+    """The bytes of the specification: an asset, whose address is the scene's hash."""
+    return _encoder.encode(spec)
+
+
+def decode_scene(data: Bytes) -> SceneSpec:
+    """Inverse of `encode_scene`, checked: every reference has its target. Raises `SceneError`."""
+    if len(data) > MAX_SCENE_BYTES:
+        raise SceneError(f"a scene specification of {len(data)} bytes, at most {MAX_SCENE_BYTES} are read")
+    try:
+        spec = _decode(data)
+    except msgspec.DecodeError as error:
+        raise SceneError(f"no scene specification: {error}") from None
+    if spec.version != SCENE_VERSION:
+        raise SceneError(f"scene specification version {spec.version}, this side reads {SCENE_VERSION}: update it")
+    _check(spec)
+    return spec
+
+
+def asset_addresses(spec: SceneSpec) -> dict[str, int]:
+    """Every asset of a scene with its size in bytes, each once: those that show something early come first.
+
+    Order: deformables, height fields and coarsest levels of meshes, of textures, then the finer levels.
+    """
+    found: dict[str, int] = {}
+    found.update((entry.address, entry.bytes) for entry in spec.deformables)
+    found.update((entry.address, entry.bytes) for entry in spec.hfields)
+    ladders = [tuple((level.address, level.bytes) for level in mesh.levels) for mesh in spec.meshes]
+    ladders += [tuple((level.address, level.bytes) for level in texture.levels) for texture in spec.textures]
+    for depth in range(1, max(map(len, ladders), default=0) + 1):
+        for ladder in ladders:
+            if depth <= len(ladder):
+                found.setdefault(*ladder[-depth])
+    return found
+
+
+def _check(spec: SceneSpec) -> None:
+    bodies = {body.id for body in spec.bodies}
+    if len(bodies) != len(spec.bodies):
+        raise SceneError("two bodies have the same id")
+    for body in spec.bodies:
+        if body.parent != -1 and body.parent not in bodies:
+            raise SceneError(f"body {body.id} has the parent {body.parent}, which does not exist")
+    sites = {site.id for site in spec.sites}
+    _on_bodies("visual", spec.visuals, bodies)
+    _on_bodies("site", spec.sites, bodies)
+    _on_bodies("light", spec.lights, bodies)
+    _on_bodies("camera", spec.cameras, bodies)
+    for geometry in (*(visual.geometry for visual in spec.visuals), *(site.geometry for site in spec.sites)):
+        _refer("mesh", geometry.mesh, len(spec.meshes))
+        _refer("height field", geometry.hfield, len(spec.hfields))
+    for worn in (spec.visuals, spec.sites, spec.tendons, spec.deformables):
+        for one in worn:
+            _refer("material", one.material, len(spec.materials))
+    for material in spec.materials:
+        for use in material.textures:
+            _refer("texture", use.texture, len(spec.textures))
+    for light in spec.lights:
+        _refer("texture", light.texture, len(spec.textures))
+    _refer("texture", spec.environment.skybox, len(spec.textures))
+    for tendon in spec.tendons:
+        if not sites.issuperset(tendon.sites):
+            raise SceneError(f"tendon {tendon.name!r} runs through a site that is not there")
+    if not (all(mesh.levels for mesh in spec.meshes) and all(texture.levels for texture in spec.textures)):
+        raise SceneError("a mesh or texture has no level")
+
+
+def _on_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:
+    for thing in things:
+        if thing.body not in bodies:
+            raise SceneError(f"{what} {thing.name!r} is on body {thing.body}: no such body")
+
+
+def _refer(what: str, index: int, count: int) -> None:
+    if index >= count:
+        raise SceneError(f"reference to {what} {index}, but there are {count}")
