@@ -12,6 +12,7 @@ from typing import Final, TypeVar, get_args
 
 import msgspec
 
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage
 from iris_session.protocol.common import EventBody, Message
 from iris_session.protocol.decoding import BAD_BYTES, Bytes
@@ -19,6 +20,8 @@ from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.limits import (
     LIMITS,
+    MAX_ASSET_HEADER_BYTES,
+    MAX_ASSET_REQUEST_BYTES,
     MAX_BEACON_BYTES,
     MAX_CLIENT_BYTES,
     MAX_INTRODUCTION_BYTES,
@@ -40,6 +43,7 @@ from iris_session.protocol.server_messages import (
 )
 
 T = TypeVar("T")
+A = TypeVar("A", AssetRequest, AssetChunk, AssetRefused)
 
 
 def tag_of(kind: type[msgspec.Struct]) -> str:
@@ -105,6 +109,9 @@ _beacon: Final = msgspec.msgpack.Decoder(Beacon)
 _introduction: Final = msgspec.msgpack.Decoder(Introduction)
 _media_header: Final = msgspec.msgpack.Decoder(MediaHeader)
 _media_push: Final = msgspec.msgpack.Decoder(MediaPush)
+_asset_request: Final = msgspec.msgpack.Decoder(AssetRequest)
+_asset_chunk: Final = msgspec.msgpack.Decoder(AssetChunk)
+_asset_refused: Final = msgspec.msgpack.Decoder(AssetRefused)
 
 #: Bytes of the length before an introduction.
 INTRODUCTION_PREFIX: Final = 4
@@ -214,6 +221,35 @@ def decode_media_push(data: Bytes) -> MediaPush:
     return _decode("media push", _media_push, data, MAX_MEDIA_HEADER_BYTES)
 
 
+def encode_asset_request(request: AssetRequest) -> bytes:
+    """The one frame of a client's message on the assets channel."""
+    return _encoder.encode(request)
+
+
+def decode_asset_request(data: Bytes) -> AssetRequest:
+    """Inverse of `encode_asset_request`. Raises `VersionError`, `TooLargeError` or `MalformedError`."""
+    return _decode_asset("asset request", _asset_request, data, MAX_ASSET_REQUEST_BYTES)
+
+
+def encode_asset_header(header: AssetChunk | AssetRefused) -> bytes:
+    """First frame of an answer on the assets channel; the bytes of a chunk after it."""
+    return _encoder.encode(header)
+
+
+def decode_asset_chunk(data: Bytes, payload: int) -> AssetChunk:
+    """First of the two frames of a chunk, whose second has `payload` bytes. Raises as `decode_asset_request`."""
+    chunk = _decode_asset("asset chunk", _asset_chunk, data, MAX_ASSET_HEADER_BYTES)
+    _check_length("asset chunk", payload, MAX_ASSET_CHUNK_BYTES)
+    if chunk.offset + payload > chunk.total:
+        raise MalformedError(f"asset chunk: {payload} bytes from {chunk.offset} of an asset of {chunk.total}")
+    return chunk
+
+
+def decode_asset_refused(data: Bytes) -> AssetRefused:
+    """An answer of one frame. Raises as `decode_asset_request`."""
+    return _decode_asset("asset refusal", _asset_refused, data, MAX_ASSET_HEADER_BYTES)
+
+
 def encode_beacon(beacon: Beacon) -> bytes:
     """One discovery datagram."""
     return _encoder.encode(beacon)
@@ -269,9 +305,22 @@ def _decode(what: str, decoder: msgspec.msgpack.Decoder[T], data: Bytes, limit: 
         raise MalformedError(f"no {what}: {error}") from None
 
 
+def _decode_asset(what: str, decoder: msgspec.msgpack.Decoder[A], data: Bytes, limit: int) -> A:
+    """A struct that begins with the version, which is looked at first."""
+    _check_size(what, data, limit)
+    version = peek_version(data)
+    if version != PROTOCOL_VERSION:
+        raise VersionError(version)
+    return _decode(what, decoder, data, limit)
+
+
 def _check_size(what: str, data: Bytes, limit: int) -> None:
-    if len(data) > limit:
-        raise TooLargeError(what, len(data), limit)
+    _check_length(what, len(data), limit)
+
+
+def _check_length(what: str, length: int, limit: int) -> None:
+    if length > limit:
+        raise TooLargeError(what, length, limit)
 
 
 def _explain(

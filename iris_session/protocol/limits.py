@@ -123,6 +123,9 @@ MAX_PRESENCE_BYTES: Final = 256_000
 MAX_MEDIA_HEADER_BYTES: Final = 2_000
 #: One frame of media, of one class: a 1080p depth image without compression has half of it.
 MAX_MEDIA_FRAME_BYTES: Final = 8 * 1024 * 1024
+#: A request for a chunk of an asset, and the first frame of its answer.
+MAX_ASSET_REQUEST_BYTES: Final = 512
+MAX_ASSET_HEADER_BYTES: Final = 4_000
 #: One UDP datagram without fragmentation on Ethernet.
 MAX_BEACON_BYTES: Final = 1_400
 #: What a session says of itself over TCP, without the length before it.

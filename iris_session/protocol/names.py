@@ -284,6 +284,21 @@ class BudgetClass:
     NONE: Final = "none"
 
 
+class AssetRefusal:
+    """Why no bytes of an asset come. After the last four the same may be asked again later."""
+
+    UNKNOWN: Final = "unknown_asset"  # of neither the present scene nor the one before
+    BAD_RANGE: Final = "bad_range"
+    VERSION: Final = "version"
+    MALFORMED: Final = "malformed"
+    TOO_MANY: Final = "too_many_outstanding"
+    NOT_ALLOWED: Final = "not_allowed"  # the connection that the request names is not welcome, or not the sender's
+    RATE: Final = "rate"
+    BUSY: Final = "busy"
+    #: What time can change.
+    PASSING: Final = frozenset({"too_many_outstanding", "not_allowed", "rate", "busy"})
+
+
 class MediaEncoding:
     """What the bytes of a media frame are."""
 

@@ -13,6 +13,7 @@ import pytest
 
 from anchors.pose import Quat, Vec3, quat_normalize, quat_rotate
 from iris_session.protocol import codec
+from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.errors import ProtocolError
@@ -33,6 +34,9 @@ CODECS: dict[str, tuple[Any, Any, Any]] = {
     "presence": (Presence, codec.encode_presence, codec.decode_presence),
     "media_header": (MediaHeader, codec.encode_media_header, codec.decode_media_header),
     "media_push": (MediaPush, codec.encode_media_push, codec.decode_media_push),
+    "asset_request": (AssetRequest, codec.encode_asset_request, codec.decode_asset_request),
+    "asset_chunk": (AssetChunk, codec.encode_asset_header, lambda data: codec.decode_asset_chunk(data, 0)),
+    "asset_refused": (AssetRefused, codec.encode_asset_header, codec.decode_asset_refused),
     "beacon": (Beacon, codec.encode_beacon, lambda data: msgspec.msgpack.decode(data, type=Beacon)),
 }
 

@@ -24,6 +24,9 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "server": codec.decode_server,
     "state_header": codec.decode_state_header,
     "presence": codec.decode_presence,
+    "asset_request": codec.decode_asset_request,
+    "asset_chunk": lambda data: codec.decode_asset_chunk(data, 0),
+    "asset_refused": codec.decode_asset_refused,
     "beacon": lambda data: msgspec.msgpack.decode(data, type=Beacon),
 }
 VECTORS = [pytest.param(section, vector, id=vector["name"]) for section in DECODERS for vector in GOLDEN[section]]

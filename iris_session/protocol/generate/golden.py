@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 
 from iris_session.protocol import codec
+from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, envelope
 from iris_session.protocol.discovery import Beacon
 from iris_session.protocol.generate import conversions, rigid_reference
@@ -29,6 +30,8 @@ from iris_session.protocol.server_messages import (
 )
 
 _pack = msgspec.msgpack.encode
+#: Structs that are a message of their own, without an envelope.
+VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
 
 
 def golden() -> str:
@@ -41,6 +44,9 @@ def golden() -> str:
         "presence": list(_values("presence", Presence)),
         "media_header": list(_values("media_header", MediaHeader)),
         "media_push": list(_values("media_push", MediaPush)),
+        "asset_request": list(_values("asset_request", AssetRequest)),
+        "asset_chunk": list(_values("asset_chunk", AssetChunk)),
+        "asset_refused": list(_values("asset_refused", AssetRefused)),
         "beacon": list(_values("beacon", Beacon)),
         "decode_only": list(_decode_only()),
         "malformed": list(_malformed()),
@@ -88,6 +94,8 @@ def _values(name: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
     makes = (full, least) if kind is Beacon else (full, least, extreme)
     for make in makes:
         value = make(kind)
+        if kind in VERSIONED:
+            value = msgspec.structs.replace(value, version=PROTOCOL_VERSION)
         yield _vector(f"{name}/{make.__name__}", _pack(value), value)
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final, get_args
 
 import msgspec
 
-from iris_session.protocol import client_messages, common, discovery, media, names, server_messages, status
+from iris_session.protocol import assets, client_messages, common, discovery, media, names, server_messages, status
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,9 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         server_messages.Presence,
         media.MediaHeader,
         media.MediaPush,
+        assets.AssetRequest,
+        assets.AssetChunk,
+        assets.AssetRefused,
         discovery.Beacon,
         discovery.Introduction,
     ),
@@ -147,6 +150,7 @@ _ENUMS: Final[dict[str, str]] = {
     "MediaHeader.encoding": "MediaEncoding",
     "MediaPush.classes": "BudgetClass",
     "MediaPush.encoding": "MediaEncoding",
+    "AssetRefused.reason": "AssetRefusal",
     "ParticipantReport.role": "Role",
     "ParticipantReport.alignment": "AlignmentKind",
     "ParticipantReport.budget_class": "BudgetClass",

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from iris_session.protocol import limits
+from iris_session.protocol import assets, limits
 from iris_session.protocol.generate.schema import Field, Struct, Type, enum_doc, enums, structs
 
 
@@ -96,6 +96,8 @@ def _limits() -> str:
         ("presence", limits.MAX_PRESENCE_BYTES),
         ("media header", limits.MAX_MEDIA_HEADER_BYTES),
         ("media frame", limits.MAX_MEDIA_FRAME_BYTES),
+        ("asset header", limits.MAX_ASSET_HEADER_BYTES),
+        ("asset chunk", assets.MAX_ASSET_CHUNK_BYTES),
         ("beacon", limits.MAX_BEACON_BYTES),
     ):
         lines.append(f"| {name} | client | {size:,} | - | - |")

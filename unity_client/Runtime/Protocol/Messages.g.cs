@@ -322,6 +322,21 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// Why no bytes of an asset come. After the last four the same may be asked again later.
+    /// </summary>
+    public static class AssetRefusal
+    {
+        public const string Unknown = "unknown_asset";
+        public const string BadRange = "bad_range";
+        public const string Version = "version";
+        public const string Malformed = "malformed";
+        public const string TooMany = "too_many_outstanding";
+        public const string NotAllowed = "not_allowed";
+        public const string Rate = "rate";
+        public const string Busy = "busy";
+    }
+
+    /// <summary>
     /// What the bytes of a media frame are.
     /// </summary>
     public static class MediaEncoding
@@ -5308,6 +5323,120 @@ namespace IrisSession.Protocol
             writer.Write(CaptureNs);
             writer.Write(Classes);
             writer.Write(Encoding);
+        }
+    }
+
+    /// <summary>
+    /// Asks for length bytes of an asset from offset on; fewer come when it ends before.
+    ///
+    /// connection_epoch: of the sender's Welcome. request_id: any number; it comes back with the answer. address:
+    /// SHA-256 of the asset, 64 hexadecimal digits.
+    /// </summary>
+    public sealed class AssetRequest : WireValue
+    {
+        public long Version = 0;
+        public long ConnectionEpoch = 0;
+        public long RequestId = 0;
+        public string Address = "";
+        public long Offset = 0;
+        public long Length = 0;
+
+        public static AssetRequest Read(WireReader reader)
+        {
+            AssetRequest value = new AssetRequest();
+            int n = reader.ReadArrayHeader();
+            if (n < 6) throw new WireException("AssetRequest of " + n + " elements, expected 6");
+            value.Version = reader.ReadLong();
+            value.ConnectionEpoch = reader.ReadLong();
+            value.RequestId = reader.ReadLong();
+            value.Address = reader.ReadString();
+            value.Offset = reader.ReadLong();
+            value.Length = reader.ReadLong();
+            for (int i = 6; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(6);
+            writer.Write(Version);
+            writer.Write(ConnectionEpoch);
+            writer.Write(RequestId);
+            writer.Write(Address);
+            writer.Write(Offset);
+            writer.Write(Length);
+        }
+    }
+
+    /// <summary>
+    /// First of two frames; the other holds bytes offset and following of an asset that has total bytes.
+    /// </summary>
+    public sealed class AssetChunk : WireValue
+    {
+        public long Version = 0;
+        public long RequestId = 0;
+        public string Address = "";
+        public long Offset = 0;
+        public long Total = 0;
+
+        public static AssetChunk Read(WireReader reader)
+        {
+            AssetChunk value = new AssetChunk();
+            int n = reader.ReadArrayHeader();
+            if (n < 5) throw new WireException("AssetChunk of " + n + " elements, expected 5");
+            value.Version = reader.ReadLong();
+            value.RequestId = reader.ReadLong();
+            value.Address = reader.ReadString();
+            value.Offset = reader.ReadLong();
+            value.Total = reader.ReadLong();
+            for (int i = 5; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(5);
+            writer.Write(Version);
+            writer.Write(RequestId);
+            writer.Write(Address);
+            writer.Write(Offset);
+            writer.Write(Total);
+        }
+    }
+
+    /// <summary>
+    /// The only frame of an answer: nothing comes for this request. request_id 0: it could not be read.
+    /// </summary>
+    public sealed class AssetRefused : WireValue
+    {
+        public long Version = 0;
+        public long RequestId = 0;
+        public string Address = "";
+        public string Reason = "";
+        public string Advice = "";
+
+        public static AssetRefused Read(WireReader reader)
+        {
+            AssetRefused value = new AssetRefused();
+            int n = reader.ReadArrayHeader();
+            if (n < 4) throw new WireException("AssetRefused of " + n + " elements, expected 4");
+            value.Version = reader.ReadLong();
+            value.RequestId = reader.ReadLong();
+            value.Address = reader.ReadString();
+            value.Reason = reader.ReadString();
+            if (n > 4) value.Advice = reader.ReadString();
+            for (int i = 5; i < n; i++) reader.Skip();
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteArrayHeader(5);
+            writer.Write(Version);
+            writer.Write(RequestId);
+            writer.Write(Address);
+            writer.Write(Reason);
+            writer.Write(Advice);
         }
     }
 

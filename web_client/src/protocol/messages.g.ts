@@ -267,6 +267,19 @@ export const BudgetClass = {
 } as const;
 export type BudgetClass = (typeof BudgetClass)[keyof typeof BudgetClass] | (string & {});
 
+/** Why no bytes of an asset come. After the last four the same may be asked again later. */
+export const AssetRefusal = {
+  UNKNOWN: "unknown_asset",
+  BAD_RANGE: "bad_range",
+  VERSION: "version",
+  MALFORMED: "malformed",
+  TOO_MANY: "too_many_outstanding",
+  NOT_ALLOWED: "not_allowed",
+  RATE: "rate",
+  BUSY: "busy",
+} as const;
+export type AssetRefusal = (typeof AssetRefusal)[keyof typeof AssetRefusal] | (string & {});
+
 /** What the bytes of a media frame are. */
 export const MediaEncoding = {
   BYTES: "bytes",
@@ -1306,6 +1319,39 @@ export type MediaPush = [
   capture_ns: number,
   classes?: BudgetClass[],
   encoding?: MediaEncoding,
+];
+
+/**
+ * Asks for `length` bytes of an asset from `offset` on; fewer come when it ends before.
+ *
+ * `connection_epoch`: of the sender's `Welcome`. `request_id`: any number; it comes back with the answer. `address`:
+ * SHA-256 of the asset, 64 hexadecimal digits.
+ */
+export type AssetRequest = [
+  version: number,
+  connection_epoch: number,
+  request_id: number,
+  address: string,
+  offset: number,
+  length: number,
+];
+
+/** First of two frames; the other holds bytes `offset` and following of an asset that has `total` bytes. */
+export type AssetChunk = [
+  version: number,
+  request_id: number,
+  address: string,
+  offset: number,
+  total: number,
+];
+
+/** The only frame of an answer: nothing comes for this request. `request_id` 0: it could not be read. */
+export type AssetRefused = [
+  version: number,
+  request_id: number,
+  address: string,
+  reason: AssetRefusal,
+  advice?: string,
 ];
 
 /** UDP discovery datagram, 5 Hz. Never needed: an address can be typed or scanned. */
