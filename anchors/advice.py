@@ -30,6 +30,14 @@ def upright(against_gravity: int, taken: int) -> str:
     return "the sheet is not mounted as configured (lying, or on a wall): its pose contradicts the vertical"
 
 
+def tilted(tilt_rad: float) -> str:
+    """What was seen agrees with itself, but not with gravity."""
+    return (
+        f"the sheet is tilted by {math.degrees(tilt_rad):.0f} deg against the headset's vertical: lay it level, or "
+        "configure how it lies"
+    )
+
+
 def size_advice(sightings: Iterable[tuple[str, Sighting]], tolerance: float) -> str:
     """Warns about a sheet that is seen in several sizes; single measurements that are off do not count."""
     sizes: dict[str, list[float]] = {}

@@ -14,12 +14,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, upright
+from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, tilted, upright
 from anchors.groups import Group, Key, Memory, Sighting
 from anchors.lie import Array
 from anchors.noise import NoiseModel, isotropic, stated
@@ -56,7 +56,8 @@ class AlignmentConfig:
 
     `noise` is used where it is known from where an anchor was seen, `position_sigma_m` and `rotation_sigma_rad` (per
     axis) where nothing is. `dof`: 4, or 6 to measure the tilt without gravity. `tilt_sigma_rad`: how far a headset's
-    vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong. `drift_m_per_s`, `walk_m_per_sqrt_s`:
+    vertical may be off; `max_tilt_rad`: beyond it a single observation is wrong; `follow_tilt_rad`: so far a tilt that
+    all anchors show is followed, from `tilt_warning_rad` on with a warning. `drift_m_per_s`, `walk_m_per_sqrt_s`:
     how the tracking frame drifts and wanders, per axis. `max_error_m`: the stated p95 at the anchors above which the
     estimate is refused. `max_observations`, `max_groups`, and of one viewpoint `max_in_group`: the oldest are forgotten
     (counted in `forgotten`), as are those older than the newest by more than `max_age_ns` (`outdated`).
@@ -70,6 +71,7 @@ class AlignmentConfig:
     dof: int = 4
     tilt_sigma_rad: float = math.radians(0.2)
     tilt_warning_rad: float = math.radians(1.0)
+    follow_tilt_rad: float = math.radians(3.0)
     max_tilt_rad: float = math.radians(15.0)
     drift_m_per_s: float = 0.003 / 60.0 / math.sqrt(3.0)
     walk_m_per_sqrt_s: float = 0.001 / math.sqrt(60.0)
@@ -254,12 +256,16 @@ class AlignmentEstimator:
         prior = self.config.prior
         b = self._problem(keys, merged, prior)
         s = solve(b, prior, self._near)
+        if prior.gravity and not self._is_majority(b, s, len(groups)):  # do they contradict each other, or gravity?
+            free = solve(b, replace(prior, tilt_sigma_rad=math.inf))
+            s = free if self._is_majority(b, free, len(groups)) else s
         if not s.inside.any():
             return self._refusal(disagreement(sorted(set(b.anchor))))
         tilt = s.tilt_seen(b)
+        if prior.gravity and tilt > self.config.follow_tilt_rad:
+            return self._refusal(tilted(tilt))
         if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
-            prior = Prior(tilt, prior.drift_m_per_s, prior.walk_m_per_sqrt_s)
-            s = solve(b, prior, (s.q, s.t))
+            s = solve(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
         moved = outvoted(b.anchor, s)

@@ -3,14 +3,14 @@ behind `anchors.alignment`.
 
 Unknown are translation (3), rotation (3) and the velocity of the tracking frame's drift (3). Gravity is an observation
 too: the tilt of the frame is zero with the stated sigma; so is the drift. Gauss-Newton on whitened residuals; where a
-group does not fit, the largest set of groups that agree with one of them is solved instead, and what then lies outside
-its 99.9 % ellipsoid is left out.
+group does not fit, the largest set of groups that agree with one of them is solved instead, or all but one sheet, and
+what then lies outside its 99.9 % ellipsoid is left out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, turned
 from anchors.pose import PoseTuple, quat_normalize
 from anchors.robust import Merged, circular_median
+from anchors.uncertainty import Z999, chi2_quantile
 
 _CHI2_6_999: Final = 22.458
 _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
 _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
+_LEFT_OUT: Final = 8  # sheets, at most, that are left out in turn
 _EYE: Final = np.eye(6)
 Mask = NDArray[np.bool_]
 
@@ -109,6 +111,33 @@ def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> 
     if b.size == 2:
         return _without(solution)
     inside, start = _consensus(b, prior)
+    if not inside.any():  # each is tilted so far that it contradicts gravity
+        return _without(solution)
+    found = _settled(b, inside, start, prior)
+    others = [one for one in _with_one_sheet_less(b, solution, prior) if _is_likely(one)]
+    return max([found, *others], key=lambda one: _rank(b, one))
+
+
+def _with_one_sheet_less(b: Problem, everyone: Solution, prior: Prior) -> Iterator[Solution]:
+    """Of three or more sheets one may have been moved so little that each alone seems to agree with it (rotations of
+    one sheet say little about the place of the others): each of those that fit worst is left out in turn."""
+    off = dict.fromkeys(b.anchor, 0.0)
+    for name, distance2 in zip(b.anchor, everyone.distance2.tolist(), strict=True):
+        off[name] = max(off[name], distance2)
+    if len(off) < 3:
+        return
+    start = _start(b, prior)
+    for out in sorted(off, key=lambda name: -off[name])[:_LEFT_OUT]:
+        yield _settled(b, np.array([name != out for name in b.anchor]), start, prior)
+
+
+def _is_likely(s: Solution) -> bool:
+    """Whether what is left over is noise: of two sheets that should agree each may be off by half of what they are."""
+    return s.freedom > 0.0 and s.chi2 <= chi2_quantile(s.freedom, Z999)
+
+
+def _settled(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
+    """Fitted to some of the groups, then to those that agree with that."""
     for _ in range(3):
         solution = _fit(b, inside, start, prior)
         now = solution.distance2 <= _CHI2_6_999
@@ -118,6 +147,11 @@ def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> 
             break
         inside, start = now, (solution.q, solution.t)
     return solution
+
+
+def _rank(b: Problem, s: Solution) -> tuple[int, int, float]:
+    """The better the larger: agreeing sheets, agreeing looks, and how well they agree."""
+    return agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
 
 
 def _without(s: Solution) -> Solution:

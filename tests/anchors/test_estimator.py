@@ -155,6 +155,52 @@ def test_of_three_sheets_the_moved_one_is_named_and_left_out_however_often_it_wa
     assert _off(got, T, TRIANGLE["a"][0]) < 0.02
 
 
+@pytest.mark.parametrize("order", ["abc", "bca", "cab"])
+@pytest.mark.parametrize("apart_s", [0.0, 5.0])
+def test_of_three_sheets_one_that_was_moved_by_3_cm_is_named_whenever_it_was_seen(order: str, apart_s: float) -> None:
+    """So near that each of the others, with the little that its rotation says, could agree with it."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        T = headset(rng)
+        estimator = AlignmentEstimator(TRIANGLE)
+        for viewpoint, name in enumerate(order):
+            place = shifted(TRIANGLE["b"], (0.03, 0.0, 0.0)) if name == "b" else None
+            _look(estimator, rng, T, name, viewpoint, at_s=apart_s * viewpoint, place=place)
+        got = estimator.estimate()
+        assert not got.refused, got.advice
+        assert got.moved == ("b",)
+        assert all(_off(got, T, TRIANGLE[name][0]) < 0.015 for name in "ac")
+
+
+def test_three_sheets_of_which_no_two_agree_give_nothing() -> None:
+    rng = np.random.default_rng(5)
+    T = headset(rng)
+    estimator = AlignmentEstimator(TRIANGLE)
+    away = {"a": (0.0, 0.0, 0.0), "b": (0.2, 0.0, 0.0), "c": (0.0, 0.3, 0.0)}
+    for viewpoint, name in enumerate(away):
+        _look(estimator, rng, T, name, viewpoint, place=shifted(TRIANGLE[name], away[name]))
+    got = estimator.estimate()
+    assert got.refused
+    assert got.advice.endswith("one of these was moved: a, b, c")
+
+
+@pytest.mark.parametrize("names", ["a", "abc"])
+@pytest.mark.parametrize(("tilt_deg", "followed"), [(1.5, True), (2.5, True), (4.0, False), (8.0, False)])
+def test_a_tilt_that_everything_shows_is_no_contradiction(names: str, tilt_deg: float, followed: bool) -> None:
+    rng = np.random.default_rng(2)
+    level = headset(rng, 0.0)
+    T = compose(level, ((0.0, 0.0, 0.0), quat_from_rotvec((math.radians(tilt_deg), 0.0, 0.0))))
+    estimator = AlignmentEstimator({name: TRIANGLE[name] for name in names})
+    for viewpoint in range(3):
+        _look(estimator, rng, T, names[viewpoint % len(names)], viewpoint, at_s=5.0 * viewpoint)
+    got = estimator.estimate()
+    assert got.refused != followed
+    assert ("vertical is off by" if followed else "lay it level") in got.advice
+    if followed:
+        assert math.degrees(got.residual_tilt_rad) == pytest.approx(tilt_deg, abs=0.6)
+        assert _off(got, T, TRIANGLE["a"][0]) < 0.01
+
+
 def test_of_two_sheets_that_disagree_both_are_named() -> None:
     rng = np.random.default_rng(4)
     T = headset(rng)
