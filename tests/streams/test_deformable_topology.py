@@ -1,0 +1,183 @@
+"""Topologies: which plan a mesh gets, bytes that come back the same, and tables that no encoder makes are refused."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
+from iris_session.streams.deformable_golden import cloth, rope, shell
+from iris_session.streams.deformable_topology import (
+    MAX_LEVELS,
+    MAX_VERTICES,
+    ROWS,
+    TREE,
+    DeformableTopology,
+    used_vertices,
+)
+from iris_session.streams.errors import StreamError
+
+SCENE = """
+<mujoco>
+  <option integrator="discrete" solver="CG" timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <flexcomp name="rope" type="grid" dim="1" count="12 1 1" spacing=".02 .02 .02" pos="1 0 .5" mass=".1">
+      <edge equality="true"/>
+    </flexcomp>
+    <flexcomp name="cloth" type="grid" dim="2" count="8 6 1" spacing=".02 .02 .02" pos="0 1 .5" mass=".1">
+      <edge equality="true"/>
+    </flexcomp>
+    <flexcomp name="soft" type="grid" dim="3" count="5 4 4" spacing=".02 .02 .02" pos="0 0 .2" mass=".1"
+              dof="trilinear">
+      <elasticity young="5e3" poisson=".2" damping=".1"/>
+    </flexcomp>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_flexes_of_mujoco_of_every_dimension() -> None:
+    """A rope is one row, a cloth rows, the shell of a solid a tree without inner vertices; decoded as they move."""
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    plans = []
+    streams = []
+    for flex in range(model.nflex):
+        begin, count = int(model.flex_vertadr[flex]), int(model.flex_vertnum[flex])
+        if model.flex_dim[flex] == 3:
+            at, size = int(model.flex_shelldataadr[flex]), 3 * int(model.flex_shellnum[flex])
+            used, faces = used_vertices(count, model.flex_shell[at : at + size])
+            topology = DeformableTopology(len(used), faces)
+        else:
+            at = int(model.flex_elemdataadr[flex])
+            width = int(model.flex_dim[flex]) + 1
+            elements = model.flex_elem[at : at + width * int(model.flex_elemnum[flex])]
+            used = np.arange(count)
+            topology = DeformableTopology(count, elements) if width == 3 else DeformableTopology(count, edges=elements)
+        plans.append((topology.plan, topology.n_vertices, topology.order is None))
+        streams.append((begin + used, DeformableEncoder(topology), DeformableDecoder(topology)))
+    assert plans == [(ROWS, 12, True), (ROWS, 48, True), (TREE, 80 - 3 * 2 * 2, False)]
+    moved = np.zeros(model.nflex)
+    for _ in range(60):
+        mujoco.mj_step(model, data)
+        for i, (vertices, encoder, decoder) in enumerate(streams):
+            truth = data.flexvert_xpos[vertices]
+            frames = encoder.encode(truth)
+            if frames is not None:
+                moved[i] += 1
+                assert np.linalg.norm(decoder.decode(frames["full"]) - truth, axis=1).max() <= 0.0005
+    assert (moved > 50).all()
+
+
+def test_plans() -> None:
+    assert (cloth(9, 7)[0].rows, cloth(9, 7)[0].cols) == (9, 7)
+    quads = np.arange(20).reshape(4, 5)
+    lines = np.concatenate(
+        [
+            np.stack([quads[:, :-1].ravel(), quads[:, 1:].ravel()], 1),
+            np.stack([quads[:-1].ravel(), quads[1:].ravel()], 1),
+        ]
+    )
+    net = DeformableTopology(20, edges=lines)
+    assert (net.plan, net.rows, net.cols) == (ROWS, 4, 5)
+    walked = rope(30)[0]
+    assert (walked.plan, walked.rows, walked.cols) == (ROWS, 1, 30)
+    assert walked.order is not None
+    assert {frozenset(pair) for pair in zip(walked.order[:-1].tolist(), walked.order[1:].tolist(), strict=True)} == {
+        frozenset(pair) for pair in walked.edges.tolist()
+    }, "a rope is walked from end to end"
+    assert shell(4)[0].plan == TREE
+
+
+def test_a_tree_predicts_almost_every_vertex_across_a_triangle() -> None:
+    topology, _ = shell(7)
+    assert topology.parents is not None
+    a, b, c = topology.parents
+    assert np.count_nonzero((a != b) & (b != c)) > 0.9 * topology.n_vertices
+    assert len(topology.levels) < 3 * np.sqrt(topology.n_vertices)
+
+
+def test_pieces_loose_vertices_and_triangles_without_area() -> None:
+    faces = [(4, 5, 6), (5, 6, 7), (10, 11, 12), (11, 12, 13), (6, 6, 14), (2, 2, 2)]
+    topology = DeformableTopology(16, faces)
+    assert topology.plan == TREE
+    assert topology.order is not None
+    assert sorted(topology.order.tolist()) == list(range(16))
+
+
+def test_a_long_ribbon_is_walked_instead_of_a_tree_of_thousands_of_levels() -> None:
+    n = 4 * MAX_LEVELS
+    shuffled = np.random.default_rng(0).permutation(n)
+    ribbon = shuffled[np.stack([np.arange(n - 2) + k for k in range(3)], axis=1)]
+    topology = DeformableTopology(n, ribbon)
+    assert (topology.plan, topology.cols) == (ROWS, n)
+    vertices = np.random.default_rng(1).uniform(0.0, 1.0, (n, 3))
+    frames = DeformableEncoder(topology).encode(vertices)
+    assert frames is not None
+    assert np.linalg.norm(DeformableDecoder(topology).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
+
+
+def test_used_vertices() -> None:
+    used, faces = used_vertices(10, [(7, 2, 9), (9, 2, 4)])
+    assert used.tolist() == [2, 4, 7, 9]
+    assert faces.tolist() == [[2, 0, 3], [3, 0, 1]]
+
+
+@pytest.mark.parametrize("made", [cloth(5, 4), shell(3), rope(9)], ids=["cloth", "shell", "rope"])
+def test_bytes_come_back_the_same_and_tables_cannot_be_written(made: tuple[DeformableTopology, Any]) -> None:
+    topology = made[0]
+    back = DeformableTopology.from_bytes(topology.to_bytes())
+    assert back.to_bytes() == topology.to_bytes()
+    assert back.identity == topology.identity
+    assert back.levels == topology.levels
+    for table in (back.faces, back.edges, back.order, back.parents):
+        assert table is None or not table.flags.writeable
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from([shell(3)[0].to_bytes(), rope(6)[0].to_bytes(), cloth(3, 3)[0].to_bytes()]), st.data())
+def test_damaged_topologies_are_refused_or_of_use(good: bytes, data: st.DataObject) -> None:
+    damaged = bytearray(good)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        topology = DeformableTopology.from_bytes(memoryview(damaged))
+    except StreamError:
+        return
+    vertices = np.random.default_rng(0).uniform(0.0, 1.0, (topology.n_vertices, 3))
+    frames = DeformableEncoder(topology).encode(vertices)
+    assert frames is not None
+    assert np.linalg.norm(DeformableDecoder(topology).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
+
+
+def test_tables_that_do_not_fit_are_refused() -> None:
+    chain = np.stack([np.arange(-1, 2 * MAX_LEVELS - 1)] * 3).clip(0)
+    n = chain.shape[1]
+    head = struct.pack("<BBHIIIII", 1, TREE, 0, n, 0, 0, 0, 0)
+    with pytest.raises(StreamError, match="levels"):
+        DeformableTopology.from_bytes(head + chain.astype("<u4").tobytes())
+    forward = struct.pack("<BBHIIIII", 1, TREE, 0, 2, 0, 0, 0, 0) + np.array([0, 1] * 3, "<u4").tobytes()
+    with pytest.raises(StreamError, match="after it"):
+        DeformableTopology.from_bytes(forward)
+    twice = struct.pack("<BBHIIIII", 1, ROWS, 1, 2, 1, 2, 0, 0) + np.array([1, 1], "<u4").tobytes()
+    with pytest.raises(StreamError, match="each once"):
+        DeformableTopology.from_bytes(twice)
+    with pytest.raises(StreamError, match="header asks"):
+        DeformableTopology.from_bytes(struct.pack("<BBHIIIII", 1, ROWS, 0, 2**18, 1, 2**18, 2**20, 2**20))
+
+
+def test_what_is_no_mesh_is_refused() -> None:
+    for n in (0, MAX_VERTICES + 1):
+        with pytest.raises(ValueError, match="1 to"):
+            DeformableTopology(n)
+    with pytest.raises(ValueError, match="numbers begin at 0"):
+        DeformableTopology(3, [(0, 1, 3)])
+    with pytest.raises(ValueError, match="numbers begin at 0"):
+        DeformableTopology(3, edges=[(-1, 0)])
