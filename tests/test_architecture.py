@@ -27,6 +27,7 @@ FORBIDDEN = {
     "control": SOCKETS | CLOCKS | THREADS | RANDOM | {"rerun"},
     "physics": {"zmq", "rerun"} | RANDOM,
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
+    "scene": SOCKETS | RANDOM | {"rerun"},
     "keys": (SOCKETS - {"zmq"}) | THREADS | RANDOM | HEAVY,
     "transport": {"mujoco", "rerun"},
     "recording": set(),

@@ -80,7 +80,9 @@ class Texture(msgspec.Struct, frozen=True):
 
 
 class MeshLevel(msgspec.Struct, frozen=True):
-    """One level of detail. `max_error_m`: how far the exact mesh's vertices lie from it at most [m], 0: exact."""
+    """One level of detail. `max_error_m`: how far its points lie from the exact mesh at most [m], 0: exact. Parts of the
+    exact mesh that are smaller than this may be missing.
+    """
 
     address: Address
     bytes: Count

@@ -1,0 +1,202 @@
+"""Arrays to bytes and back: the container of `protocol.arrays`, filters and Zstandard. Layout in docs/scene.md.
+
+Decoding is safe for bytes of anybody: it raises `AssetError` and nothing else, and allocates no more than the header
+says, which is checked against a limit first.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from iris_session.protocol.arrays import MAGIC, MAX_ARRAY_BYTES, MAX_HEADER_BYTES, ArrayHeader, ArrayInfo
+from iris_session.protocol.decoding import decoder
+from iris_session.protocol.scene_names import ArrayCodec, ArrayFilter
+from iris_session.scene.errors import AssetError
+
+Array = NDArray[Any]
+_DTYPES: Final = {"u1": "u1", "i1": "i1", "u2": "<u2", "u4": "<u4", "f4": "<f4"}
+_PREFIX: Final = struct.Struct("<4sI")
+_encoder: Final = msgspec.msgpack.Encoder()
+_decode_header: Final = decoder(ArrayHeader)
+#: Fast, and on filtered data as small as slower levels.
+LEVEL: Final = 1
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One array as it is stored. `scale`, `offset`: of quantised values, see `ArrayInfo`."""
+
+    name: str
+    values: Array
+    filter: str = ArrayFilter.NONE
+    scale: tuple[float, ...] = ()
+    offset: tuple[float, ...] = ()
+
+
+def encode_arrays(kind: str, arrays: Sequence[Stored], max_error: float = 0.0) -> bytes:
+    """The asset. Arrays that do not shrink are stored as they are."""
+    infos, bodies = [], []
+    for array in arrays:
+        values = np.ascontiguousarray(array.values)
+        plain = filtered(values, array.filter)
+        packed: bytes | memoryview = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
+        codec = ArrayCodec.ZSTD
+        if len(packed) >= len(plain):
+            packed, codec = plain, ArrayCodec.NONE
+        dtype = values.dtype.str.lstrip("<|")
+        infos.append(
+            ArrayInfo(array.name, dtype, values.shape, len(packed), array.filter, codec, array.scale, array.offset)
+        )
+        bodies.append(packed)
+    header = _encoder.encode(ArrayHeader(kind, tuple(infos), max_error))
+    return b"".join((_PREFIX.pack(MAGIC, len(header)), header, *bodies))
+
+
+def decode_arrays(
+    data: bytes | bytearray | memoryview, kind: str, max_bytes: int = MAX_ARRAY_BYTES
+) -> dict[str, Array]:
+    """The arrays of an asset by name, quantised ones as float32. `max_bytes`: of all arrays, decompressed."""
+    header, start = read_header(data)
+    if header.kind != kind:
+        raise AssetError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
+    total = sum(_size(info) for info in header.arrays)
+    if total > max_bytes:
+        raise AssetError(f"arrays of {total} bytes, at most {max_bytes} are read")
+    view, found = memoryview(data), {}
+    for info in header.arrays:
+        found[info.name] = _scaled(info, _decode_one(info, view[start : start + info.bytes]))
+        start += info.bytes
+    return found
+
+
+def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]:
+    """The header, and where the first array begins. The lengths in it fit `data` exactly."""
+    if len(data) < _PREFIX.size:
+        raise AssetError(f"{len(data)} bytes are no asset of arrays")
+    magic, length = _PREFIX.unpack_from(data)
+    if magic != MAGIC:
+        raise AssetError(f"no asset of arrays: it begins with {bytes(magic)!r}, not {MAGIC!r}")
+    start = _PREFIX.size + length
+    if length > MAX_HEADER_BYTES or start > len(data):
+        raise AssetError(f"a header of {length} bytes in an asset of {len(data)}, at most {MAX_HEADER_BYTES}")
+    try:
+        header = _decode_header(memoryview(data)[_PREFIX.size : start])
+    except msgspec.DecodeError as error:
+        raise AssetError(f"header of an asset: {error}") from None
+    if start + sum(info.bytes for info in header.arrays) != len(data):
+        raise AssetError("the lengths in the header are not those of the asset")
+    if len({info.name for info in header.arrays}) != len(header.arrays):
+        raise AssetError("two arrays of the same name")
+    return header, start
+
+
+def require(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence[int | None]) -> Array:
+    """The array `name`, whose dtype is one of `dtypes` (`u2 u4`) and whose shape fits (`None`: any length)."""
+    array = arrays.get(name)
+    if array is None:
+        raise AssetError(f"the array {name!r} is missing; there are {', '.join(sorted(arrays)) or 'none'}")
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if array.dtype.str.lstrip("<|") not in dtypes.split() or not fits:
+        raise AssetError(f"the array {name!r} is {array.dtype.str} {array.shape}, expected {dtypes} {tuple(shape)}")
+    return array
+
+
+# --- filters ---------------------------------------------------------------------------------------------------------
+
+
+def filtered(values: Array, kind: str) -> memoryview:
+    """The bytes that are compressed, of an array in C order."""
+    if kind == ArrayFilter.NONE:
+        return _bytes(values)
+    if kind == ArrayFilter.UP:
+        rows = values.reshape(values.shape[0], -1).view(np.uint8)
+        up = rows.copy()
+        np.subtract(rows[1:], rows[:-1], up[1:])
+        return _bytes(up)
+    flat = values.reshape(-1)
+    if kind == ArrayFilter.DELTA:
+        delta = flat.copy()
+        np.subtract(flat[1:], flat[:-1], delta[1:])
+        flat = delta
+    return _bytes(np.ascontiguousarray(flat.view(np.uint8).reshape(-1, values.dtype.itemsize).T))
+
+
+def _bytes(values: Array) -> memoryview:
+    return values.reshape(-1).view(np.uint8).data
+
+
+def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
+    dtype = np.dtype(_DTYPES[info.dtype])
+    if info.filter == ArrayFilter.NONE:
+        return np.frombuffer(plain, dtype).reshape(info.shape)
+    if info.filter == ArrayFilter.UP:
+        rows = np.frombuffer(plain, np.uint8).reshape(info.shape[0], -1).copy()
+        for above, row in itertools.pairwise(rows):  # faster than one accumulate: whole rows vectorise
+            np.add(above, row, row)
+        return rows.view(dtype).reshape(info.shape)
+    flat = np.empty(math.prod(info.shape), dtype)
+    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    target = flat.view(np.uint8).reshape(-1, dtype.itemsize)
+    for k in range(dtype.itemsize):  # faster than one transposing copy
+        target[:, k] = planes[k]
+    if info.filter == ArrayFilter.DELTA:
+        np.cumsum(flat, out=flat, dtype=dtype)
+    return flat.reshape(info.shape)
+
+
+def _size(info: ArrayInfo) -> int:
+    if info.dtype not in _DTYPES:
+        raise AssetError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
+    return math.prod(info.shape) * np.dtype(_DTYPES[info.dtype]).itemsize
+
+
+def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
+    if info.filter not in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
+        raise AssetError(f"unknown filter {info.filter!r}")
+    if info.filter == ArrayFilter.DELTA and info.dtype == "f4":
+        raise AssetError("differences of float32 are not exact")
+    size = _size(info)
+    plain: bytes | memoryview
+    if info.codec == ArrayCodec.ZSTD:
+        plain = _decompress(packed, size)
+    elif info.codec == ArrayCodec.NONE:
+        plain = packed
+    else:
+        raise AssetError(f"unknown compression {info.codec!r}")
+    if len(plain) != size:
+        raise AssetError(f"array {info.name!r} has {len(plain)} bytes, its shape and dtype need {size}")
+    if not size:
+        return np.zeros(info.shape, _DTYPES[info.dtype])
+    return _unfiltered(info, plain)
+
+
+def _decompress(packed: memoryview, size: int) -> bytes:
+    try:
+        # The frame says its size: checked before anything is allocated for it.
+        if zstandard.get_frame_parameters(packed).content_size != size:
+            raise AssetError("a Zstandard frame of another size than the array")
+        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise AssetError(f"damaged Zstandard frame: {error}") from None
+
+
+def _scaled(info: ArrayInfo, stored: Array) -> Array:
+    if not info.scale:
+        return stored
+    last = info.shape[-1]
+    if len(info.scale) != last or len(info.offset) != last:
+        raise AssetError(f"array {info.name!r}: scale and offset need {last} values each")
+    if not np.isfinite((*info.scale, *info.offset)).all():
+        raise AssetError(f"array {info.name!r}: scale and offset are not finite")
+    with np.errstate(over="ignore"):
+        return np.array(info.offset, np.float32) + np.array(info.scale, np.float32) * stored.astype(np.float32)

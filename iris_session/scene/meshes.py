@@ -1,0 +1,146 @@
+"""Meshes as assets: indexed corners, exact or quantised, and back.
+
+A corner is a vertex with its normal and texture coordinate as they are drawn; corners that agree in all bits are one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.arrays import MAX_ARRAY_BYTES
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind
+from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, require
+from iris_session.scene.errors import AssetError
+
+#: Steps of a quantised coordinate, and of a component of a normal.
+_POSITION_STEPS: Final = 65_535
+_NORMAL_STEPS: Final = 127
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """Triangles, counter-clockwise seen from outside.
+
+    `position` (n, 3) [m], `normal` (n, 3) unit vectors, `uv` (n, 2) or `None`: u to the right, v down from the upper
+    left corner of the image; `index` (m, 3) into the n corners.
+    """
+
+    position: Floats
+    normal: Floats
+    uv: Floats | None
+    index: NDArray[np.uint32]
+
+    @property
+    def vertices(self) -> int:
+        return len(self.position)
+
+    @property
+    def triangles(self) -> int:
+        return len(self.index)
+
+
+def index_corners(position: Floats, normal: Floats, uv: Floats | None) -> MeshArrays:
+    """Corners of triangles, shape (m, 3, ...), to indexed ones in the order of their first use."""
+    parts = [position.reshape(-1, 3), normal.reshape(-1, 3)]
+    if uv is not None:
+        parts.append(uv.reshape(-1, 2))
+    rows = np.ascontiguousarray(np.concatenate(parts, axis=1), np.float32)
+    first, inverse = _unique_rows(rows)
+    order = np.argsort(first)
+    rank = np.empty(len(first), np.uint32)
+    rank[order] = np.arange(len(first), dtype=np.uint32)
+    kept = rows[first[order]]
+    return MeshArrays(
+        position=np.ascontiguousarray(kept[:, :3]),
+        normal=np.ascontiguousarray(kept[:, 3:6]),
+        uv=None if uv is None else np.ascontiguousarray(kept[:, 6:8]),
+        index=rank[inverse].reshape(-1, 3),
+    )
+
+
+def _unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First occurrence of each different row, and for every row which of these it is. By bits."""
+    bits = rows.view(np.uint32)
+    key = np.zeros(len(rows), np.uint64)
+    for column in bits.T:  # Fowler-Noll-Vo: 64 bits of a row, so that one fast sort finds equals
+        key = (key ^ column) * np.uint64(0x100000001B3) + np.uint64(0x9E3779B97F4A7C15)
+        key ^= key >> np.uint64(29)
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    if not np.array_equal(bits[first[inverse]], bits):  # two rows of one key: once in 10^8 meshes
+        whole = np.ascontiguousarray(bits).view(np.dtype((np.void, bits.shape[1] * 4))).reshape(-1)
+        _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
+    return first, inverse.reshape(-1)
+
+
+def encode_mesh(mesh: MeshArrays) -> bytes:
+    """The asset, exact to the bit."""
+    arrays = [
+        Stored("index", _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        Stored("position", mesh.position, ArrayFilter.SHUFFLE),
+        Stored("normal", mesh.normal, ArrayFilter.SHUFFLE),
+    ]
+    if mesh.uv is not None:
+        arrays.append(Stored("uv", mesh.uv, ArrayFilter.SHUFFLE))
+    return encode_arrays(ArrayKind.MESH, arrays)
+
+
+def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
+    """A third of the size, and the bound on the position error [m]: 16 bits a coordinate, 8 a normal's component."""
+    low, step = _lattice(mesh.position)
+    error = float(np.linalg.norm(step)) / 2 + _rounding(mesh.position)
+    arrays = [
+        Stored("index", _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        _quantised("position", mesh.position, low, step),
+        Stored(
+            "normal",
+            np.rint(np.clip(mesh.normal, -1, 1) * _NORMAL_STEPS).astype(np.int8),
+            ArrayFilter.SHUFFLE,
+            (1 / _NORMAL_STEPS,) * 3,
+            (0.0,) * 3,
+        ),
+    ]
+    if mesh.uv is not None:
+        arrays.append(_quantised("uv", mesh.uv, *_lattice(mesh.uv)))
+    return encode_arrays(ArrayKind.MESH, arrays, error), error
+
+
+def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY_BYTES) -> MeshArrays:
+    """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetError` for bytes that are no mesh."""
+    arrays = decode_arrays(data, ArrayKind.MESH, max_bytes)
+    position = require(arrays, "position", "f4", (None, 3))
+    normal = require(arrays, "normal", "f4", (len(position), 3))
+    uv = require(arrays, "uv", "f4", (len(position), 2)) if "uv" in arrays else None
+    index = require(arrays, "index", "u2 u4", (None, 3)).astype(np.uint32)
+    if index.size and int(index.max()) >= len(position):
+        raise AssetError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
+    if not np.isfinite(position).all():
+        raise AssetError("a vertex is not finite")
+    return MeshArrays(position, normal, uv, index)
+
+
+def _narrow(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32] | NDArray[np.uint16]:
+    return index.astype(np.uint16) if vertices <= 1 << 16 else index
+
+
+def _lattice(values: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest value and step of 16 bits, per column."""
+    if not len(values):
+        return np.zeros(values.shape[1]), np.ones(values.shape[1])
+    low = values.min(axis=0).astype(np.float64)
+    step = (values.max(axis=0).astype(np.float64) - low) / _POSITION_STEPS
+    return low, np.where(step > 0, step, 1e-12)
+
+
+def _rounding(values: Floats) -> float:
+    """What float32 arithmetic in the decoder may add, over three axes."""
+    return float(np.abs(values).max(initial=0.0)) * 2.0**-22
+
+
+def _quantised(name: str, values: Floats, low: NDArray[np.float64], step: NDArray[np.float64]) -> Stored:
+    stored = np.clip(np.rint((values - low) / step), 0, _POSITION_STEPS).astype(np.uint16)
+    return Stored(name, stored, ArrayFilter.SHUFFLE, tuple(step.tolist()), tuple(low.tolist()))

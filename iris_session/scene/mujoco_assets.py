@@ -1,0 +1,126 @@
+"""Meshes, textures, height fields and deformables of a compiled MuJoCo model as work for a `Builder`.
+
+Everything is as MuJoCo's own renderer draws it: meshes without texture coordinates get creases (`simplify.CREASE`),
+with them the normals of the file; a texture coordinate (0, 0) is the upper left corner of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.scene_looks import HeightField, Mesh, Texture
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ColorSpace, TextureKind
+from iris_session.scene.arrays import Stored, encode_arrays
+from iris_session.scene.build import Builder, MeshNote, Work
+from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.mujoco_names import label
+from iris_session.scene.simplify import CREASE, unit
+
+_KINDS: Final = {
+    int(mujoco.mjtTexture.mjTEXTURE_2D): TextureKind.IMAGE,
+    int(mujoco.mjtTexture.mjTEXTURE_CUBE): TextureKind.CUBE,
+    int(mujoco.mjtTexture.mjTEXTURE_SKYBOX): TextureKind.SKYBOX,
+}
+_SPACES: Final = {0: ColorSpace.AUTO, 1: ColorSpace.LINEAR, 2: ColorSpace.SRGB}
+_FACES: Final = 6
+
+
+def meshes(model: mujoco.MjModel, builder: Builder) -> tuple[Mesh, ...]:
+    """All meshes, by id."""
+    notes = builder.run([_mesh_work(model, builder, i) for i in range(model.nmesh)])
+    return tuple(
+        Mesh(label(model, "mesh", i), note.low, note.high, int(model.mesh_texcoordadr[i]) >= 0, note.levels)
+        for i, note in enumerate(notes)
+    )
+
+
+def _mesh_work(model: mujoco.MjModel, builder: Builder, index: int) -> Work[MeshNote]:
+    vertex, normal, texcoord, face, face_normal, face_texcoord = _mesh_views(model, index)
+    raw = [vertex, normal, face, face_normal]
+    if texcoord is not None and face_texcoord is not None:
+        raw += [texcoord, face_texcoord]
+    return builder.mesh(raw, lambda: mesh_corners(model, index))
+
+
+def _mesh_views(model: mujoco.MjModel, index: int) -> tuple[Any, ...]:
+    """Views of one mesh: vertices, normals, texture coordinates or `None`, and per face three indices into each."""
+    v, n, f = (int(getattr(model, f"mesh_{name}adr")[index]) for name in ("vert", "normal", "face"))
+    vertex = model.mesh_vert[v : v + int(model.mesh_vertnum[index])]
+    normal = model.mesh_normal[n : n + int(model.mesh_normalnum[index])]
+    faces = slice(f, f + int(model.mesh_facenum[index]))
+    t = int(model.mesh_texcoordadr[index])
+    texcoord = model.mesh_texcoord[t : t + int(model.mesh_texcoordnum[index])] if t >= 0 else None
+    face_texcoord = model.mesh_facetexcoord[faces] if t >= 0 else None
+    return vertex, normal, texcoord, model.mesh_face[faces], model.mesh_facenormal[faces], face_texcoord
+
+
+def mesh_corners(model: mujoco.MjModel, index: int) -> MeshArrays:
+    """One mesh with a normal and a texture coordinate at every corner, as it is drawn."""
+    vertex, normals, texcoord, face, face_normal, face_texcoord = _mesh_views(model, index)
+    position = vertex[face]
+    normal = normals[face_normal].copy()
+    if texcoord is not None:
+        return index_corners(position, normal, texcoord[face_texcoord])
+    flat = unit(np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]))
+    creased = np.einsum("fkc,fc->fk", normal, flat) < CREASE
+    normal[creased] = np.broadcast_to(flat[:, None], normal.shape)[creased]
+    return index_corners(position, normal, None)
+
+
+def textures(model: mujoco.MjModel, builder: Builder) -> tuple[Texture, ...]:
+    """All textures, by id."""
+    kinds = [_KINDS.get(int(kind), TextureKind.IMAGE) for kind in model.tex_type]
+    images = [_pixels(model, i, kind) for i, kind in enumerate(kinds)]
+    notes = builder.run([builder.texture(image, kind) for image, kind in zip(images, kinds, strict=True)])
+    return tuple(
+        Texture(
+            name=label(model, "texture", i),
+            kind=kind,
+            width=image.shape[1],
+            height=image.shape[0] // (1 if kind == TextureKind.IMAGE else _FACES),
+            channels=image.shape[2],
+            colorspace=_SPACES.get(int(model.tex_colorspace[i]), ColorSpace.AUTO),
+            levels=note.levels,
+        )
+        for i, (kind, image, note) in enumerate(zip(kinds, images, notes, strict=True))
+    )
+
+
+def _pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:
+    """(height, width, channels); of cubes six faces. A cube that is one square wears it on every face."""
+    shape = tuple(int(getattr(model, f"tex_{side}")[index]) for side in ("height", "width", "nchannel"))
+    start = int(model.tex_adr[index])
+    data = model.tex_data[start : start + shape[0] * shape[1] * shape[2]].reshape(shape)
+    if kind != TextureKind.IMAGE and shape[0] == shape[1]:
+        return np.tile(data, (_FACES, 1, 1))
+    image: NDArray[np.uint8] = data
+    return image
+
+
+def hfields(model: mujoco.MjModel, builder: Builder) -> tuple[HeightField, ...]:
+    """All height fields, by id."""
+    grids = []
+    for i in range(model.nhfield):
+        rows, columns, start = (int(getattr(model, f"hfield_{name}")[i]) for name in ("nrow", "ncol", "adr"))
+        grids.append(model.hfield_data[start : start + rows * columns].reshape(rows, columns))
+    notes = builder.run([builder.blob([b"hfield", grid], _encode_grid(grid)) for grid in grids])
+    return tuple(
+        HeightField(
+            name=label(model, "hfield", i),
+            rows=grid.shape[0],
+            columns=grid.shape[1],
+            size=tuple(model.hfield_size[i].tolist()),
+            address=note.address,
+            bytes=note.bytes,
+        )
+        for i, (grid, note) in enumerate(zip(grids, notes, strict=True))
+    )
+
+
+def _encode_grid(grid: NDArray[np.float32]) -> Callable[[], bytes]:
+    return lambda: encode_arrays(ArrayKind.GRID, [Stored("elevation", grid, ArrayFilter.SHUFFLE)])

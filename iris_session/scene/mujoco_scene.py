@@ -1,0 +1,207 @@
+"""`parse_mujoco`: a compiled MuJoCo model to a scene specification and its assets. Works with MuJoCo 3.3 to 4.
+
+The model is not changed. Left out: collision settings, actuators, sensors, contacts, and skins (see `skipped`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from iris_session.protocol.common import MAX_TEXT, Vec3
+from iris_session.protocol.scene import Body, Geometry, SceneSpec, Site, Tendon, Visual
+from iris_session.protocol.scene_names import GeometryKind
+from iris_session.scene.build import Builder, EncodeOptions
+from iris_session.scene.mujoco_assets import hfields, meshes, textures
+from iris_session.scene.mujoco_deformables import deformables
+from iris_session.scene.mujoco_looks import cameras, drawn_rgba, environment, lights, materials, pose
+from iris_session.scene.mujoco_names import label
+from iris_session.scene.store import AssetStore
+from iris_session.scene.totals import with_totals
+
+_KINDS: Final = {
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
+    for kind in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
+}
+_WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
+_HINGE_OR_SLIDE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """`skipped`: what the model has and the specification does not, in words for people. `built`, `recalled`: pieces of
+    work that were done, and that were known from before."""
+
+    spec: SceneSpec
+    skipped: tuple[str, ...]
+    built: int
+    recalled: int
+
+
+def parse_mujoco(
+    model: mujoco.MjModel,
+    store: AssetStore,
+    *,
+    data: Any = None,
+    name: str = "",
+    options: EncodeOptions | None = None,
+    sites: bool = False,
+    tendons: bool = False,
+    threads: int = 0,
+) -> Parsed:
+    """The specification of `model`; its assets are in `store` afterwards.
+
+    `data`: the initial state, with kinematics; else the model's default one. `sites`, `tendons`: list them too (tendons
+    bring the sites they run through).
+    """
+    if data is None:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        if model.nflex:
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_flex(model, data)
+    builder = Builder(store, options, threads)
+    found_textures = textures(model, builder)
+    cables = _tendons(model) if tendons else ()
+    needed = {site for cable in cables for site in cable.sites}
+    spec = SceneSpec(
+        name=name[:MAX_TEXT],
+        source=f"MuJoCo {mujoco.__version__}",
+        bodies=_bodies(model, data),
+        visuals=tuple(_visual(model, i) for i in range(model.ngeom)),
+        materials=materials(model),
+        textures=found_textures,
+        meshes=meshes(model, builder),
+        hfields=hfields(model, builder),
+        lights=lights(model),
+        cameras=cameras(model),
+        sites=tuple(_site(model, i) for i in range(model.nsite) if sites or i in needed),
+        tendons=cables,
+        deformables=deformables(model, data, builder),
+        environment=environment(model, found_textures),
+    )
+    return Parsed(with_totals(spec), _skipped(model), builder.built, builder.recalled)
+
+
+def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
+    """All bodies but those that MuJoCo made for vertices of flexes, by id; the world is 0."""
+    vertices = _flex_vertex_bodies(model)
+    weld = model.body_weldid.tolist()
+    mocap = model.body_mocapid.tolist()
+    return tuple(
+        Body(
+            id=i,
+            name=label(model, "body", i),
+            parent=int(model.body_parentid[i]) if i else -1,
+            T_parent_body=pose(model.body_pos[i], model.body_quat[i]),
+            T_world_body=pose(data.xpos[i], data.xquat[i]),
+            moving=i > 0 and (weld[i] != 0 or mocap[i] >= 0),
+        )
+        for i in range(model.nbody)
+        if i not in vertices
+    )
+
+
+def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
+    """Bodies that hold nothing but a vertex or node of a flex: they are not streamed."""
+    listed: set[int] = set()
+    for field in ("flex_vertbodyid", "flex_nodebodyid"):
+        if model.nflex and hasattr(model, field):
+            listed.update(np.unique(getattr(model, field)).tolist())
+    used = {
+        *model.body_parentid.tolist(),
+        *model.light_bodyid.tolist(),
+        *model.cam_bodyid.tolist(),
+        *model.site_bodyid.tolist(),
+    }
+    return frozenset(
+        body
+        for body in listed
+        if body > 0
+        and body not in used
+        and int(model.body_geomnum[body]) == 0
+        and int(model.body_jntnum[body]) == 3
+        and all(
+            int(model.jnt_type[joint]) in _HINGE_OR_SLIDE
+            for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + 3)
+        )
+    )
+
+
+def _visual(model: mujoco.MjModel, index: int) -> Visual:
+    material = int(model.geom_matid[index])
+    return Visual(
+        id=index,
+        body=int(model.geom_bodyid[index]),
+        name=label(model, "geom", index),
+        T_body_visual=pose(model.geom_pos[index], model.geom_quat[index]),
+        group=int(model.geom_group[index]),
+        geometry=_geometry(model, int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])),
+        material=material,
+        rgba=drawn_rgba(model, model.geom_rgba[index], material),
+    )
+
+
+def _site(model: mujoco.MjModel, index: int) -> Site:
+    material = int(model.site_matid[index])
+    mesh = int(model.site_dataid[index]) if hasattr(model, "site_dataid") else -1
+    return Site(
+        id=index,
+        body=int(model.site_bodyid[index]),
+        name=label(model, "site", index),
+        T_body_site=pose(model.site_pos[index], model.site_quat[index]),
+        group=int(model.site_group[index]),
+        geometry=_geometry(model, int(model.site_type[index]), model.site_size[index], mesh),
+        material=material,
+        rgba=drawn_rgba(model, model.site_rgba[index], material),
+    )
+
+
+def _geometry(model: mujoco.MjModel, kind: int, size: Any, asset: int) -> Geometry:
+    shape = _KINDS.get(kind, GeometryKind.BOX)
+    a, b, c = (float(v) for v in size)
+    full: Vec3 = (a, b, c)
+    mesh = hfield = -1
+    match shape:
+        case GeometryKind.SPHERE:
+            full = (a, a, a)
+        case GeometryKind.CAPSULE | GeometryKind.CYLINDER:
+            full = (a, a, b)
+        case GeometryKind.MESH | GeometryKind.SDF:
+            mesh = asset
+        case GeometryKind.HFIELD:
+            hfield = asset
+            x, y, z, _ = (float(v) for v in model.hfield_size[asset])
+            full = (x, y, z)
+    return Geometry(shape, full, mesh, hfield)
+
+
+def _tendons(model: mujoco.MjModel) -> tuple[Tendon, ...]:
+    """Spatial tendons: those that run through at least two sites."""
+    found = []
+    for i in range(model.ntendon):
+        wraps = range(int(model.tendon_adr[i]), int(model.tendon_adr[i]) + int(model.tendon_num[i]))
+        through = tuple(int(model.wrap_objid[w]) for w in wraps if int(model.wrap_type[w]) == _WRAP_SITE)
+        material = int(model.tendon_matid[i])
+        if len(through) >= 2:
+            found.append(
+                Tendon(
+                    name=label(model, "tendon", i),
+                    group=int(model.tendon_group[i]),
+                    width=float(model.tendon_width[i]),
+                    sites=through,
+                    material=material,
+                    rgba=drawn_rgba(model, model.tendon_rgba[i], material),
+                )
+            )
+    return tuple(found)
+
+
+def _skipped(model: mujoco.MjModel) -> tuple[str, ...]:
+    found = []
+    if model.nskin:
+        found.append(f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex")
+    return tuple(found)

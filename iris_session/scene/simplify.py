@@ -1,0 +1,85 @@
+"""Coarser meshes with a stated error: vertices of one cell of a grid become one of them.
+
+Not a quadric decimation, which keeps flat parts better: here the error is proven. No point of a triangle moves farther
+than the vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in
+threads.) Parts smaller than a cell vanish. Meshes with texture coordinates are not made coarser: their textures
+would move across seams.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.scene.meshes import MeshArrays, index_corners
+
+#: A corner whose smooth normal is farther than this (cosine) from the face's gets the face's: MuJoCo's rule for meshes.
+CREASE: Final = 0.8
+#: Attempts to meet the wanted number of triangles by another size of the cells.
+_TRIES: Final = 3
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
+    """A mesh of about `triangles`, and how far its points lie from `mesh` at most [m].
+
+    `None` where that would gain less than a quarter, and when `mesh` is textured.
+    """
+    if mesh.uv is not None or triangles <= 0 or mesh.triangles <= triangles:
+        return None
+    points, inverse = np.unique(mesh.position.astype(np.float64), axis=0, return_inverse=True)
+    index = inverse.reshape(-1)[mesh.index].astype(np.int64)
+    corners = points[index]
+    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+    cell = np.sqrt(max(area, 1e-18) / triangles)  # a cell of surface is about two triangles; `area` is twice the area
+    best: tuple[Doubles, Ints, float] | None = None
+    for _ in range(_TRIES):
+        found = _clustered(points, index, float(cell))
+        if len(found[1]) and (best is None or abs(len(found[1]) - triangles) < abs(len(best[1]) - triangles)):
+            best = found
+        cell *= np.clip(np.sqrt(max(1, len(found[1])) / triangles), 0.5, 2.0)
+    if best is None or len(best[1]) > 0.75 * mesh.triangles:
+        return None
+    return smooth_mesh(best[0], best[1]), best[2]
+
+
+def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
+    """Points that stay, triangles between them, and the longest way that a point moved."""
+    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    _, cluster = np.unique(cells, axis=0, return_inverse=True)
+    cluster = cluster.reshape(-1)
+    count = np.bincount(cluster)
+    mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
+    off = np.linalg.norm(points - mean[cluster], axis=1)
+    order = np.lexsort((off, cluster))
+    keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # of each cell the point nearest to the mean
+    faces = cluster[index]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
+    faces = np.unique(np.take_along_axis(faces, turned % 3, axis=1), axis=0) if len(faces) else faces
+    used, faces = np.unique(faces, return_inverse=True)
+    moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
+    return points[keep[used]], faces.reshape(-1, 3), moved
+
+
+def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
+    """Corners with area-weighted normals, creased by `CREASE`."""
+    corners = points[faces]
+    face_normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertex_normal = np.zeros_like(points)
+    for k in range(3):
+        np.add.at(vertex_normal, faces[:, k], face_normal)
+    face_normal = unit(face_normal)
+    normal = unit(vertex_normal)[faces]
+    creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE
+    normal[creased] = np.broadcast_to(face_normal[:, None], normal.shape)[creased]
+    return index_corners(corners.astype(np.float32), normal.astype(np.float32), None)
+
+
+def unit(vectors: NDArray[Any]) -> NDArray[Any]:
+    """Vectors of length 1; those without length become +z, as MuJoCo's renderer has it."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-15, vectors / np.maximum(length, 1e-15), np.array([0, 0, 1], vectors.dtype))
