@@ -53,6 +53,11 @@ def _of_session(r: StatusReport) -> Iterator[Metric]:
     yield _one("processors", "gauge", "Processors of the machine.", r.cpus)
     dropped = [({"reason": reason}, float(n)) for reason, n in r.drops.items()]
     yield Metric("drops_total", "counter", "Thrown away, by reason.", dropped)
+    if r.assets is not None:
+        yield _one("assets_served", "gauge", "Assets of the present scene.", r.assets.served)
+        yield _one("assets_bytes_total", "counter", "Bytes of assets handed to clients.", r.assets.bytes_sent)
+        yield _one("assets_requests_total", "counter", "Requests for chunks of assets.", r.assets.requests)
+        yield _one("assets_refusals_total", "counter", "Requests and connections refused.", r.assets.refusals)
     restarts = [({"process": name}, float(n)) for name, n in r.restarts.items()]
     yield Metric("restarts_total", "counter", "Processes that were started again.", restarts)
 

@@ -205,6 +205,17 @@ class MediaStreamReport(msgspec.Struct, frozen=True):
     subscribers: Count = 0
 
 
+class AssetsReport(msgspec.Struct, frozen=True):
+    """The assets channel. `served`: assets of the present scene. Since the front began: `bytes_sent`, `requests`, and
+    `refusals`, of requests and connections. `waiting`: connections that wait for something now."""
+
+    served: Count = 0
+    bytes_sent: Count = 0
+    requests: Count = 0
+    refusals: Count = 0
+    waiting: Count = 0
+
+
 class StatusReport(Message, frozen=True, tag="status_report"):
     """Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
 
@@ -247,3 +258,4 @@ class StatusReport(Message, frozen=True, tag="status_report"):
     media: tuple[MediaStreamReport, ...] = ()
     anchors: tuple[AnchorReport, ...] = ()
     cross_checks: tuple[CrossCheckReport, ...] = ()
+    assets: AssetsReport | None = None

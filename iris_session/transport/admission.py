@@ -216,7 +216,11 @@ class Admission:
                 config.tick_period_ns,
                 config.state_period_ns,
                 Endpoints(
-                    self._ports.state, self._ports.media, config.assets_port, config.web_port, self._ports.media_ingest
+                    self._ports.state,
+                    self._ports.media,
+                    self._ports.assets,
+                    config.web_port,
+                    self._ports.media_ingest,
                 ),
                 self._ports.key_fingerprint,
             ),

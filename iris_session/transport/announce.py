@@ -49,7 +49,7 @@ def announce(config: FrontConfig, ports: Ports, listeners: Listeners, drops: Dro
         control=ports.control,
         state=ports.state,
         media=ports.media,
-        assets=config.assets_port,
+        assets=ports.assets,
         web=config.web_port,
         key_fingerprint=ports.key_fingerprint,
     )

@@ -62,12 +62,18 @@ class FrontLimits(msgspec.Struct, frozen=True):
 
 class SceneInfo(msgspec.Struct, frozen=True):
     """What the front adds to every `Snapshot`. `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, little-endian,
-    used until the first state frame."""
+    used until the first state frame.
+
+    `asset_root`: folder of a store (`ROOT/ab/abcd...`) that holds the `assets`, by address, which clients may fetch as
+    long as this scene or the next one is the present one; empty for none.
+    """
 
     scene_hash: str
     robots: tuple[RobotInfo, ...] = ()
     bodies: tuple[BodyInfo, ...] = ()
     poses: bytes = b""
+    asset_root: str = ""
+    assets: tuple[str, ...] = ()
 
 
 class FrontConfig(msgspec.Struct, frozen=True):
@@ -79,7 +85,7 @@ class FrontConfig(msgspec.Struct, frozen=True):
     `curve_secret_file`: another ZeroMQ certificate of the server (`*.key_secret`); `curve_clients_dir`: folder of
     public certificates (`*.key`) instead of the allow-list. `origin_ns`: `time.monotonic_ns()` at session time 0.
     `media_endpoint`: where processes of this session hand in media, empty for nowhere; `media_port`,
-    `media_ingest_port`: taken when they are free, else any other. `adapt_media`: slow links get less.
+    `media_ingest_port`, `assets_port`: taken when they are free, else any other. `adapt_media`: slow links get less.
     `recorder_endpoint`: a PULL socket that takes raw samples, empty when nothing is recorded. `forward_observations`:
     raw observations reach the authority too.
     """
@@ -147,6 +153,7 @@ class Ports(msgspec.Struct, frozen=True):
     reachable: tuple[str, ...] = ()
     media: int = 0
     media_ingest: int = 0
+    assets: int = 0
 
 
 class FrontStart(msgspec.Struct, frozen=True):

@@ -10,6 +10,7 @@ import zmq
 
 from iris_session.transport import link_messages as link
 from iris_session.transport.announce import host_for_address, hosts_to_tell
+from iris_session.transport.asset_server import AssetSockets, open_below
 from iris_session.transport.config import FrontError, FrontStart, Ports
 from iris_session.transport.introduction import Listeners, open_with_introduction
 from iris_session.transport.keyring import open_keyring
@@ -36,7 +37,7 @@ class Watched(NamedTuple):
 
 class FrontSockets:
     """`link`: to the authority. `control`, `state`, `media`: for clients. `ingest`, `local_ingest`: for media sources,
-    on other machines and of this session. `listeners`: of the introduction.
+    on other machines and of this session. `assets`: theirs is a context of its own. `listeners`: of the introduction.
 
     Raises `FrontError` when one cannot be opened; the authority has been told why then, and all are closed. `refused`:
     told the fingerprint and the address of every key that was not let in.
@@ -46,6 +47,7 @@ class FrontSockets:
         self._config = start.config
         self._drops = drops
         self._state_sockets = 0
+        self.assets: AssetSockets
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(IO_THREADS)
         self.link = self.context.socket(zmq.PAIR)
         self.link.setsockopt(zmq.LINGER, 1000)
@@ -71,6 +73,7 @@ class FrontSockets:
             self.state = self.open_state(config.state_port)
             media = open_media(self.context, config, key)
             ingest = open_ingest(self.context, config, key)
+            self.assets = open_below(config, key)
         except FrontError:
             for listener in self.listeners:
                 listener.close()
@@ -88,6 +91,7 @@ class FrontSockets:
             hosts_to_tell(config),
             bound_port(media),
             bound_port(ingest),
+            bound_port(self.assets.socket),
         )
 
     def open_state(self, port: int) -> Watched:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
@@ -78,6 +78,11 @@ class Keyring:
     def close(self) -> None:
         """What was asked for is still written."""
         self.files.close()
+
+    @property
+    def marks(self) -> Collection[str]:
+        """Fingerprints of all allowed keys."""
+        return self._keys.keys()
 
     def find(self, mark: str) -> AllowedKey | None:
         """The allowed key with that fingerprint."""

@@ -1,4 +1,4 @@
-"""The one loop of the front process, all sockets wired. Threads: of media, and of `FileWorker`.
+"""The one loop of the front process, all sockets wired. Threads: of media, of assets, and of `FileWorker`.
 
 It drains the link to the authority first (state goes out before anything else), then the control socket in small
 rounds with a look at the link in between. It never waits for a client, nor for the authority.
@@ -17,6 +17,8 @@ from iris_session.transport import link_messages as link
 from iris_session.transport.admission import Admission
 from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.announce import Facts, announce
+from iris_session.transport.asset_desk import AssetDesk
+from iris_session.transport.asset_server import REQUEST_BYTES, AssetServer
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Outbox, Peer
 from iris_session.transport.coalescer import Coalescer
@@ -143,7 +145,8 @@ class Front:
             departures.lose,
             self._open_state_again,
         )
-        self._services += [self._pairing, revocation, self._audit]
+        self._assets = self._make_assets()
+        self._services += [self._pairing, revocation, self._audit, self._assets]
         self._downlink = Downlink(
             self._link,
             self._clients,
@@ -208,6 +211,12 @@ class Front:
             lambda: self._publisher.frames,
             adapt=self._config.adapt_media,
         )
+
+    def _make_assets(self) -> AssetDesk:
+        sockets, encrypted, limits = self._sockets.assets, self._keyring.key is not None, self._config.limits
+        doors = MediaDoors(sockets.monitor, limits, limits.subscribers, REQUEST_BYTES, curve=encrypted, name="assets")
+        server = AssetServer(sockets, doors, self._session_ns)
+        return AssetDesk(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.revoked)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
@@ -342,4 +351,5 @@ class Front:
             self._uplink.entries,
             self._doors.warnings(self._session_ns()),
             self._media.streams(),
+            self._assets.report(),
         )

@@ -1,5 +1,5 @@
-"""TCP connections to a socket of media: who says nothing for a while is closed, and so are too many, and who hands in
-more than is taken: of a message libzmq collects all frames, however many, before it shows the first."""
+"""TCP connections to a socket of media, or of assets: who says nothing for a while is closed, and so are too many, and
+who hands in more than is taken: of a message libzmq collects all frames, however many, before it shows the first."""
 
 from __future__ import annotations
 
@@ -34,16 +34,25 @@ class _Guest:
 
 
 class MediaDoors:
-    """Belongs to the thread of the media proxy. `monitor`: of the socket. What it closes, it gives the reason of.
+    """Belongs to the thread of the media proxy, or of the assets. `monitor`: of the socket. What it closes, it gives
+    the reason of, which begins with `name`.
 
     At most `most` connections that have said something, and as many that have not; at most `waiting` bytes that came by
     one of them and were not taken. `curve`: whether it is encrypted.
     """
 
     def __init__(
-        self, monitor: zmq.Socket[bytes], limits: FrontLimits, most: int, waiting: int, *, curve: bool
+        self,
+        monitor: zmq.Socket[bytes],
+        limits: FrontLimits,
+        most: int,
+        waiting: int,
+        *,
+        curve: bool,
+        name: str = "media",
     ) -> None:
         self._monitor = monitor
+        self._name = name
         self._limits = limits
         self._most = most
         self._waiting = waiting
@@ -73,7 +82,7 @@ class MediaDoors:
             self._traffic.taken(descriptor, length)
         guest.inside, guest.who = True, user or guest.who
         guest.said += counts
-        return self.close_one(descriptor, "media_flood") if guest.said > MAX_SAID else ""
+        return self.close_one(descriptor, f"{self._name}_flood") if guest.said > MAX_SAID else ""
 
     def turn(self, now_ns: int) -> list[str]:
         """The reasons of those that were closed now."""
@@ -84,10 +93,10 @@ class MediaDoors:
         silent = [one for one in self._guests.items() if not one[1].inside]
         oldest_ns = now_ns - self._limits.hello_timeout_ns
         flooding = [fd for fd in self._guests if self._traffic.held(fd) > self._waiting]
-        closed = [self.close_one(fd, "media_flood") for fd in flooding]
-        closed += [self.close_one(fd, "media_silent") for fd, guest in silent if guest.opened_ns < oldest_ns]
+        closed = [self.close_one(fd, f"{self._name}_flood") for fd in flooding]
+        closed += [self.close_one(fd, f"{self._name}_silent") for fd, guest in silent if guest.opened_ns < oldest_ns]
         many = (*crowd(silent, self._most), *crowd(reversed(inside), self._most))
-        closed += [self.close_one(fd, "media_too_many") for fd in many]
+        closed += [self.close_one(fd, f"{self._name}_too_many") for fd in many]
         return [reason for reason in closed if reason]
 
     def close_one(self, descriptor: int, reason: str) -> str:

@@ -60,8 +60,14 @@ class MemoryWatch:
 
 
 def _resident_of_us() -> Callable[[], int]:
+    """Without what is mapped from files: assets are, and the system takes those pages back as it likes."""
     process = psutil.Process()
-    return lambda: int(process.memory_info().rss)
+
+    def resident() -> int:
+        info = process.memory_info()
+        return int(info.rss - getattr(info, "shared", 0))
+
+    return resident
 
 
 def _give_back() -> None:

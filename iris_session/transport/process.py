@@ -98,6 +98,7 @@ class FrontProcess:
                 state_port=ports.state,
                 media_port=ports.media,
                 media_ingest_port=ports.media_ingest,
+                assets_port=ports.assets,
             )
         start = self._open_link()
         self._replacing = threading.Thread(target=self._replace, args=(self._process, start), name="iris-front")

@@ -13,6 +13,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from iris_session.keys import KeyPair
+from iris_session.protocol.assets import MAX_ASSET_REQUESTS
 from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.transport.config import FrontConfig, FrontError, PortInUseError
 
@@ -21,6 +22,7 @@ from iris_session.transport.config import FrontConfig, FrontError, PortInUseErro
 ZAP_CONTROL = b"iris-control"
 ZAP_STATE = b"iris-state"
 ZAP_MEDIA = b"iris-media"
+ZAP_ASSETS = b"iris-assets"
 #: State sockets: two frames may wait for a client that is slow, then the newest is lost, not the oldest (libzmq).
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768
@@ -32,6 +34,11 @@ CONTROL_BUFFER_BYTES = 131_072
 MEDIA_HWM = 2
 MEDIA_BUFFER_BYTES = 65_536
 INGEST_HWM = 8
+#: Assets: chunks that wait in libzmq for one reader, mapped files all of them. The system holds no more than a link of
+#: 300 Mbit/s and 7 ms: what waits there delays the state that shares the link.
+ASSET_HWM = 4
+ASSET_BUFFER_BYTES = 262_144
+ASSET_MESSAGE_BYTES = 1024
 #: I/O threads of the front, as bits of ZMQ_AFFINITY: encrypting media must not delay state.
 IO_THREADS = 2
 MAIN_THREAD = 1
@@ -88,6 +95,19 @@ def open_media(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key
     media.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
     _bind_or_any(media, config, key, config.media_port, "media")
     return media
+
+
+def open_assets(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
+    """ROUTER for requests of assets, which are small, and their chunks, which are not."""
+    assets = context.socket(zmq.ROUTER)
+    assets.setsockopt(zmq.ROUTER_MANDATORY, 1)
+    assets.setsockopt(zmq.MAXMSGSIZE, ASSET_MESSAGE_BYTES)
+    assets.setsockopt(zmq.SNDHWM, ASSET_HWM)
+    assets.setsockopt(zmq.RCVHWM, MAX_ASSET_REQUESTS)
+    assets.setsockopt(zmq.SNDBUF, ASSET_BUFFER_BYTES)
+    assets.setsockopt(zmq.RCVBUF, STATE_RECEIVE_BYTES)
+    _bind_or_any(assets, config, key, config.assets_port, "assets")
+    return assets
 
 
 def open_ingest(context: zmq.Context[zmq.Socket[bytes]], config: FrontConfig, key: KeyPair | None) -> zmq.Socket[bytes]:
@@ -230,7 +250,7 @@ def _prepare(bound: zmq.Socket[bytes], key: KeyPair | None, name: str) -> None:
     bound.setsockopt(zmq.HANDSHAKE_IVL, 5000)
     bound.setsockopt(zmq.BACKLOG, 512)
     if key is not None:
-        domains = {"control": ZAP_CONTROL, "state": ZAP_STATE}
+        domains = {"control": ZAP_CONTROL, "state": ZAP_STATE, "assets": ZAP_ASSETS}
         bound.setsockopt(zmq.ZAP_DOMAIN, domains.get(name, ZAP_MEDIA))
         bound.setsockopt(zmq.CURVE_SERVER, 1)
         bound.setsockopt(zmq.CURVE_PUBLICKEY, key.public.encode())

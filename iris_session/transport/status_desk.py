@@ -16,6 +16,7 @@ import msgspec
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.status import (
     AlignmentReport,
+    AssetsReport,
     ClientReport,
     GetStatus,
     MediaStreamReport,
@@ -70,6 +71,7 @@ class Telling(NamedTuple):
     entries: int = 0  # sent to the authority since the start
     warnings: tuple[str, ...] = ()  # of the front
     media: tuple[MediaStreamReport, ...] = ()
+    assets: AssetsReport | None = None
 
 
 class StatusDesk:
@@ -181,6 +183,7 @@ class StatusDesk:
             entries_per_s=self._entries_per_s,
             authority_silent_ns=now_ns - telling.heard_ns if telling.heard_ns else -1,
             media=telling.media,
+            assets=telling.assets,
         )
 
     def _row(self, row: ParticipantReport, connection: Connection | None, now_ns: int) -> ParticipantReport:

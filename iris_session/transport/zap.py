@@ -17,7 +17,28 @@ from iris_session.transport.keyring import STRANGER, Keyring
 from iris_session.transport.limiter import Drops
 from iris_session.transport.sockets import ZAP_CONTROL, ZAP_STATE, readable
 
+ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
 _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, mechanism, client key
+
+
+def asks_with_curve(request: list[bytes]) -> bool:
+    """Whether a ZAP request has all its frames, and the client's key as the last."""
+    return len(request) == _REQUEST_FRAMES and request[5] == b"CURVE"
+
+
+def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
+    """Answers every ZAP request that waits. `user_id_of(request)`: empty for who is not to be let in."""
+    while readable(socket):
+        frames = socket.recv_multipart()
+        split = frames.index(b"") + 1
+        route, request = frames[:split], frames[split:]
+        request_id = request[1] if len(request) > 1 else b""
+        user_id = user_id_of(request)
+        if user_id:
+            reply = [b"1.0", request_id, b"200", b"OK", user_id.encode(), b""]
+        else:
+            reply = [b"1.0", request_id, b"400", b"key not on the list", b"", b""]
+        socket.send_multipart(route + reply)
 
 
 class Authenticator:
@@ -35,7 +56,7 @@ class Authenticator:
     ) -> None:
         self.socket = context.socket(zmq.ROUTER)
         self.socket.setsockopt(zmq.LINGER, 0)
-        self.socket.bind("inproc://zeromq.zap.01")
+        self.socket.bind(ZAP_ENDPOINT)
         self._keyring = keyring
         self._drops = drops
         self.refused = refused
@@ -44,24 +65,13 @@ class Authenticator:
 
     def answer(self) -> None:
         """Answers everything that waits."""
-        if not readable(self.socket):
-            return
-        self._keyring.look()
-        while readable(self.socket):
-            frames = self.socket.recv_multipart()
-            split = frames.index(b"") + 1
-            route, request = frames[:split], frames[split:]
-            request_id = request[1] if len(request) > 1 else b""
-            user_id = self._user_id(request)
-            if user_id:
-                reply = [b"1.0", request_id, b"200", b"OK", user_id.encode(), b""]
-            else:
-                reply = [b"1.0", request_id, b"400", b"key not on the list", b"", b""]
-            self.socket.send_multipart(route + reply)
+        if readable(self.socket):
+            self._keyring.look()
+            answer_zap(self.socket, self._user_id)
 
     def _user_id(self, request: list[bytes]) -> str:
         """Empty: not to be let in."""
-        if len(request) != _REQUEST_FRAMES or request[5] != b"CURVE":
+        if not asks_with_curve(request):
             self._drops.count("unknown_key")
             return ""
         mark = fingerprint(request[6])

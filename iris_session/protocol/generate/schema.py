@@ -87,6 +87,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         status.RobotReport,
         status.RecorderReport,
         status.MediaStreamReport,
+        status.AssetsReport,
     ),
     "client": UNIONS["ClientMessage"],
     "server": UNIONS["ServerMessage"],

@@ -1972,6 +1972,52 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// The assets channel. served: assets of the present scene. Since the front began: bytes_sent, requests, and
+    /// refusals, of requests and connections. waiting: connections that wait for something now.
+    /// </summary>
+    public sealed class AssetsReport : WireValue
+    {
+        public long Served = 0;
+        public long BytesSent = 0;
+        public long Requests = 0;
+        public long Refusals = 0;
+        public long Waiting = 0;
+
+        public static AssetsReport Read(WireReader reader)
+        {
+            AssetsReport value = new AssetsReport();
+            for (int n = reader.ReadMapHeader(); n > 0; n--)
+            {
+                switch (reader.ReadString())
+                {
+                    case "served": value.Served = reader.ReadLong(); break;
+                    case "bytes_sent": value.BytesSent = reader.ReadLong(); break;
+                    case "requests": value.Requests = reader.ReadLong(); break;
+                    case "refusals": value.Refusals = reader.ReadLong(); break;
+                    case "waiting": value.Waiting = reader.ReadLong(); break;
+                    default: reader.Skip(); break;
+                }
+            }
+            return value;
+        }
+
+        public override void WriteTo(WireWriter writer)
+        {
+            writer.WriteMapHeader(5);
+            writer.Write("served");
+            writer.Write(Served);
+            writer.Write("bytes_sent");
+            writer.Write(BytesSent);
+            writer.Write("requests");
+            writer.Write(Requests);
+            writer.Write("refusals");
+            writer.Write(Refusals);
+            writer.Write("waiting");
+            writer.Write(Waiting);
+        }
+    }
+
+    /// <summary>
     /// First message of a connection.
     ///
     /// secret: client-made 128-bit secret that stands for the key on plain loopback. resume_token: from the last
@@ -3820,6 +3866,7 @@ namespace IrisSession.Protocol
         public MediaStreamReport[] Media = new MediaStreamReport[0];
         public AnchorReport[] Anchors = new AnchorReport[0];
         public CrossCheckReport[] CrossChecks = new CrossCheckReport[0];
+        public AssetsReport Assets = null;
 
         public static StatusReport Read(WireReader reader)
         {
@@ -3860,6 +3907,7 @@ namespace IrisSession.Protocol
                     case "media": value.Media = reader.ReadArray(Protocol.MediaStreamReport.Read); break;
                     case "anchors": value.Anchors = reader.ReadArray(Protocol.AnchorReport.Read); break;
                     case "cross_checks": value.CrossChecks = reader.ReadArray(Protocol.CrossCheckReport.Read); break;
+                    case "assets": value.Assets = reader.TryReadNil() ? null : AssetsReport.Read(reader); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -3869,7 +3917,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(32);
+            writer.WriteMapHeader(33);
             writer.Write("type");
             writer.Write(TagName);
             writer.Write("request_id");
@@ -3934,6 +3982,8 @@ namespace IrisSession.Protocol
             writer.Write(Anchors);
             writer.Write("cross_checks");
             writer.Write(CrossChecks);
+            writer.Write("assets");
+            writer.Write(Assets);
         }
     }
 

@@ -561,6 +561,18 @@ export interface MediaStreamReport {
 }
 
 /**
+ * The assets channel. `served`: assets of the present scene. Since the front began: `bytes_sent`, `requests`, and
+ * `refusals`, of requests and connections. `waiting`: connections that wait for something now.
+ */
+export interface AssetsReport {
+  served?: number;
+  bytes_sent?: number;
+  requests?: number;
+  refusals?: number;
+  waiting?: number;
+}
+
+/**
  * First message of a connection.
  *
  * `secret`: client-made 128-bit secret that stands for the key on plain loopback. `resume_token`: from the last
@@ -1008,6 +1020,7 @@ export interface StatusReport {
   media?: MediaStreamReport[];
   anchors?: AnchorReport[];
   cross_checks?: CrossCheckReport[];
+  assets?: AssetsReport | null;
 }
 
 /**
@@ -1490,7 +1503,7 @@ export const DEFAULTS = {
   event: {},
   snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
   paired: { roles: [] },
-  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [] },
+  status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
   participant_joined: { resumed: false },
   participant_changed: {},

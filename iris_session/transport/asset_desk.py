@@ -1,0 +1,114 @@
+"""Who may have which assets: the front's side of the assets channel. Tells its thread whenever something changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from iris_session.protocol.status import AssetsReport
+from iris_session.transport.asset_server import AssetServer, Table
+from iris_session.transport.clients import ClientTable, Connection
+from iris_session.transport.config import MILLISECOND, SceneInfo
+from iris_session.transport.keyring import Keyring
+from iris_session.transport.limiter import Drops
+from iris_session.transport.state_publisher import StatePublisher
+
+LOOK_NS: Final = 250 * MILLISECOND
+#: State that left so long after its tick is late: the bar for its whole way to a client is 3 ms.
+LATE_NS: Final = 2 * MILLISECOND
+#: Between two turns of the loop, which come every 10 ms.
+LATE_TURN_NS: Final = 25 * MILLISECOND
+#: How long assets hold back then.
+YIELD_NS: Final = 20 * MILLISECOND
+
+
+class AssetDesk:
+    """A `Service`. What the publisher's scene and the one before it name is served. `revoked(key)`: may do nothing."""
+
+    def __init__(
+        self,
+        server: AssetServer,
+        clients: ClientTable,
+        keyring: Keyring,
+        drops: Drops,
+        publisher: StatePublisher,
+        revoked: Callable[[str], bool],
+    ) -> None:
+        self._server = server
+        self._clients = clients
+        self._keyring = keyring
+        self._drops = drops
+        self._publisher = publisher
+        self._revoked = revoked
+        self._present: SceneInfo | None = None
+        self._stores: tuple[tuple[str, tuple[str, ...]], ...] = ()
+        self._told = Table()
+        self._counted: dict[str, int] = {}
+        self._next_ns = self._turned_ns = self._frames = 0
+        server.start()
+
+    def turn(self, now_ns: int) -> None:
+        """Lets in who came and out who left, at once; gives the state its way."""
+        if not self._server.alive:
+            raise RuntimeError("the thread of assets has ended")  # a new front does better
+        self._give_way(now_ns)
+        if self._publisher.scene is not self._present:
+            self._change(self._publisher.scene)
+        listeners = {n: self._user_of(one) for n, one in self._clients.by_number.items() if one.admitted}
+        look = now_ns >= self._next_ns
+        if look or listeners != self._told.listeners or self._stores is not self._told.stores:
+            self._tell(listeners)
+        if look:
+            self._next_ns = now_ns + LOOK_NS
+            self._count()
+
+    def close(self) -> None:
+        self._server.close()
+
+    def report(self) -> AssetsReport:
+        """For the status."""
+        tallied = self._server.tallied()
+        return AssetsReport(
+            sum(len(addresses) for _, addresses in self._stores[-1:]),
+            tallied.bytes,
+            tallied.requests,
+            sum(tallied.reasons.values()),
+            tallied.waiting,
+        )
+
+    def _give_way(self, now_ns: int) -> None:
+        """When state was late since the last turn, or this turn is."""
+        late = 0 < self._turned_ns < now_ns - LATE_TURN_NS
+        if self._publisher.frames != self._frames and self._publisher.delays_ns:
+            late |= self._publisher.delays_ns[-1] > LATE_NS
+        self._frames, self._turned_ns = self._publisher.frames, now_ns
+        if late:
+            self._server.late_until_ns = now_ns + YIELD_NS
+
+    def _change(self, scene: SceneInfo) -> None:
+        """Another scene: what only the one before the last named is served no more."""
+        before = self._stores[-1:] if self._present is not None else ()
+        self._present = scene
+        self._stores = (*before, (scene.asset_root, scene.assets))
+
+    def _tell(self, listeners: dict[int, str]) -> None:
+        keyring = self._keyring
+        marks = frozenset() if keyring.key is None else frozenset(m for m in keyring.marks if not self._revoked(m))
+        table = Table(listeners, marks, self._stores)
+        if table != self._told:
+            self._told = table
+            self._server.publish(table)
+
+    def _count(self) -> None:
+        for reason, count in self._server.tallied().reasons.items():
+            more = count - self._counted.get(reason, 0)
+            if more:
+                self._drops.count(reason, n=more)
+                self._counted[reason] = count
+
+    def _user_of(self, connection: Connection) -> str:
+        """The key of the TCP connections by which this connection may ask: of people behind a gateway, its."""
+        if self._keyring.key is None:
+            return ""
+        gateway = self._clients.by_number.get(connection.gateway)
+        return connection.key_id if gateway is None else gateway.key_id
