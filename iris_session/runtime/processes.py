@@ -46,9 +46,10 @@ from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replac
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
 from iris_session.transport.sockets import host_in_address
 
-#: Ports of media, from the port of state: 7723 and 7726 by default.
+#: Ports of media and assets, from the port of state: 7723, 7726 and 7724 by default.
 MEDIA_OFFSET: Final = 1
 INGEST_OFFSET: Final = 4
+ASSETS_OFFSET: Final = 2
 WATCH_PERIOD_NS: Final = 50_000_000
 #: What the recorder gets to take what is left, and one that was just started before.
 TAKING_S: Final = 5.0
@@ -163,6 +164,7 @@ class SessionProcesses:
             state_port=config.state_port,
             media_port=config.state_port + MEDIA_OFFSET if config.state_port else 0,
             media_ingest_port=config.state_port + INGEST_OFFSET if config.state_port else 0,
+            assets_port=config.state_port + ASSETS_OFFSET if config.state_port else 0,
             adapt_media=config.adapt_media,
             session_id=self.session_id,
             session_name=self.name,
