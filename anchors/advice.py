@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
-from anchors.groups import Sighting
+from anchors.groups import Group, Key
 from anchors.pose import Vec3, distance
 
 LOOK: Final = "look at the anchor sheet for a few seconds, from about half a metre"
@@ -38,14 +38,17 @@ def tilted(tilt_rad: float) -> str:
     )
 
 
-def size_advice(sightings: Iterable[tuple[str, Sighting]], tolerance: float) -> str:
+def size_advice(groups: Mapping[Key, Group], tolerance: float) -> str:
     """Warns about a sheet that is seen in several sizes; single measurements that are off do not count."""
-    sizes: dict[str, list[float]] = {}
-    for anchor_id, s in sightings:
-        if s.size_m > 0.0 and math.isfinite(s.size_m):
-            sizes.setdefault(anchor_id, []).append(s.size_m)
-    for anchor_id, seen in sizes.items():
-        seen.sort()
+    extremes: dict[str, tuple[float, float]] = {}
+    for (anchor_id, _), group in groups.items():
+        if group.sizes is not None:
+            low, high = extremes.get(anchor_id, group.sizes)
+            extremes[anchor_id] = (min(low, group.sizes[0]), max(high, group.sizes[1]))
+    for anchor_id, (least, most) in extremes.items():
+        if most - least <= tolerance * least:
+            continue  # then no quantiles are further apart
+        seen = sorted(size for (name, _), group in groups.items() if name == anchor_id for size in group.sizes_seen())
         low, high = seen[len(seen) // 10], seen[(9 * len(seen)) // 10 if len(seen) > 1 else 0]
         if high - low > tolerance * low:
             return f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"

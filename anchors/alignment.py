@@ -321,7 +321,7 @@ class AlignmentEstimator:
         elif tilt > self.config.tilt_warning_rad and self.config.dof == 4:
             advice = f"the headset's vertical is off by {math.degrees(tilt):.1f} deg: is the sheet level as configured?"
         else:
-            advice = size_advice(self._memory.sightings(), self.config.size_tolerance) or self._misprint()
+            advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint()
         return AlignmentEstimate(
             inverted(s.t, s.q),
             self.tracking_epoch,

@@ -5,8 +5,8 @@ Each group is merged (`anchors.robust`) at most once per change; everything can 
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -36,10 +36,12 @@ class Sighting(NamedTuple):
 
 @dataclass
 class Group:
-    """Sightings of one anchor from one viewpoint, oldest first."""
+    """Sightings of one anchor from one viewpoint, oldest first. `sizes`: the smallest and the largest [m] that was
+    measured, as of the last `solve`."""
 
     sightings: deque[Sighting] = field(default_factory=deque)
     merged: Merged | None = None
+    sizes: tuple[float, float] | None = None
     dirty: bool = True
 
     def solve(self, noise: NoiseModel, fallback: Array, min_agreeing: float) -> Merged | None:
@@ -49,7 +51,13 @@ class Group:
             q = np.array([s.q for s in self.sightings])
             common, each = self._noise(p, noise, fallback)
             self.merged, self.dirty = merge(p, q, common, each, min_agreeing), False
+            sizes = self.sizes_seen()
+            self.sizes = (min(sizes), max(sizes)) if sizes else None
         return self.merged
+
+    def sizes_seen(self) -> list[float]:
+        """Measured sizes [m]; 0 and what is no size stands for none."""
+        return [s.size_m for s in self.sightings if 0.0 < s.size_m < math.inf]
 
     def _noise(self, p: Array, noise: NoiseModel, fallback: Array) -> tuple[Array, Array]:
         """What the observers state comes first, then the model from where they stood, then the configured default."""
@@ -113,11 +121,6 @@ class Memory:
         if all(len(group.sightings) < enough for group in self.groups.values()):
             return self.groups
         return {key: group for key, group in self.groups.items() if len(group.sightings) >= _JUST_BEGUN}
-
-    def sightings(self) -> Iterator[tuple[str, Sighting]]:
-        for (anchor_id, _), group in self.groups.items():
-            for sighting in group.sightings:
-                yield anchor_id, sighting
 
     def _pop(self) -> None:
         key = self._order.popleft()

@@ -90,9 +90,10 @@ def problem(
     anchor: Sequence[str], p_world: Array, q_world: Array, merged: Sequence[Merged], age_s: Array, prior: Prior
 ) -> Problem:
     """Groups as arrays. Older ones are less certain: the tracking frame wanders."""
-    p = np.array([m.p for m in merged])
-    q = quat_multiply(np.array([m.q for m in merged]), quat_conjugate(q_world))
-    covariance = np.array([m.covariance for m in merged])
+    # Joined, not stacked: of small arrays that takes a third of the time.
+    p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
+    q = quat_multiply(np.concatenate([m.q for m in merged]).reshape(-1, 4), quat_conjugate(q_world))
+    covariance = np.concatenate([m.covariance for m in merged]).reshape(-1, 6, 6)
     if float(age_s.min()) < -_STEADY_S:
         walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
         covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]

@@ -34,6 +34,9 @@ def test_every_case_has_every_key_and_bar(report: BenchReport) -> None:
     held = {(b.key, b.op) for b in report.bars}
     assert held >= {(f"{case}.coverage_share", op) for case in CASES for op in ("<=", ">=")}
     assert {b.key: b.bound for b in report.bars}["one_sheet.at_2m_mm_p95"] == 26.0
+    timed = {f"{load}{what}_us_p50" for load in ("", "loaded_") for what in ("update", "add", "estimate")}
+    assert timed <= set(report.results)
+    assert ("loaded_update_us_p50", "<=") in held
     values = flat(report.as_dict()["results"])
     assert all(b.value == values[b.key] for b in report.bars)
     assert "one_sheet.sheet_mm_p95" in report.lines()
