@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from math import degrees
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.common import CommandError, add_json, add_way_to_session, print_json
+from iris_session.cli.common import CommandError, add_json, add_way_to_session, expect_session, print_json
 from iris_session.cli.live import printable
 from iris_session.cli.poses import add_pose
 from iris_session.cli.status import add_watch, asking, watch
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
 EVERYBODY: Final = "all"
+#: Further than this nobody carries a sheet: a wrong unit or digit.
+FAR_M: Final = 5.0
 #: Sheets that are told of per headset, those seen last first.
 MAX_SEEN: Final = 8
 
@@ -79,7 +81,7 @@ def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         "measured one is to be moved, which voids its stated error. Joins as a director.",
         epilog="examples:\n"
         "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
-        "  iris-session anchors place ann --offset --pose=-0.01,0,0,1,0,0,0      (a minus needs the `=`)",
+        "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
@@ -94,15 +96,16 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     one = actions.add_parser(
         "move",
         help="say where an anchor of the session is",
-        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor. Joins "
-        "as a director.",
+        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
+        f"what is measured. Further than {FAR_M:g} m only with --force. Joins as a director.",
         epilog="examples:\n"
         "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
-        "  iris-session anchors move table --pose=-0.2,0.1,0,0.7071068,0,0,0.7071068      (a minus needs the `=`)",
+        "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
     add_pose(one, "T_world_anchor")
+    one.add_argument("--force", action="store_true", help=f"also further than {FAR_M:g} m from where it is")
     add_way_to_session(one, option=True)
     add_json(one)
     one.set_defaults(run=run_move)
@@ -116,6 +119,7 @@ def directing(arguments: argparse.Namespace) -> Iterator[Client]:
     """A director in the session that is meant."""
     from iris_session.client import Client
 
+    expect_session(arguments)
     with Client(
         arguments.address,
         session=arguments.session,
@@ -165,13 +169,39 @@ def run_place(arguments: argparse.Namespace) -> int:
 
 
 def run_move(arguments: argparse.Namespace) -> int:
+    """Whoever is not measured, or no more, is told of: their alignments stay."""
+    from anchors.pose import distance
+
     with directing(arguments) as client:
+        report = client.status()
+        was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
+        away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
+        if away_m > FAR_M and not arguments.force:
+            raise CommandError(
+                f"anchor '{arguments.anchor}' would be moved by {away_m:.1f} m; more than {FAR_M:g} m needs --force "
+                "(poses are in metres)"
+            )
         client.move_anchor(arguments.anchor, arguments.pose)
+    stay = {one.id: f"{one.name} ({one.id}): {why}" for one in headsets(report) if (why := stays(one))}
+    follow = [one for one in headsets(report) if one.id not in stay]
     if arguments.json:
-        print_json({"ok": True, "anchor": arguments.anchor})
-    else:
-        print(printable(f"anchor '{arguments.anchor}' moved: the alignments to it follow"))
+        ids = {"follow": [one.id for one in follow], "stay": list(stay)}
+        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
+        return 0
+    by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
+    print(printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
+    for line in stay.values():
+        print(printable(f"    not that of {line}"))
     return 0
+
+
+def stays(p: ParticipantReport) -> str:
+    """Why an alignment does not follow an anchor that is moved; empty: it does, as far as it rests on that anchor."""
+    if p.alignment_report is not None and not p.alignment_report.running:
+        return f"its run is stopped; `iris-session anchors align start {p.id}`"
+    if p.alignment == AlignmentKind.PLACED:
+        return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
+    return ""
 
 
 def chosen(client: Client, word: str, *, several: bool = True) -> list[ParticipantInfo]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import socket
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 
@@ -14,6 +16,10 @@ if TYPE_CHECKING:
     import mujoco
 
     from iris_session.runtime.scenes import Scene
+
+
+#: Whatever is there has taken a connection by then.
+CONNECT_S: Final = 2.0
 
 
 class CommandError(Exception):
@@ -86,6 +92,33 @@ def add_way_to_session(
         parser.add_argument("address", nargs="?", default="", help=text)
     parser.add_argument("--session", default="", metavar="NAME", help="a session by its name instead of an address")
     parser.add_argument("--code", default="", help=code)
+
+
+def expect_session(arguments: argparse.Namespace) -> None:
+    """Raises `CommandError` within `CONNECT_S` where nothing listens at the address that was given: a client would wait
+    for it to begin. A session by its name has no address yet."""
+    from iris_session.client.address import Address
+    from iris_session.client.joining import LOCAL
+    from iris_session.client.resolving import resolve
+
+    if arguments.session:
+        return
+    address = Address.parse(arguments.address or LOCAL)
+    until_s = time.monotonic() + CONNECT_S
+    looking = resolve(address.host, until_s)
+    try:
+        while True:
+            try:
+                next(looking)
+            except StopIteration as found:
+                socket.create_connection((found.value, address.port), max(0.1, until_s - time.monotonic())).close()
+                return
+            time.sleep(0.005)
+    except OSError as error:
+        raise CommandError(
+            f"no session answers at {address}: is `iris-session serve` running there? "
+            f"(TCP port {address.port}: {error.strerror or error})"
+        ) from None
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 from iris_session.cli.common import CommandError, add_way_to_session, positive_seconds
 
@@ -60,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--headset name=ann,model.drift_m_per_min=0.03,bump_at_s=20,glance_every_s=5"
         )
     headsets = arguments.headset or [
-        f"name={arguments.behaviour}{i + 1},behaviour={arguments.behaviour},robot={arguments.robot},"
+        f"name={arguments.behaviour}{i + 1}-{os.getpid()},behaviour={arguments.behaviour},robot={arguments.robot},"
         f"seed={arguments.seed + i}{_headset_options(arguments)}"
         for i in range(arguments.count)
     ]

@@ -10,6 +10,7 @@ from importlib.metadata import version
 
 from iris_session.cli import anchors, bench, demo, doctor, emulate, keys, pair, robots, serve, sessions, status, verify
 from iris_session.cli.common import CommandError, expected_errors
+from iris_session.cli.poses import joined
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand a hammer over
@@ -44,7 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit status."""
-    arguments = build_parser().parse_args(argv)
+    arguments = build_parser().parse_args(joined(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError
 

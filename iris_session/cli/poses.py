@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from anchors.pose import PoseTuple
 
 FORM: Final = "X,Y,Z,QW,QX,QY,QZ"
+#: Numbers with a comma between them, the first negative: no option looks like that.
+_BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
 
 
 def pose(text: str) -> PoseTuple:
@@ -27,7 +31,20 @@ def pose(text: str) -> PoseTuple:
     return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
 
 
+def joined(words: Sequence[str]) -> list[str]:
+    """Words of a command line, where a pose that begins with a minus is joined to its option: alone it would be read as
+    an option itself."""
+    out: list[str] = []
+    for word in words:
+        if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
 def add_pose(parser: argparse.ArgumentParser, what: str) -> None:
     """`--pose`, which must be given."""
-    text = f"{what}: metres, unit quaternion with w first; one that begins with a minus as --pose=-0.1,..."
-    parser.add_argument("--pose", type=pose, required=True, metavar=FORM, help=text)
+    parser.add_argument(
+        "--pose", type=pose, required=True, metavar=FORM, help=f"{what}: metres, unit quaternion with w first"
+    )

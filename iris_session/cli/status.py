@@ -11,7 +11,14 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Final, Protocol
 
-from iris_session.cli.common import CommandError, add_json, add_way_to_session, positive_seconds, print_json
+from iris_session.cli.common import (
+    CommandError,
+    add_json,
+    add_way_to_session,
+    expect_session,
+    positive_seconds,
+    print_json,
+)
 from iris_session.cli.live import printable
 
 if TYPE_CHECKING:
@@ -77,6 +84,7 @@ def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport
     how it does."""
     from iris_session.client import Client, NotConnectedError, RequestTimeoutError
 
+    expect_session(arguments)
     client = Client(
         arguments.address,
         session=arguments.session,

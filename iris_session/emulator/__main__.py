@@ -91,7 +91,9 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
         for key in LISTS & pairs.keys():
             pairs[key] = [float(value) for value in pairs[key].split("/")]
-        specs.append(msgspec.convert(_nested(pairs), HeadsetSpec, strict=False))
+        nested = _nested(pairs)
+        _check_fields(nested, HeadsetSpec)
+        specs.append(msgspec.convert(nested, HeadsetSpec, strict=False))
     if not specs:
         raise ValueError("no headset: give --headset name=ann,behaviour=giver,robot=left or --specs FILE")
     given = {"curve_server": options.curve_server, "curve_key": options.curve_key}
@@ -112,6 +114,21 @@ def _nested(pairs: Mapping[str, Any]) -> dict[str, Any]:
             inner = inner.setdefault(part, {})
         inner[name] = value
     return nested
+
+
+def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: str = "") -> None:
+    """Raises `ValueError` that lists the fields there are, also those of a field."""
+    fields = {field.name: field.type for field in msgspec.structs.fields(kind)}
+    for name, value in pairs.items():
+        if name not in fields:
+            known = ", ".join(f"{path}{one}" for one in sorted(fields))
+            raise ValueError(f"--headset: there is no field '{path}{name}'; fields: {known}")
+        inner = fields[name]
+        whole = not (isinstance(inner, type) and issubclass(inner, msgspec.Struct))
+        if whole and isinstance(value, Mapping):
+            raise ValueError(f"--headset: '{path}{name}' has no fields of its own")
+        if isinstance(value, Mapping):
+            _check_fields(value, inner, f"{path}{name}.")
 
 
 def _read(path: str) -> bytes:

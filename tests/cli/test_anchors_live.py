@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -148,6 +149,9 @@ class Session:
     def move_anchor(self, anchor_id: str, pose: Any) -> None:
         self.asked.append((anchor_id, pose))
 
+    def status(self) -> StatusReport:
+        return REPORT
+
 
 @pytest.fixture
 def session(monkeypatch: pytest.MonkeyPatch) -> Session:
@@ -213,14 +217,48 @@ def test_one_denial_of_several_is_told_and_the_others_go_on(
 
 def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["anchors", "place", "ann", "--pose", "0.4,0,0,1,0,0,0"]) == 0
-    assert main(["anchors", "place", "p2", "--offset", "--pose=-0.01,0,0,1,0,0,0"]) == 0
+    assert main(["anchors", "place", "p2", "--offset", "--pose", "-0.01,0,0,1,0,0,0"]) == 0, "a minus is no option"
     assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,0,0,0,1", "--json"]) == 0
     assert session.asked == [
         ("p1", ((0.4, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), False),
         ("p2", ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), True),
         ("table", ((-0.2, 0.1, 0.0), (0.0, 0.0, 0.0, 1.0))),
     ]
-    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"ok": True, "anchor": "table"}
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
+    assert told == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": ["p2"]}
+
+
+def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first == "anchor 'table' moved by 50 mm: alignments that are measured to it follow (1)"
+    assert others == ["    not that of bob (p2): its run is stopped; `iris-session anchors align start p2`"]
+
+
+def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    far = ["anchors", "move", "table", "--pose", "450,-0.45,0,1,0,0,0"]
+    assert main(far) == 2
+    assert session.asked == []
+    assert "'table' would be moved by 450.0 m; more than 5 m needs --force" in capsys.readouterr().err
+    assert main([*far, "--force"]) == 0
+    assert [asked[0] for asked in session.asked] == ["table"]
+
+
+@pytest.mark.parametrize("command", [["status"], ["align", "start"], ["move", "table", "--pose", "0,0,0,1,0,0,0"]])
+def test_that_nobody_is_there_is_found_out_without_waiting(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing listens at the port: no client is made, which would wait for a session to begin."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # nobody else gets it, and it takes no connections
+        monkeypatch.setattr(Client, "open", lambda self: pytest.fail("waits"))
+        where = f"127.0.0.1:{taken.getsockname()[1]}"
+        there = [where] if command == ["status"] else ["--address", where]
+        assert main(["anchors", *command, *there]) == 2
+    err = capsys.readouterr().err
+    assert f"no session answers at {where}: is `iris-session serve` running there? (TCP port" in err
+    assert "refused" in err
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from iris_session.cli.main import main
@@ -13,3 +15,19 @@ def test_what_is_for_nameless_people_is_refused_beside_named_ones(
 ) -> None:
     assert main(["emulate", "127.0.0.1:1", "--headset", "name=ann", *option]) == 2
     assert "model.drift_m_per_min" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("headset", "said"),
+    [
+        ("name=ann,drift=3", r"there is no field 'drift'; fields: T_world_anchor, anchor_id, .*, drift_m_per_min, "),
+        ("name=ann,model.drift=3", r"there is no field 'model.drift'; fields: .*model\.drift_m_per_min, "),
+        ("name=ann,model.sheet.far=3", r"there is no field 'model.sheet.far'; fields: model\.sheet\.across, "),
+        ("name=ann,seed.x=3", "'seed' has no fields of its own"),
+    ],
+)
+def test_a_field_that_there_is_not_is_told_with_those_there_are(
+    headset: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["emulate", "127.0.0.1:1", "--headset", headset]) == 2
+    assert re.search(said, capsys.readouterr().err)

@@ -138,7 +138,9 @@ def test_emulated_people_whom_no_session_lets_in_have_failed(capsys: pytest.Capt
         port = taken.getsockname()[1]  # somebody listens there, but it is no session
         assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2", "--count", "2"]) == 1
         errors = capsys.readouterr().err.splitlines()
-        assert [line.split(": ")[:2] for line in errors] == [["iris-session", "wander1"], ["iris-session", "wander2"]]
+        assert [line.split(": ")[:2] for line in errors] == [
+            ["iris-session", f"wander{i}-{os.getpid()}"] for i in (1, 2)
+        ], "two commands with nothing said have people of different names"
         assert all(f"no session let us in at 127.0.0.1:{port} within 0.2 s" in line for line in errors)
         assert main(["emulate", f"127.0.0.1:{port}", "--behaviour", "observer", "--seconds", "0.1"]) == 1
         assert "no session let us in" in capsys.readouterr().err
