@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import CommandError, add_json, print_json
 from iris_session.keys.allow_list import DEFAULT_ROLES
+from iris_session.keys.files import KeysBusyError
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -165,8 +166,11 @@ def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
     while True:
         if home.codes.signature != seen:
             seen = home.codes.signature
-            with home.folder.locked():  # held from the use of a code until the key is on the list
-                now = home.codes.find(made.id)
+            try:
+                with home.folder.locked():  # held from the use of a code until the key is on the list
+                    now = home.codes.find(made.id)
+            except KeysBusyError:  # whoever holds it has a slow disk: the code is good all the same
+                seen, now = None, made
             if now is None or now.paired or not now.open(time.time()):
                 break
         if time.time() >= made.expires:

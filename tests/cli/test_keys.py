@@ -6,7 +6,7 @@ import json
 import os
 import threading
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,8 @@ from zmq.auth import create_certificates
 
 from iris_session.cli.main import main
 from iris_session.client.address import Address
-from iris_session.keys import KeyHome, KeyPair, KeysError, SessionNote
+from iris_session.keys import KeyHome, KeyPair, KeysBusyError, KeysError, SessionNote
+from iris_session.keys.files import PrivateFolder
 from iris_session.protocol import pairing
 
 Capture = pytest.CaptureFixture[str]
@@ -141,6 +142,28 @@ def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
     monkeypatch.setattr("iris_session.cli.pair.time.sleep", interrupt)
     assert main(["pair"]) == 130
     assert lab.codes.expiries(lab.server_key().fingerprint) == ()
+
+
+def test_pair_waits_on_while_another_process_holds_the_list(
+    lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A code is good for minutes, whatever a slow disk does meanwhile."""
+    busy = iter([True, True])
+    locked = PrivateFolder.locked
+    asked: list[float] = []
+
+    def slow(folder: PrivateFolder, patience_s: float = 5.0) -> AbstractContextManager[None]:
+        if asked and next(busy, False):
+            raise KeysBusyError("another process is changing it: try again")
+        asked.append(patience_s)
+        return locked(folder, patience_s)
+
+    monkeypatch.setattr(PrivateFolder, "locked", slow)
+    assert main(["pair", "--minutes", "0.02"]) == 1
+    assert next(busy, None) is None
+    said = capsys.readouterr()
+    assert "expired: nobody used it" in said.out
+    assert said.err == ""
 
 
 @pytest.mark.parametrize("full", [False, True])
