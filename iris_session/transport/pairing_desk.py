@@ -40,6 +40,8 @@ MAX_WAITING: Final = 32
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
 MAX_ADDRESSES: Final = 1024
+#: Codes that could not be read (no descriptor left, a network drive) are read again after so long.
+AGAIN_S: Final = 1.0
 REVOKED: Final = "this key was revoked just now"
 BUSY: Final = "the list of keys is busy"
 SHUT_OUT: Final = "too many wrong codes from this address"
@@ -68,6 +70,7 @@ class PairingDesk:
         self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
+        self._unread, self._again_s = "", 0.0  # why the codes could not be read, and when they are read again
         self._codes: tuple[float, ...] = ()  # when the open codes expire, UTC seconds
 
     @property
@@ -76,14 +79,22 @@ class PairingDesk:
         home, key = self._keyring.home, self._keyring.key
         if home is None or key is None:
             return False
-        if home.codes.signature != self._signature:
-            self._signature = home.codes.signature
-            try:
-                self._codes = home.codes.expiries(key.fingerprint)
-            except KeysError as error:
-                self._codes = ()
-                self._say(error)
+        signature = home.codes.signature
+        if signature != self._signature or (self._unread and time.monotonic() >= self._again_s):
+            self._signature = signature
+            self._read_codes(home, key)
         return any(time.time() < expires for expires in self._codes)
+
+    def _read_codes(self, home: KeyHome, key: KeyPair) -> None:
+        """What cannot be read now is read again a second later, and complained about once."""
+        try:
+            self._codes, unread = home.codes.expiries(key.fingerprint), ""
+        except KeysError as error:
+            self._codes, unread = (), str(error)
+            self._again_s = time.monotonic() + AGAIN_S
+            if unread != self._unread:
+                self._say(error)
+        self._unread = unread
 
     def take(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
         """One `Pair` of a key that is on the list, or is not."""

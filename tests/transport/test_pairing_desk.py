@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.keys import KeyHome, KeyPair
+from iris_session.keys import KeyHome, KeyPair, KeysError
 from iris_session.protocol import pairing
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
@@ -20,7 +20,7 @@ from iris_session.transport.clients import ClientTable, Peer, Route
 from iris_session.transport.config import SECOND
 from iris_session.transport.keyring import STRANGER, Keyring
 from iris_session.transport.limiter import Drops
-from iris_session.transport.pairing_desk import BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
+from iris_session.transport.pairing_desk import AGAIN_S, BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
 from iris_session.transport.resume_tokens import ResumeTokens
 from iris_session.transport.revocation import LOOK_NS, Revocation
 from tests.transport.slow_disk import slow_disk, turns
@@ -252,3 +252,28 @@ def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeyp
         desk.turn()
         assert {desk.answer(own).message for own in waiting} == {"the list of keys is busy"}
     assert isinstance(desk.answer(first), Paired)
+
+
+def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No descriptor is left for a while, and the file does not change meanwhile."""
+    desk, now_s, tries = Desk(tmp_path / "home"), 1000.0, 0
+    desk.home.codes.make(desk.server)
+    with monkeypatch.context() as patch:
+
+        def fails(_server: str) -> tuple[float, ...]:
+            nonlocal tries
+            tries += 1
+            raise KeysError("Too many open files")
+
+        patch.setattr(desk.home.codes, "expiries", fails)
+        patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
+        for _ in range(3):
+            assert not desk.desk.open
+        now_s += AGAIN_S
+        assert not desk.desk.open
+    assert tries == 2
+    assert capsys.readouterr().err.count("Too many open files") == 1
+    monkeypatch.setattr(pairing_desk.time, "monotonic", lambda: now_s + AGAIN_S)
+    assert desk.desk.open
