@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Final, TypeVar
 
@@ -64,11 +65,12 @@ class FileWorker:
         """Waits a moment for what was asked for; nobody is told any more."""
         if self._thread is None:
             return
+        until_s = time.monotonic() + CLOSE_S
         try:
             self._jobs.put(None, timeout=CLOSE_S)
         except queue.Full:
             return
-        self._thread.join(CLOSE_S)
+        self._thread.join(max(0.0, until_s - time.monotonic()))
 
     def _run(self) -> None:
         while True:

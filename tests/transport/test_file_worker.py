@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
 from iris_session.keys import KeysError
-from iris_session.transport.file_worker import CAPACITY, FileWorker
+from iris_session.transport import file_worker
+from iris_session.transport.file_worker import CAPACITY, CLOSE_S, FileWorker
 from tests.transport.slow_disk import turns
 
 
@@ -60,6 +62,27 @@ def test_a_job_that_hangs_keeps_nobody_and_no_more_than_a_few_wait() -> None:
     disk.set()
     turns(files.turn, lambda: len(told) == 1 + CAPACITY)
     assert told[0] == "slow"
+    files.close()
+
+
+def test_the_end_has_one_bound_for_all_that_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room in the queue first, then the thread."""
+    files = FileWorker()
+    files.submit(lambda: None, lambda _outcome, _now: None)
+    now_s, waited = 100.0, []
+
+    def put(_job: object, timeout: float) -> None:
+        nonlocal now_s
+        now_s += 0.7 * timeout
+
+    thread = files._thread
+    assert thread is not None
+    monkeypatch.setattr(file_worker, "time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(files._jobs, "put", put)
+    monkeypatch.setattr(thread, "join", waited.append)
+    files.close()
+    assert waited == [pytest.approx(0.3 * CLOSE_S)]
+    monkeypatch.undo()
     files.close()
 
 
