@@ -56,6 +56,8 @@ class Recorder(Protocol):
 
     def restart(self) -> None: ...
 
+    def close(self, timeout_s: float) -> bool: ...
+
 
 class RecorderSupervisor:
     """Watches one recorder. All but the thread's work belongs to the tick loop, which never waits here.
@@ -68,6 +70,7 @@ class RecorderSupervisor:
         self._recorder = recorder
         self._backoff = Backoff()
         self._thread: threading.Thread | None = None
+        self._given_up = threading.Event()
         self._news: tuple[str, str] | None = None  # why it ended, and what became of it
         self._failed_ns = 0
         self.alive = True
@@ -102,14 +105,18 @@ class RecorderSupervisor:
         return told
 
     def close(self, patience_s: float = CLOSING_S) -> None:
-        """Waits for the thread: the process is the caller's from here on. One that a disk keeps is left to itself."""
+        """Waits for the thread: the process is the caller's from here on. One that a disk keeps is left to itself, and
+        ends the successor that it may still start: nobody would look after that one."""
         if self._thread is not None:
             self._thread.join(patience_s)
+            self._given_up.set()
             self._thread = None
 
     def _replace(self) -> None:
         failure = self._recorder.failure or "the recorder ended"
         self._news = failure, replaced(self._recorder.restart)
+        if self._given_up.is_set():
+            self._recorder.close(0.0)
 
 
 def replaced(restart: Callable[[], None], error_type: type[Exception] = RecordingError) -> str:

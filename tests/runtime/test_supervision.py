@@ -54,6 +54,7 @@ class Recorder:
         self.disk = threading.Event()
         self.refused = False
         self.readers: list[threading.Thread] = []
+        self.closed = threading.Event()
 
     @property
     def failure(self) -> str:
@@ -65,6 +66,11 @@ class Recorder:
         if self.refused:
             raise RecordingError("no room for its log")
         self.alive = True
+
+    def close(self, timeout_s: float) -> bool:
+        self.alive = False
+        self.closed.set()
+        return True
 
 
 def _until(look: Callable[[], list[str]]) -> list[str]:
@@ -126,6 +132,7 @@ def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -
     recorder.disk.set()
     supervisor.close()
     assert recorder.alive
+    assert not recorder.closed.is_set(), "it writes what is left"
 
 
 def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
@@ -136,3 +143,5 @@ def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
     supervisor.close(0.05)
     assert not recorder.alive, "and its disk has not answered yet"
     recorder.disk.set()
+    assert recorder.closed.wait(30.0), "nobody would look after the successor that is started now"
+    assert not recorder.alive
