@@ -19,19 +19,21 @@ if TYPE_CHECKING:
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "demo",
-        help="emulated operators hand things over, in one of three scenes",
+        help="emulated operators hand things over, fold a cloth, or stow soft bodies",
         description="Runs a whole session with emulated people in other processes. Exit status 0 only if every object "
-        "really changed hands by contact alone and the recording verifies bit for bit.\n\n"
+        "really changed hands by contact alone (or was folded, or stowed) and the recording verifies bit for bit.\n\n"
         "  handover   arms drawn from primitives hand a hammer over; needs no data\n"
         "  iiwa       the same with KUKA iiwa 14 arms\n"
-        "  aloha      two ALOHA stations: two people with two arms each exchange a red and a blue board\n\n"
+        "  aloha      two ALOHA stations: two people with two arms each exchange a red and a blue board\n"
+        "  cloth      two people fold a cloth: each takes a corner\n"
+        "  soft       two people stow a soft body each in one box\n\n"
         "The models of iiwa and aloha come from the folder that IRIS_DATA names.",
         epilog="examples:\n  iris-session demo handover\n  iris-session demo handover --seed 7 --json\n"
         "  iris-session demo handover --operators 8 --observers 8\n  iris-session demo aloha --profile busy-wifi\n"
         "  iris-session demo iiwa --latency 40",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("demo", choices=("handover", "iiwa", "aloha"))
+    parser.add_argument("demo", choices=("handover", "iiwa", "aloha", "cloth", "soft"))
     parser.add_argument(
         "--operators", type=int, default=2, metavar="N", help="people who drive, in pairs; 2 to 8 (default: 2)"
     )
@@ -101,6 +103,7 @@ def summary(result: DemoResult) -> str:
         f"  handover of {h.object}: {h.giver} -> {h.receiver} at {h.at_s:.1f} s, both held it for {h.duration_s:.2f} s"
         for h in result.handovers
     ]
+    lines += [f"  {g.deformable} {g.goal} at {g.at_s:.1f} s" for g in result.goals if g.at_s is not None]
     lines += [
         f"  alignment of {name}: stated {a['stated_p95']:.1f} mm (95 %), true {a['at_sheet']:.1f} mm at the sheet"
         for name, a in result.alignment_mm.items()

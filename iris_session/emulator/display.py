@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from anchors.pose import PoseTuple, compose
+from collections.abc import Sequence
+
+from anchors.pose import PoseTuple, Vec3, compose
 from iris_session.client import Client, PoseBuffer, SceneState, Shown
 from iris_session.client.scene_view import pose_at
 
@@ -14,6 +16,7 @@ class Display:
         self._client = client
         self.buffer = PoseBuffer(int(delay_s * 1e9))
         self.hands: dict[str, PoseTuple] = {}
+        self._vertices: dict[str, Sequence[Sequence[float]]] = {}
         self._epoch = 0
         self._shown: Shown | None = None
         self._now_ns = 0
@@ -24,6 +27,10 @@ class Display:
             self._epoch = state.header.scene_epoch
             self.buffer.clear()
         self.buffer.add(state.header.session_time, state.poses)
+
+    def take_vertices(self, deformable: str, p_world: Sequence[Sequence[float]]) -> None:
+        """New positions of all vertices of a deformable came [m], in the order of the model."""
+        self._vertices[deformable] = p_world
 
     def refresh(self, session_ns: int) -> None:
         """The next picture."""
@@ -50,6 +57,13 @@ class Display:
         tip = self._client.mirror.tip(robot)
         body = None if tip is None else self._pose(tip[0])
         return None if tip is None or body is None else compose(body, tip[1])
+
+    def vertex(self, deformable: str, index: int) -> Vec3 | None:
+        vertices = self._vertices.get(deformable, ())
+        if not 0 <= index < len(vertices):
+            return None
+        x, y, z = vertices[index]
+        return (float(x), float(y), float(z))
 
     def lease_version(self, robot: str) -> int | None:
         return self._client.lease_version(robot)

@@ -25,6 +25,7 @@ from iris_session.physics.errors import (
     SnapshotError,
     one_line,
 )
+from iris_session.physics.flexes import Flexes
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.physics.names import body_names, element_id, element_names
 from iris_session.physics.specs import check_specs
@@ -99,6 +100,8 @@ class World:
         tree = Tree(model)
         self._tables = ContactTables(model, robots, objects, tree)
         self._view = LiveView(model, self.data, robots, objects, self._tables)
+        #: Deformables: where their vertices are after the last tick, and who touches them.
+        self.flexes = Flexes(model, self.data, robots, self._tables)
         self.bodies = _body_infos(model, tree, objects)
         ids = [b.id for b in self.bodies]
         whole = bool(ids) and ids == list(range(ids[0], ids[0] + len(ids)))

@@ -1,7 +1,8 @@
 """Runs a demo: a session in this process, emulated people in others, and a result that says whether it worked.
 
-It counts only if the session's own detector saw every object change hands by contact alone, and if the recording
-verifies bit for bit. What is played is in `plays`.
+It counts only if the session's own detector saw every object change hands by contact alone, if every goal with a
+deformable was reached (`goals`; told in the recording as the verdict of an episode), and if the recording verifies bit
+for bit. What is played is in `plays`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from typing import Any, Final, Self
 import msgspec
 
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
+from iris_session.protocol.client_messages import Episode
+from iris_session.protocol.names import EpisodeAction
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.goals import GoalWatch
 from iris_session.runtime.links import address_over, link_address, links_before
 from iris_session.runtime.plays import Play
 from iris_session.runtime.session import Session
@@ -30,6 +34,8 @@ from iris_session.runtime.verification import verify_recording
 READ_PERIOD_NS: Final = 100_000_000
 #: Until the session that the demo itself started lets its people in: a busy machine may take its time.
 JOIN_TIMEOUT_S: Final = 60.0
+#: So long a deformable may take to come to rest after everybody is done [s].
+SETTLE_S: Final = 3.0
 #: People who work share a process in pairs, people who only look in fours.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
@@ -107,6 +113,14 @@ def _nan_for_null(line: bytes) -> bytes:
     return msgspec.json.encode({key: value for key, value in pairs.items() if value is not None})
 
 
+class GoalStatus(msgspec.Struct, frozen=True):
+    """What became of a goal: `at_s` of simulated time it was reached, `None` when it was not."""
+
+    deformable: str
+    goal: str
+    at_s: float | None
+
+
 class DemoResult(msgspec.Struct, frozen=True):
     """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet; nobody who
     never was aligned."""
@@ -127,6 +141,7 @@ class DemoResult(msgspec.Struct, frozen=True):
     real_time_factor: float = 0.0
     notes: tuple[str, ...] = ()
     interrupted: bool = False
+    goals: tuple[GoalStatus, ...] = ()
 
 
 def run_demo(
@@ -144,6 +159,7 @@ def run_demo(
     session = Session(
         play.model, config=dataclasses.replace(config, anchors=play.anchors, anchor_sizes=play.anchor_sizes)
     )
+    judge = _Judge(play, session)
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
@@ -161,10 +177,11 @@ def run_demo(
             update()
             now_ns = session.clock()
             began_ns = began_ns or now_ns  # making the loop ready is no part of its pace
+            judge.look()
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            return people.finished()
+            return people.finished() and judge.settled()
 
         session.run(seconds=timeout_s + 5.0, until=finished)
         run_s = max(session.clock() - began_ns, 1) * 1e-9
@@ -177,6 +194,8 @@ def run_demo(
     # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
     problems = ["interrupted before its end"] if interrupted else _problems(play, reports, status, timeout_s)
+    if not interrupted:
+        problems += judge.problems()
     if verified is False:
         problems.append(verification)
     return DemoResult(
@@ -200,7 +219,54 @@ def run_demo(
         problems=tuple(problems),
         notes=play.notes,
         interrupted=interrupted,
+        goals=judge.status(),
     )
+
+
+class _Judge:
+    """Follows the goals of a play, tick by tick, and has the verdict recorded as that of an episode."""
+
+    def __init__(self, play: Play, session: Session) -> None:
+        self._name = play.name
+        self._session = session
+        self._watches = tuple(GoalWatch(goal) for goal in play.goals)
+        self._began = False
+        self._finished_s: float | None = None
+
+    def look(self) -> None:
+        """After every tick."""
+        if not self._watches:
+            return
+        if not self._began:
+            self._began = True
+            self._session.post(Episode(0, EpisodeAction.START, self._name))
+        world = self._session.stepper.core.world
+        now_s, reached = world.view().sim_time, False
+        for watch in self._watches:
+            name = watch.goal.deformable
+            reached |= watch.observe(now_s, world.flexes.vertices(name), world.flexes.touching(name))
+        if reached and all(watch.at_s is not None for watch in self._watches):
+            self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
+
+    def settled(self) -> bool:
+        """Asked when everybody is done: whether the goals are reached, or evidently will not be."""
+        now_s = self._session.clock() * 1e-9
+        self._finished_s = now_s if self._finished_s is None else self._finished_s
+        return all(watch.at_s is not None for watch in self._watches) or now_s - self._finished_s > SETTLE_S
+
+    def status(self) -> tuple[GoalStatus, ...]:
+        return tuple(
+            GoalStatus(w.goal.deformable, w.goal.name, None if w.at_s is None else round(w.at_s, 3))
+            for w in self._watches
+        )
+
+    def problems(self) -> list[str]:
+        """The goals that were not reached."""
+        return [
+            f"the {w.goal.deformable} was not {w.goal.name}, let go and at rest"
+            for w in self._watches
+            if w.at_s is None
+        ]
 
 
 def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:

@@ -1,7 +1,8 @@
 """What is played in the demos: for each a scene, where its sheet lies, and who does what. Nothing runs here.
 
 `handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; always there.
-`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two people with two arms each.
+`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two people with two arms each. `cloth`: two people
+fold a cloth. `soft`: two people stow a soft body each.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ import mujoco
 from anchors.pose import PoseTuple, Vec3
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID
 from iris_session.emulator.specs import HandTask, HeadsetSpec
+from iris_session.physics.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, RADIUS
 from iris_session.physics.scenes.generators import arm_names, bearing_of, circle_radius
 from iris_session.physics.scenes.iiwa import iiwa_radius
 from iris_session.protocol.names import Device
 from iris_session.runtime.errors import ConfigError
-from iris_session.runtime.scenes import Scene, aloha, arms, iiwa, scene_by_name
+from iris_session.runtime.goals import FoldGoal, Goal, StowGoal
+from iris_session.runtime.scenes import Scene, aloha, arms, cloth, iiwa, scene_by_name, soft
 
 MOST_OPERATORS: Final = 8
 MOST_OBSERVERS: Final = 16
@@ -33,7 +36,8 @@ _BEHIND, _EYES = 0.45, 0.55
 
 @dataclass(frozen=True)
 class Play:
-    """A demo ready to run. `objects`: what must change hands. `notes`: what a reader should know about the cast."""
+    """A demo ready to run. `objects`: what must change hands. `goals`: what must be reached with deformables. `notes`:
+    what a reader should know about the cast."""
 
     name: str
     model: mujoco.MjModel
@@ -42,6 +46,7 @@ class Play:
     objects: tuple[str, ...]
     notes: tuple[str, ...] = ()
     anchor_sizes: Mapping[str, float] = field(default_factory=dict)
+    goals: tuple[Goal, ...] = ()
 
 
 def make_play(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Play:
@@ -165,7 +170,60 @@ def _aloha(operators: int, seed: int) -> Play:
     return dataclasses.replace(play, people=people)
 
 
-PLAYS: Final[dict[str, Callable[[int, int], Play]]] = {"handover": _handover, "iiwa": _iiwa, "aloha": _aloha}
+# --- things that bend -------------------------------------------------------------------------------------------------
+
+
+def _cloth(operators: int, seed: int) -> Play:
+    goals = (FoldGoal("cloth", FOLD_PAIRS),)
+    return _at_table("cloth", operators, seed, cloth(), goals, ("folder", "folder"), ("cloth", "cloth"))
+
+
+def _soft(operators: int, seed: int) -> Play:
+    goals = tuple(StowGoal(name, BOX_LOW, BOX_HIGH) for name in ("rose", "mint"))
+    return _at_table("soft", operators, seed, soft(), goals, ("stower", "stower"), ("rose", "mint"))
+
+
+def _at_table(
+    name: str,
+    operators: int,
+    seed: int,
+    scene: Scene,
+    goals: tuple[Goal, ...],
+    behaviours: tuple[str, str],
+    things: tuple[str, str],
+) -> Play:
+    """Two people side by side before the sheet, one arm each."""
+    if operators != 2:
+        raise ConfigError(
+            f"demo {name} has two arms at one table: 2 operators, not {operators}. For more people: "
+            "iris-session demo handover --operators N"
+        )
+    sheet = scene.anchors[DEFAULT_ANCHOR_ID]
+    left, right = arm_names(2)
+    people = tuple(
+        HeadsetSpec(
+            name=NAMES[i],
+            behaviour=behaviours[i],
+            robot=robot,
+            partner=partner,
+            object=things[i],
+            seed=seed + i,
+            eye=_seat(i, operators, RADIUS, sheet[0]),
+            T_world_anchor=sheet,
+        )
+        for i, (robot, partner) in enumerate(((left, right), (right, left)))
+    )
+    play = _play(name, scene, ())
+    return dataclasses.replace(play, people=people, goals=goals)
+
+
+PLAYS: Final[dict[str, Callable[[int, int], Play]]] = {
+    "handover": _handover,
+    "iiwa": _iiwa,
+    "aloha": _aloha,
+    "cloth": _cloth,
+    "soft": _soft,
+}
 
 
 def _observer(i: int, count: int, sheet: PoseTuple, seed: int) -> HeadsetSpec:

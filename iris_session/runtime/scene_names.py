@@ -10,5 +10,7 @@ SCENE_NAMES: Final = {
     "arms": "eight arms around a table; arms1 to arms12 for another number",
     "iiwa": "two KUKA iiwa 14 around a table; iiwa1 to iiwa8 for another number",
     "aloha": "two ALOHA stations face to face, four arms",
+    "cloth": "two arms and a cloth",
+    "soft": "two arms, two soft bodies, an open box",
     "bodies": "300 bodies that fly about, no robot",
 }

@@ -16,6 +16,7 @@ from anchors.pose import IDENTITY_QUAT, PoseTuple
 from iris_session.physics import load_model
 from iris_session.physics.scenes import free_bodies_scene, n_arms_scene, scene_path
 from iris_session.physics.scenes.aloha import SHEET_Z, aloha_scene
+from iris_session.physics.scenes.deformables import cloth_scene, soft_scene
 from iris_session.physics.scenes.iiwa import iiwa_scene
 from iris_session.physics.scenes.parts import add_sheet, sheet_place
 from iris_session.runtime.config import DEFAULT_ANCHORS, DEFAULT_SHEET_M
@@ -56,6 +57,16 @@ def aloha() -> Scene:
     return Scene(aloha_scene().compile(), _sheet((0.0, 0.0, SHEET_Z)))
 
 
+def cloth() -> Scene:
+    """Two arms and a cloth between them."""
+    return Scene(cloth_scene().compile(), _sheet(sheet_place(2)))
+
+
+def soft() -> Scene:
+    """Two arms, a soft body before each, and an open box."""
+    return Scene(soft_scene().compile(), _sheet(sheet_place(2)))
+
+
 def packaged(name: str) -> Scene:
     """An MJCF file of the package."""
     return Scene(load_model(scene_path(name)))
@@ -72,6 +83,8 @@ SCENES: Final[dict[str, Callable[[], Scene]]] = {
     "arms": lambda: arms(8),
     "iiwa": lambda: iiwa(2),
     "aloha": aloha,
+    "cloth": cloth,
+    "soft": soft,
     "bodies": lambda: Scene(free_bodies_scene().compile()),
 }
 NUMBERED: Final[dict[str, Callable[[int], Scene]]] = {"arms": arms, "iiwa": iiwa}

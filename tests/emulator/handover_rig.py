@@ -19,7 +19,16 @@ from typing import Any
 
 import mujoco
 
-from anchors.pose import PoseTuple, distance, quat_from_rotvec, quat_from_yaw, quat_mul, quat_normalize
+from anchors.pose import (
+    IDENTITY_QUAT,
+    PoseTuple,
+    Vec3,
+    distance,
+    quat_from_rotvec,
+    quat_from_yaw,
+    quat_mul,
+    quat_normalize,
+)
 from iris_session.control.controller import Controller
 from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
 from iris_session.physics.objects import find_objects
@@ -77,6 +86,10 @@ class LateView:
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         return self._shown.get(f"tip:{robot}")
+
+    def vertex(self, deformable: str, index: int) -> Vec3 | None:
+        seen = self._shown.get(f"vertex:{deformable}:{index}")
+        return None if seen is None else seen[0]
 
     def lease_version(self, robot: str) -> int | None:
         return self.lease
@@ -136,6 +149,7 @@ class Rig:
     seed: int = 0
     object: str = "hammer"
     also: tuple[str, ...] = ()  # other objects that change hands
+    vertices: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # of deformables, which people watch
     shift: bool = True  # start the objects up to 30 mm and 20 deg from their places
     noise: tuple[float, float] = NOISE
     watch: Callable[[Rig, str], None] | None = None  # called at every change of an operator's phase
@@ -148,12 +162,12 @@ class Rig:
         model = self.model or mujoco.MjModel.from_xml_path(str(scene_path("handover")))
         self.robots, self.objects = find_robots(model), find_objects(model)
         self.world = World(model, self.robots, self.objects)
-        for name in (self.object, *self.also) if self.shift else ():
+        objects = tuple(filter(None, (self.object, *self.also)))
+        for name in objects if self.shift else ():
             self._shift_object(name)
         self.controller = Controller(model, self.robots, self.objects)
         self.controller.reset(self.world.data)
-        self.referees = {name: Referee(name) for name in (self.object, *self.also)}
-        self.referee = self.referees[self.object]
+        self.referees = {name: Referee(name) for name in objects}
         self.views = {robot: LateView(random.Random(self.rng.random()), self.noise) for robot in self.behaviours}
         self._commands = {spec.name: Command(spec.name, CommandKind.HOLD, HoldReason.NO_SAMPLE) for spec in self.robots}
         self._on_the_way: deque[tuple[float, HandInput]] = deque()
@@ -186,6 +200,11 @@ class Rig:
             for referee in self.referees.values():
                 referee.tick(self.world)
 
+    @property
+    def referee(self) -> Referee:
+        """Of the first object."""
+        return self.referees[self.object]
+
     def end_engagement(self, robot: str) -> None:
         """What the session does after a gap in the samples: the robot holds until the clutch was opened once."""
         self._commands[robot] = Command(robot, CommandKind.HOLD, HoldReason.STALE)
@@ -207,6 +226,10 @@ class Rig:
         for spec in self.robots:
             tip = self.world.view().tip_pose(spec.name)
             poses[f"tip:{spec.name}"] = (tip.p, tip.q)
+        for name, watched in self.vertices.items():
+            p_world = self.world.flexes.vertices(name)
+            for index in watched:
+                poses[f"vertex:{name}:{index}"] = (tuple(p_world[index].tolist()), IDENTITY_QUAT)
         for view in self.views.values():
             view.publish(self.now_s, poses)
 

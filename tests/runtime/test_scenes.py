@@ -31,7 +31,7 @@ def test_a_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("alohas", "Scenes: handover, arm, arms, iiwa, aloha, bodies"),
+        ("alohas", "Scenes: handover, arm, arms, iiwa, aloha, cloth, soft, bodies"),
         ("handover2", "Scenes: handover"),
         ("arms0", "scene 'arms0': .* 1 to 12"),
         ("iiwa9", "1 to 8"),

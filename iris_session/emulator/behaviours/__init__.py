@@ -1,21 +1,37 @@
 """Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
 
-`base` (the contract), `giver` and `receiver` (hand a thing over in mid-air), `wander` (motion without a task).
+`base` (the contract), `giver` and `receiver` (hand a thing over in mid-air), `folder` (folds a cloth with a partner),
+`stower` (stows a soft body), `wander` (motion without a task).
 """
 
 from __future__ import annotations
 
 from iris_session.emulator.behaviours.arms import arm_kind
 from iris_session.emulator.behaviours.base import Behaviour, HandInput, OperatorView
+from iris_session.emulator.behaviours.folder import Folder
 from iris_session.emulator.behaviours.giver import Giver
 from iris_session.emulator.behaviours.hands import Hands
 from iris_session.emulator.behaviours.receiver import Receiver
+from iris_session.emulator.behaviours.stower import Stower
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device
 
-__all__ = ["Behaviour", "Giver", "HandInput", "Hands", "Idle", "OperatorView", "Receiver", "Wander", "make_behaviour"]
+__all__ = [
+    "Behaviour",
+    "Folder",
+    "Giver",
+    "HandInput",
+    "Hands",
+    "Idle",
+    "OperatorView",
+    "Receiver",
+    "Stower",
+    "Wander",
+    "make_behaviour",
+]
 
-NAMES = ("giver", "receiver", "wander", "idle")
+NAMES = ("giver", "receiver", "folder", "stower", "wander", "idle")
+_WITH_PARTNER = ("giver", "receiver", "folder")
 
 
 def make_behaviour(
@@ -28,12 +44,13 @@ def make_behaviour(
     arm: str = "arm",
     place: tuple[float, float] | None = None,
 ) -> Behaviour:
-    """The behaviour `name` for `robot`. `partner`: the other robot of a handover; default the other of left and right.
-    `arm`: kind of both arms. `place`: where a receiver lays the thing (x, y [m], world); default before its robot.
+    """The behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of left and
+    right. `object`: a thing, or a deformable. `arm`: kind of both arms. `place`: where a receiver or stower lays it
+    (x, y [m], world); default before its robot.
 
     Raises `ValueError` naming what is available.
     """
-    if name in {"giver", "receiver"} and not partner:
+    if name in _WITH_PARTNER and not partner:
         if robot not in {"left", "right"}:
             raise ValueError(f"the {name} of '{robot}' needs a partner: the name of the other robot")
         partner = "right" if robot == "left" else "left"
@@ -42,6 +59,10 @@ def make_behaviour(
             return Giver(robot, object, partner, device, arm_kind(arm))
         case "receiver":
             return Receiver(robot, object, partner, device, arm_kind(arm), place)
+        case "folder":
+            return Folder(robot, object, partner, device, arm_kind(arm))
+        case "stower":
+            return Stower(robot, object, device, arm_kind(arm), place)
         case "wander":
             return Wander(robot, device, seed)
         case "idle":

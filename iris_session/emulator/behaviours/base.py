@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from anchors.pose import PoseTuple
+from anchors.pose import PoseTuple, Vec3
 
 
 class OperatorView(Protocol):
@@ -25,6 +25,10 @@ class OperatorView(Protocol):
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         """Pose of the robot's end-effector site; `None`: not in the stream."""
+        ...
+
+    def vertex(self, deformable: str, index: int) -> Vec3 | None:
+        """Where vertex `index` of a deformable is [m]; `None`: not in the stream."""
         ...
 
     def lease_version(self, robot: str) -> int | None:

@@ -2,46 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_rotate
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
-from iris_session.emulator.behaviours.base import HandInput, OperatorView
 from iris_session.emulator.behaviours.eyes import Eyes
-from iris_session.emulator.behaviours.hand import ClutchedHand
+from iris_session.emulator.behaviours.phases import Phases
 from iris_session.emulator.behaviours.things import COMMON_THINGS, Thing, above, grasps, thing_named
 
 #: How far above a grasp the hand first goes, and how far it backs off afterwards [m].
 CLEAR_ABOVE = 0.11
 #: Speed of the last centimetres before a grasp [m/s].
 CAREFUL_SPEED = 0.16
-#: How long an operator looks for a robot or thing that is not in the picture [s].
-SEARCH_S = 10.0
-#: So often taking the thing is tried before the operator gives up.
-ATTEMPTS = 4
 
 
-class Operator:
-    """A behaviour as a machine of phases. `done` and not `failed`: it succeeded.
-
-    A subclass fills `self._steps` (phase -> method called once per update) and says where to take the thing.
-    """
+class Operator(Phases):
+    """Takes a thing, and has a partner. A subclass adds its phases to `self._steps`, and says where to take it."""
 
     def __init__(self, robot: str, object: str, partner: str, device: str, arm: ArmKind = ARM) -> None:
-        self.phase = "wait"
-        self.done = False
-        self.failed = ""
-        self.attempts = 1
-        self.robot, self.object, self.partner = robot, object, partner
-        self.thing: Thing = thing_named(object)
-        self.arm = arm
-        self.hand = ClutchedHand(device, robot, arm.speed)
         self.eyes = Eyes((object,), (robot, partner), tuple(name for name in COMMON_THINGS if name != object), arm)
-        self._entering, self._entering_now = True, False
-        self._entered_s = 0.0
-        self._search_since_ns: int | None = None
-        self._home: PoseTuple | None = None
-        self._steps: dict[str, Callable[[], None]] = {
+        super().__init__(robot, device, self.eyes, arm)
+        self.object, self.partner = object, partner
+        self.thing: Thing = thing_named(object)
+        self._steps |= {
             "wait": self._wait,
             "approach": self._approach,
             "descend": self._descend,
@@ -49,31 +30,10 @@ class Operator:
             "back_off": self._back_off,
             "rise": self._rise,
             "step_back": self._step_back,
-            "return": self._return,
         }
         self._clutched_again = 0
         self._take_x = 0.0  # where along the thing it is taken [m]
         self._after_close = ""
-
-    def update(self, view: OperatorView) -> tuple[HandInput, ...]:
-        """One look and one hand input; see `Behaviour.update`."""
-        self.eyes.look(view)
-        if not self.eyes.ready:
-            self._search(view)
-        if self.done:
-            return (self.hand.rest(view),)
-        can_act = self.hand.update(view, self.eyes.tip(self.robot) if self.eyes.ready else None)
-        if can_act:
-            self._entering_now, self._entering = self._entering, False
-            self._steps[self.phase]()
-        return (self.hand.input(),)
-
-    def _search(self, view: OperatorView) -> None:
-        """Not everything that is needed was ever in the picture: gives up after a while."""
-        if self._search_since_ns is None:
-            self._search_since_ns = view.session_time_ns
-        if view.session_time_ns - self._search_since_ns > SEARCH_S * 1e9:
-            self._give_up(f"not to be seen in the scene: {', '.join(self.eyes.missing)}")
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 
@@ -132,12 +92,6 @@ class Operator:
         if self.hand.arrived(0.02, 0.1) or self._waited(4.0):
             self._enter(self._first_phase())
 
-    def _return(self) -> None:
-        if self._entering_now and self._home is not None:
-            self.hand.move_to(self._home)
-        if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
-            self._finish()
-
     def _open_gripper(self, then: str) -> None:
         """Opens, goes on with `then`. A gripper that does not follow: the engagement was lost, clutch again."""
         if self._entering_now:
@@ -151,29 +105,6 @@ class Operator:
         elif self._waited(1.5 * (self._clutched_again + 1)):
             self._clutched_again += 1
             self.hand.take_anew()
-
-    # --- transitions --------------------------------------------------------------------------------------------------
-
-    def _enter(self, phase: str) -> None:
-        self.phase, self._entering, self._entered_s = phase, True, self.hand.now_s
-
-    def _waited(self, seconds: float) -> bool:
-        """Whether this phase has lasted `seconds` already."""
-        return self.hand.now_s - self._entered_s >= seconds
-
-    def _retry(self, reason: str) -> None:
-        """Lets go and begins again, or gives up with `reason` after the last attempt."""
-        if self.attempts >= ATTEMPTS:
-            self._give_up(f"{reason} (after {self.attempts} attempts)")
-            return
-        self.attempts += 1
-        self._enter("back_off")
-
-    def _give_up(self, reason: str) -> None:
-        self.phase, self.failed, self.done = "failed", reason, True
-
-    def _finish(self) -> None:
-        self.phase, self.done = "done", True
 
     # --- geometry as seen ---------------------------------------------------------------------------------------------
 

@@ -21,6 +21,8 @@ from anchors.pose import (
     quat_rotate,
 )
 
+#: Turn of a tip that points straight down, its x axis along that of the world.
+DOWN: Quat = (0.0, 1.0, 0.0, 0.0)
 #: How far above the middle of a thing's thickness the pads take it [m]: keeps the finger tips clear of the table.
 _GRASP_ABOVE = 0.003
 

@@ -1,0 +1,176 @@
+"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and lets go."""
+
+from __future__ import annotations
+
+import math
+
+from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, quat_from_yaw, quat_mul
+from iris_session.emulator.behaviours.arms import ARM, ArmKind
+from iris_session.emulator.behaviours.deformables import CORNERS, SoftEyes, mean
+from iris_session.emulator.behaviours.operator import CAREFUL_SPEED, CLEAR_ABOVE
+from iris_session.emulator.behaviours.phases import Phases
+from iris_session.emulator.behaviours.things import DOWN, above
+from iris_session.protocol.names import Device
+
+#: The body of the box; its origin is in the middle of the inner floor.
+BOX: str = "box"
+#: Inside of the box: half length and half width [m], and how deep it is.
+BOX_INSIDE: Vec3 = (0.240, 0.095, 0.070)
+#: So far its lowest corner is lifted above the table [m]: over the walls of the box, and more than 10 cm.
+LIFTED: float = 0.12
+#: The body is let go so far above the floor of the box [m].
+DROP: float = 0.006
+#: A body that is squeezed is narrower than this between the pads [m], one that is not there lets them close.
+SQUEEZED: float = 0.050
+EMPTY: float = 0.012
+
+
+class Stower(Phases):
+    """Stows `soft` with `robot`. `place`: where in the box its middle comes to lie (x, y [m], world)."""
+
+    def __init__(
+        self,
+        robot: str,
+        soft: str,
+        device: str = Device.CONTROLLER_RIGHT,
+        arm: ArmKind = ARM,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        self.eyes = SoftEyes(soft, (robot,), (BOX,), arm)
+        super().__init__(robot, device, self.eyes, arm)
+        self.soft = soft
+        self._place = place
+        self._grip: PoseTuple = ((0.0, 0.0, 0.0), DOWN)
+        self._steps |= {
+            "wait": self._wait,
+            "look": self._look,
+            "approach": self._approach,
+            "descend": self._descend,
+            "close": self._close,
+            "lift": self._lift,
+            "carry": self._carry,
+            "lower": self._lower,
+            "open": self._open,
+            "leave": self._leave,
+            "judge": self._judge,
+            "back_off": self._back_off,
+        }
+
+    def _wait(self) -> None:
+        self._home = self.eyes.tip(self.robot)
+        self._enter("look")
+
+    def _look(self) -> None:
+        """Waits until it lies still."""
+        if self.eyes.corners_still_s >= 0.3:
+            self._grip = (self.eyes.middle, self._across(self.eyes.corners))
+            self._enter("approach")
+
+    def _approach(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(above(self._grip, CLEAR_ABOVE))
+        if self.hand.arrived(0.008, 0.06) and self.hand.trigger_done():
+            self._enter("descend")
+        elif self._waited(8.0):
+            self._retry(f"{self.robot} cannot reach the {self.soft}")
+
+    def _descend(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(self._grip, CAREFUL_SPEED)
+        if self.hand.arrived(0.004, 0.04):
+            self._enter("close")
+        elif self._waited(6.0):
+            self._retry(f"{self.robot} cannot reach down to the {self.soft}")
+
+    def _close(self) -> None:
+        if self._entering_now:
+            self.hand.hold_still()
+            self.hand.trigger_goal = 1.0
+        if self.hand.trigger_done() and self._waited(0.9) and self._holding():
+            self._enter("lift")
+        elif self._waited(2.5):
+            self._retry(f"{self.robot} closed its gripper beside the {self.soft}")
+
+    def _lift(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(above(self.eyes.tip(self.robot), LIFTED + 0.03))
+        self._carried("carry", 0.01)
+
+    def _carry(self) -> None:
+        if self._entering_now:
+            (x, y), z = self._goal(), self.eyes.tip(self.robot)[0][2]
+            self.hand.move_to(((x, y, z), self._grip[1]))
+        self._carried("lower", 0.006)
+
+    def _lower(self) -> None:
+        """Until its lowest corner is just above the floor of the box."""
+        if self._entering_now:
+            lowest = min(corner[2] for corner in self.eyes.corners.values())
+            down = lowest - self.eyes.body(BOX)[0][2] - DROP
+            self.hand.move_to(above(self.eyes.tip(self.robot), -down), CAREFUL_SPEED)
+        self._carried("open", 0.005)
+
+    def _carried(self, then: str, within_m: float) -> None:
+        if not self._holding():
+            self._retry(f"the {self.soft} slipped out of the gripper of {self.robot}")
+        elif self.hand.arrived(within_m, 0.06) or self._waited(5.0):
+            self._enter(then)
+
+    def _open(self) -> None:
+        if self._entering_now:
+            self.hand.hold_still()
+            self.hand.trigger_goal = 0.0
+        if self.hand.trigger_done() and self._waited(0.8):
+            self._enter("leave")
+
+    def _leave(self) -> None:
+        if self._entering_now:
+            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.25, correct=False)
+        if self.hand.moved():
+            self._enter("judge")
+
+    def _judge(self) -> None:
+        """Whether it lies in the box."""
+        if self.eyes.corners_still_s < 0.3 and not self._waited(5.0):
+            return
+        if all(self._inside(corner) for corner in self.eyes.corners.values()):
+            self._enter("return")
+        else:
+            self._give_up(f"the {self.soft} does not lie in the box")
+
+    def _back_off(self) -> None:
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0
+            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), correct=False)
+        if self.hand.moved() and self.hand.trigger_done() and self._waited(1.5):
+            self._enter("look")
+
+    # --- geometry as seen ---------------------------------------------------------------------------------------------
+
+    def _across(self, corners: dict[int, Vec3]) -> tuple[float, float, float, float]:
+        """Turn of a tip that takes it from above across its length, and turns the wrist least."""
+        order = CORNERS[self.soft]
+        (ax, ay, _), (bx, by, _) = (mean(corners[i] for i in end) for end in (order[:4], order[4:]))
+        yaw = math.atan2(by - ay, bx - ax)
+        home = (self._home or self.eyes.tip(self.robot))[1]
+        turns = [quat_mul(quat_from_yaw(yaw + half), DOWN) for half in (0.0, math.pi)]
+        return min(turns, key=lambda turn: quat_angle(turn, home))
+
+    def _goal(self) -> tuple[float, float]:
+        """Where to lay it: the given place, else the half of the box on this side."""
+        if self._place is not None:
+            return self._place
+        T_world_box = self.eyes.body(BOX)
+        mine = apply(inverse(T_world_box), self.eyes.base(self.robot)[0])
+        x, y, _ = apply(T_world_box, (math.copysign(0.5 * BOX_INSIDE[0], mine[0]), 0.0, 0.0))
+        return (x, y)
+
+    def _holding(self) -> bool:
+        """Whether it is between the pads and goes with them."""
+        near = distance(self.eyes.middle, self.eyes.tip(self.robot)[0]) < 0.04
+        return near and EMPTY < self.eyes.gap(self.robot) < SQUEEZED
+
+    def _inside(self, p_world: Vec3) -> bool:
+        x, y, z = apply(inverse(self.eyes.body(BOX)), p_world)
+        return abs(x) < BOX_INSIDE[0] and abs(y) < BOX_INSIDE[1] and z < BOX_INSIDE[2]

@@ -1,0 +1,106 @@
+"""When a task with a deformable is a success: pure functions on where its vertices are and who touches it.
+
+The criteria are those of the IRIS paper: a cloth is folded when corners meet, a soft body is stowed when it was lifted
+and lies in the box. Both count only when nobody touches it any more and it keeps still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Vec3
+
+#: It keeps still when no vertex leaves this distance [m] for so long [s].
+STILL_M: Final = 0.005
+STILL_S: Final = 0.5
+
+Vertices = NDArray[np.float64]
+
+
+class Goal(Protocol):
+    """What is to be reached with one deformable. Vertices: world [m], shape (n, 3), in the order of the model."""
+
+    @property
+    def deformable(self) -> str: ...
+
+    @property
+    def name(self) -> str:
+        """What it is called when it is reached, one word."""
+        ...
+
+    def begun(self, vertices: Vertices) -> bool:
+        """What must have been seen at some time before it counts."""
+        ...
+
+    def met(self, vertices: Vertices) -> bool:
+        """Whether it lies as it should."""
+        ...
+
+
+@dataclass(frozen=True)
+class FoldGoal:
+    """Every pair of vertices of `pairs`, apart at first, has come closer than `within_m`."""
+
+    deformable: str
+    pairs: tuple[tuple[int, int], ...]
+    within_m: float = 0.05
+    name: str = "folded"
+
+    def begun(self, vertices: Vertices) -> bool:
+        return all(gap > 2.0 * self.within_m for gap in self._gaps(vertices))
+
+    def met(self, vertices: Vertices) -> bool:
+        return all(gap <= self.within_m for gap in self._gaps(vertices))
+
+    def _gaps(self, vertices: Vertices) -> list[float]:
+        return [float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in self.pairs]
+
+
+@dataclass(frozen=True)
+class StowGoal:
+    """The whole body was `lifted_m` above the table, and lies within the box.
+
+    `low`, `high`: corners of the inside of the box [m, world]; it stands square to the world. `table_z`: of its top.
+    """
+
+    deformable: str
+    low: Vec3
+    high: Vec3
+    table_z: float = 0.0
+    lifted_m: float = 0.10
+    name: str = "stowed"
+
+    def begun(self, vertices: Vertices) -> bool:
+        return bool(vertices[:, 2].min() >= self.table_z + self.lifted_m)
+
+    def met(self, vertices: Vertices) -> bool:
+        return bool((vertices >= self.low).all() and (vertices <= self.high).all())
+
+
+class GoalWatch:
+    """Follows one goal from tick to tick. `at_s`: simulated time at which it was reached, `None` until then."""
+
+    def __init__(self, goal: Goal) -> None:
+        self.goal = goal
+        self.at_s: float | None = None
+        self._begun = False
+        self._rest: Vertices | None = None
+        self._rest_since_s = 0.0
+
+    def observe(self, now_s: float, vertices: Vertices, touching: Sequence[str]) -> bool:
+        """Takes in the world after a tick; true in the one in which the goal is reached."""
+        if self.at_s is not None:
+            return False
+        self._begun = self._begun or self.goal.begun(vertices)
+        moved = self._rest is None or float(np.abs(vertices - self._rest).max()) > STILL_M
+        if moved or touching:
+            self._rest, self._rest_since_s = vertices, now_s
+        elif self._begun and now_s - self._rest_since_s >= STILL_S and self.goal.met(vertices):
+            self.at_s = now_s
+            return True
+        return False

@@ -1,0 +1,110 @@
+"""Plays the demos with deformables without network: real physics and control, operators who see what is late and noisy.
+
+`python -m tests.emulator.deformable_rig 10 cloth` plays many seeds and prints the share of successes.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from iris_session.emulator.behaviours import make_behaviour
+from iris_session.emulator.behaviours.deformables import CORNERS
+from iris_session.runtime.goals import GoalWatch
+from iris_session.runtime.plays import Play, make_play
+from tests.emulator.handover_rig import Rig
+
+#: Deformables begin up to so far from their places, and turned by so much.
+MOVED_M, TURNED_RAD = 0.015, math.radians(8.0)
+
+
+@dataclass
+class SoftRig(Rig):
+    """A rig whose goals are those of a demo, judged by the product's own detector after every tick."""
+
+    watches: list[GoalWatch] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.world.flexes.names if self.shift else ():
+            self._shift_deformable(name)
+
+    def _receive(self) -> None:
+        super()._receive()
+        for watch in self.watches:
+            name = watch.goal.deformable
+            watch.observe(self.now_s, self.world.flexes.vertices(name), self.world.flexes.touching(name))
+
+    def _shift_deformable(self, name: str) -> None:
+        """Moves and turns it about its middle, by the slides of its vertices or nodes."""
+        model, data = self.world.model, self.world.data
+        flex = self.world.flexes.names.index(name)
+        first, count = int(model.flex_nodeadr[flex]), int(model.flex_nodenum[flex])
+        bodies = model.flex_nodebodyid[first : first + count]
+        if not count:
+            first, count = int(model.flex_vertadr[flex]), int(model.flex_vertnum[flex])
+            bodies = model.flex_vertbodyid[first : first + count]
+        yaw = self.rng.uniform(-TURNED_RAD, TURNED_RAD)
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        at = data.xpos[bodies][:, :2]
+        middle = at.mean(axis=0)
+        moved = (at - middle) @ turn.T + middle + [self.rng.uniform(-MOVED_M, MOVED_M) for _ in "xy"]
+        joints = model.body_jntadr[bodies]
+        data.qpos[model.jnt_qposadr[joints]] += moved[:, 0] - at[:, 0]
+        data.qpos[model.jnt_qposadr[joints + 1]] += moved[:, 1] - at[:, 1]
+        self.moved_by_hand()
+
+    def verdict(self) -> str:
+        """Empty when everybody is done and every goal is reached, else what is wrong."""
+        wrong = [
+            f"{robot} ({b.phase}): {b.failed or 'not done'}"
+            for robot, b in self.behaviours.items()
+            if b.failed or not b.done
+        ]
+        wrong += [f"{w.goal.deformable} is not {w.goal.name}" for w in self.watches if w.at_s is None]
+        return "; ".join(wrong)
+
+    def over(self) -> bool:
+        """Whether everybody is done and every goal is reached, or somebody has given up."""
+        behaviours = self.behaviours.values()
+        reached = all(watch.at_s is not None for watch in self.watches)
+        return any(b.failed for b in behaviours) or (reached and all(b.done for b in behaviours))
+
+
+def soft_demo(play: Play, seed: int, *, shift: bool = True) -> SoftRig:
+    """A rig with the cast of a demo."""
+    behaviours = {
+        task.robot: make_behaviour(task.behaviour, task.robot, task.object, task.partner, task.device, seed)
+        for person in play.people
+        for task in person.tasks
+    }
+    watched = {goal.deformable: CORNERS[goal.deformable] for goal in play.goals}
+    watches = [GoalWatch(goal) for goal in play.goals]
+    return SoftRig(behaviours, seed, "", vertices=watched, watches=watches, model=play.model, shift=shift)
+
+
+def main(runs: int, name: str = "cloth", first: int = 0) -> None:
+    """Counts successes over `runs` seeds."""
+    good, times = 0, []
+    play = make_play(name)
+    for seed in range(first, first + runs):
+        began = time.process_time()
+        rig = soft_demo(play, seed)
+        rig.run(45.0, until=SoftRig.over)
+        wrong = rig.verdict()
+        good += not wrong
+        times.append(rig.now_s)
+        tries = [b.attempts for b in rig.behaviours.values()]
+        notes = (
+            f"attempts {tries}, trouble {rig.world.trouble}, {(time.process_time() - began) / rig.now_s:.2f} CPU s/s"
+        )
+        print(f"seed {seed}: {wrong or 'ok'}, {rig.now_s:.1f} s, {notes}", flush=True)
+    print(f"{name}: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), *sys.argv[2:3], *map(int, sys.argv[3:4]))
