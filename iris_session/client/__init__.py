@@ -4,9 +4,12 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
+from iris_session.client.asset_cache import AssetCache
+from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.discovery import FoundSession, find_sessions
 from iris_session.client.errors import (
+    AssetError,
     ClientError,
     DeniedError,
     IdentityError,
@@ -26,6 +29,8 @@ from iris_session.client.state_stream import SceneState
 from iris_session.client.waiting import ClientGroup, poll_all, wait_any
 
 __all__ = [
+    "AssetCache",
+    "AssetFetch",
     "Client",
     "ClientGroup",
     "CurveKeys",
@@ -38,6 +43,7 @@ __all__ = [
     "find_sessions",
     "poll_all",
     "wait_any",
+    "AssetError",
     "ClientError",
     "DeniedError",
     "IdentityError",

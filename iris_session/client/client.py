@@ -105,6 +105,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         self._generation = 0
         self._sockets = ClientSockets()
         self._init_media()
+        self._init_assets()
         self._init_looking()
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
@@ -145,6 +146,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         with self._lock:
             if self.connection.phase is not Phase.CLOSED:
                 self._end_meeting()
+                self._end_assets()
                 self.connection.close()
                 self._flush()
                 self._sockets.close()

@@ -10,6 +10,7 @@ from typing import Self
 
 import zmq
 
+from iris_session.client.assets import Assets
 from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.joining import Joining
 from iris_session.client.media import Media
@@ -24,7 +25,7 @@ from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault
 DEFAULT_TIMEOUT_S = 5.0
 
 
-class Driving(SceneView, Media, Joining):
+class Driving(SceneView, Media, Assets, Joining):
     """Part of `Client`."""
 
     on_state: Callable[[SceneState], None] | None
@@ -140,6 +141,8 @@ class Driving(SceneView, Media, Joining):
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
             phase = self.connection.phase
+            if self._workers is not None:
+                self._sockets.clear_wake()  # before what it was for is looked at: a later one is not lost
             self._step_meeting()
         progressed = self.poll_state()
         with self._lock:
@@ -154,6 +157,7 @@ class Driving(SceneView, Media, Joining):
                 self.connection.send(self._with_media(report, time.monotonic_ns()))
             self._flush()
             progressed |= self._tend_media()
+            progressed |= self._tend_assets()
             if self.connection.phase is Phase.REFUSED:
                 self._sockets.hang_up()
             progressed |= self.connection.phase is not phase
@@ -165,6 +169,7 @@ class Driving(SceneView, Media, Joining):
                 self.feedback = {}  # nobody tells what the robots do now
         for message in inbox:
             self._call_back(message)
+        self._call_back_assets()
         return progressed
 
     def _drain_state(self) -> tuple[SceneState | None, bool]:

@@ -9,6 +9,7 @@
     +-- InvalidMessageError    what was to be sent is not of the protocol (also a `ValueError`); nothing was sent
     +-- IdentityError          the identity file cannot be used
     +-- TrustError             the session's key is not the one that is trusted, or it could not prove the join code
+    +-- AssetError             an asset could not be fetched: `address`, `reason`
     +-- SessionNameError       no single session can be meant by that name
 
 Bytes that a server sends and that do not fit the protocol never raise: they are counted in `Client.counters`.
@@ -79,3 +80,16 @@ class TrustError(ClientError):
 
 class SessionNameError(ClientError):
     """Several sessions have that name, or another one answers where it was heard."""
+
+
+class AssetError(ClientError):
+    """An asset could not be fetched. `address`: empty when it concerns all of them.
+
+    `reason`: an `AssetRefusal`, `hash` (twice the bytes were others than its address says), `protocol`, `decode`,
+    `cache` (the folder of the cache cannot be used), `gone` (taken away since), `no_channel` or `closed`.
+    """
+
+    def __init__(self, address: str, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.address = address
+        self.reason = reason

@@ -1,4 +1,5 @@
-"""ZeroMQ sockets of one client: control (DEALER), state and media (SUB), ingest (PUSH), and what tells of their end.
+"""ZeroMQ sockets of one client: control and assets (DEALER), state and media (SUB), ingest (PUSH), and what tells of
+their end.
 
 No protocol here.
 """
@@ -25,6 +26,8 @@ CONTROL_HWM: Final = 64
 #: As much as a link of 20 Mbit/s and 50 ms holds: more would only wait there.
 MEDIA_RCVBUF: Final = 131_072
 MEDIA_HWM: Final = 2
+#: More than may be asked for at once.
+ASSETS_HWM: Final = 128
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
 LINGER_MS: Final = 200
@@ -66,8 +69,10 @@ class ClientSockets:
         self._state_of = (0, 0)
         self._media: zmq.Socket[bytes] | None = None
         self._ingest: zmq.Socket[bytes] | None = None
+        self._assets: zmq.Socket[bytes] | None = None
         #: Changes whenever a socket is opened or closed.
         self.version = 0
+        self._wakes_anybody = False
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_out.setblocking(False)
         self._wake_in.setblocking(False)
@@ -78,6 +83,7 @@ class ClientSockets:
         self._control_port = control_port
         self._curve = curve
         self.close_media()
+        self.close_assets()
         if self._state is not None:
             self._state.close(linger=0)
             self._state = None
@@ -159,6 +165,38 @@ class ClientSockets:
             return False
         return True
 
+    def open_assets(self, port: int) -> None:
+        """Connects to the assets channel, if it is not."""
+        if self._assets is None:
+            assets = self._assets = self._new_socket(zmq.DEALER)
+            assets.setsockopt(zmq.SNDHWM, ASSETS_HWM)
+            assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
+            assets.setsockopt(zmq.RECONNECT_IVL, 50)
+            assets.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+            assets.connect(f"tcp://{self._host}:{port}")
+            self.version += 1
+
+    def send_assets(self, data: bytes) -> bool:
+        """Asks for a chunk without waiting. False: the socket cannot take it now."""
+        if self._assets is None:
+            return False
+        try:
+            self._assets.send(data, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def drain_assets(self) -> list[list[bytes]]:
+        """What came on the assets channel, in order, at most `MAX_DRAIN` messages."""
+        return _drain(self._assets)
+
+    def close_assets(self) -> None:
+        """Ends the connection to the assets channel, and what was asked by it."""
+        if self._assets is not None:
+            self._assets.close(linger=0)
+            self._assets = None
+            self.version += 1
+
     def close_media(self) -> None:
         """Ends what was subscribed and handed in, with another connection."""
         for one in (self._media, self._ingest):
@@ -204,14 +242,21 @@ class ClientSockets:
         """
         if self._control is not None:
             poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
-        for sock in (self._monitor, self._state, self._media):
+        for sock in (self._monitor, self._state, self._media, self._assets):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
+        if self._wakes_anybody:
+            self.register_wake(poller)
         return self._state
 
     def register_wake(self, poller: zmq.Poller) -> None:
         """Adds what `wake` wakes to `poller`."""
-        poller.register(self._wake_in, zmq.POLLIN)
+        poller.register(self._wake_in.fileno(), zmq.POLLIN)
+
+    def wake_anybody(self) -> None:
+        """From now on `wake` wakes whoever waits for our sockets, not only our own `poll`."""
+        self._wakes_anybody = True
+        self.version += 1
 
     def wake(self) -> None:
         """Ends a wait that includes `register_wake`, from any thread."""
@@ -229,6 +274,7 @@ class ClientSockets:
         if self._control is not None or self._state is not None:
             self.version += 1
             self.close_media()
+            self.close_assets()
             self._close_control(linger_ms=0)
             if self._state is not None:
                 self._state.close(linger=0)
@@ -238,6 +284,7 @@ class ClientSockets:
         """Closes everything; a last bye still has `LINGER_MS` to leave."""
         self.version += 1
         self.close_media()
+        self.close_assets()
         self._close_control(linger_ms=LINGER_MS)
         if self._state is not None:
             self._state.close(linger=0)

@@ -68,7 +68,7 @@ class ClientGroup:
         registered = [client.registration for client in self.clients]
         if registered != self._registered:
             self._register(registered)
-        woken = [self._owners[id(sock)] for sock, _ in self._poller.poll(milliseconds(deadline - now))]
+        woken = [self._owners[_key(sock)] for sock, _ in self._poller.poll(milliseconds(deadline - now))]
         now = time.monotonic_ns()
         rest = [c for c, due_ns in zip(clients, due, strict=True) if due_ns <= now]
         rest += [c for c, only_state in woken if not only_state and c not in rest]
@@ -82,7 +82,12 @@ class ClientGroup:
             first = len(self._poller.sockets)
             state = client.register(self._poller)
             for sock, _ in self._poller.sockets[first:]:
-                self._owners[id(sock)] = client, sock is state
+                self._owners[_key(sock)] = client, sock is state
+
+
+def _key(sock: zmq.Socket[bytes] | int) -> int:
+    """What a poller calls a socket: itself one of ZeroMQ, by its descriptor any other."""
+    return sock if isinstance(sock, int) else id(sock)
 
 
 def wait_any(clients: Sequence[Client], timeout_s: float) -> list[Client]:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 
+import msgspec
 import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
@@ -35,12 +36,21 @@ def scene() -> SceneInfo:
 
 
 class LiveSession:
-    """`origin_ns` and `entries` as the authority has them. Bodies move along x by 0.1 m/s."""
+    """`origin_ns` and `entries` as the authority has them. Bodies move along x by 0.1 m/s. `assets`: addresses that are
+    served from the store in `asset_root`."""
 
-    def __init__(self, authority: AuthorityConfig | None = None, **front: object) -> None:
+    def __init__(
+        self,
+        authority: AuthorityConfig | None = None,
+        *,
+        asset_root: str = "",
+        assets: tuple[str, ...] = (),
+        **front: object,
+    ) -> None:
         self.origin_ns = time.monotonic_ns()
         settings = {"control_port": 0, "state_port": 0, "origin_ns": self.origin_ns, "session_id": "s1", **front}
-        self.front = FrontProcess(FrontConfig(**settings), scene())  # type: ignore[arg-type]
+        shown = msgspec.structs.replace(scene(), asset_root=asset_root, assets=assets)
+        self.front = FrontProcess(FrontConfig(**settings), shown)  # type: ignore[arg-type]
         ports = self.front.start()
         self.address = f"127.0.0.1:{ports.control}"
         specs = [RobotSpec(name, ("j1",), ("a1",), f"{name}/tip", name) for name in ROBOTS]

@@ -1,0 +1,204 @@
+"""Assets on this machine's disk, by the SHA-256 of their bytes: kept across sessions, shared by all processes.
+
+Layout: `FOLDER/ab/abcd...`, and `abcd....part` beside it while bytes of it come. A file has its final name only once
+its bytes have been hashed; a part that was left goes on where it ends. Who writes a part holds a lock of the system on
+it; another process that fetches the same asset meanwhile writes one of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import mmap
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+from iris_session.client.errors import AssetError
+from iris_session.protocol.assets import is_address
+
+try:
+    import fcntl
+except ImportError:  # a system without such locks: every process writes parts of its own
+    fcntl = None  # type: ignore[assignment]
+
+DEFAULT_MAX_BYTES: Final = 4 << 30
+#: What was used so lately is not taken away, however full the cache is.
+IN_USE_S: Final = 600.0
+#: A part that nobody has written to for so long is of no use.
+STALE_PART_S: Final = 7 * 86_400.0
+#: The folder is looked through after so many bytes were stored.
+TRIM_EVERY: Final = 64 << 20
+PART: Final = ".part"
+
+
+def default_folder() -> Path:
+    """`$XDG_CACHE_HOME/iris-session/client-assets`, by default below `~/.cache`."""
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "iris-session" / "client-assets"
+
+
+class AssetCache:
+    """A folder, made when something is first stored. Any thread may use it; raises `AssetError` when it cannot be used.
+
+    Above `max_bytes` the assets that were used longest ago are taken away.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str] | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        self.folder = default_folder() if folder is None else Path(folder)
+        self.max_bytes = max_bytes
+        self._stored = TRIM_EVERY  # so the first that is stored looks through what is there
+
+    def path(self, address: str) -> Path:
+        """Where an asset lies, or would. Raises `ValueError` for what is no address."""
+        if not is_address(address):
+            raise ValueError(f"{address[:80]!r} is no address of an asset: 64 digits 0-9, a-f")
+        return self.folder / address[:2] / address
+
+    def find(self, address: str) -> int | None:
+        """Bytes of an asset that is here, after hashing it; `None` when it is not. A damaged one is taken away."""
+        path = self.path(address)
+        try:
+            with path.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            if digest == address:
+                os.utime(path)
+                return size
+            path.unlink(missing_ok=True)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise _unusable(self.folder, error) from error
+        return None
+
+    def read(self, address: str) -> bytes:
+        """The bytes of an asset that `find` found, or that was stored. Raises `AssetError` when they are gone."""
+        try:
+            return self.path(address).read_bytes()
+        except OSError as error:
+            raise AssetError(address, "gone", f"asset {address} is not in {self.folder}: fetch it again") from error
+
+    def view(self, address: str) -> memoryview:
+        """As `read`, mapped instead of copied."""
+        try:
+            with self.path(address).open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                return memoryview(mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ)) if size else memoryview(b"")
+        except OSError as error:
+            raise AssetError(address, "gone", f"asset {address} is not in {self.folder}: fetch it again") from error
+
+    def begin(self, address: str) -> Part:
+        """The part of an asset that is here already, to be gone on with. Raises `AssetError`."""
+        path = self.path(address)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return Part(self, address, *_open_part(path))
+        except OSError as error:
+            raise _unusable(self.folder, error) from error
+
+    def stored(self, size: int) -> None:
+        """An asset was stored: makes room now and then."""
+        self._stored += size
+        if self._stored >= TRIM_EVERY:
+            self._stored = 0
+            self.trim()
+
+    def trim(self) -> int:
+        """Takes away what is too much, the longest unused first. The bytes that stay."""
+        now = time.time()
+        found: list[tuple[float, int, Path]] = []
+        for path in self.folder.glob("??/*"):
+            with contextlib.suppress(OSError):
+                status = path.stat()
+                if path.name.endswith(PART) and now - status.st_mtime > STALE_PART_S:
+                    path.unlink()
+                else:
+                    found.append((status.st_mtime, status.st_size, path))
+        total = sum(size for _, size, _ in found)
+        for used, size, path in sorted(found):
+            if total <= self.max_bytes or now - used < IN_USE_S:
+                break
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= size
+        return total
+
+
+class Part:
+    """What has come of one asset so far; belongs to one thread. `offset`: bytes that are here."""
+
+    def __init__(self, cache: AssetCache, address: str, path: Path, descriptor: int) -> None:
+        self._cache = cache
+        self._address = address
+        self._path = path
+        self._file = os.fdopen(descriptor, "r+b", buffering=0)
+        self._hash = hashlib.sha256()
+        self.offset = 0
+        while block := self._file.read(1 << 20):
+            self._hash.update(block)
+            self.offset += len(block)
+
+    def append(self, data: bytes) -> None:
+        """The next bytes. Raises `AssetError` when they cannot be written."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            raise _unusable(self._cache.folder, error) from error
+        self._hash.update(data)
+        self.offset += len(data)
+
+    def finish(self) -> bool:
+        """Stores what is here as the asset. False when these are not its bytes: it begins anew then."""
+        if self._hash.hexdigest() != self._address:
+            self.restart()
+            return False
+        try:
+            os.replace(self._path, self._cache.path(self._address))
+            self._file.close()
+        except OSError as error:
+            raise _unusable(self._cache.folder, error) from error
+        self._cache.stored(self.offset)
+        return True
+
+    def restart(self) -> None:
+        """Throws away what is here."""
+        try:
+            self._file.seek(0)
+            self._file.truncate()
+        except OSError as error:
+            raise _unusable(self._cache.folder, error) from error
+        self._hash = hashlib.sha256()
+        self.offset = 0
+
+    def close(self) -> None:
+        """Leaves what is here for another time; a private part, or one without bytes, is of no use then."""
+        if not self.offset or self._path.name != self._address + PART:
+            with contextlib.suppress(OSError):
+                self._path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def _open_part(path: Path) -> tuple[Path, int]:
+    """A part that nobody else writes: the common one, or else one of our own."""
+    common = path.with_name(path.name + PART)
+    if fcntl is not None:
+        descriptor = os.open(common, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # It may have been finished, and so renamed, between opening and locking.
+            if os.path.samestat(os.fstat(descriptor), os.stat(common)):
+                return common, descriptor
+        except OSError:
+            pass  # somebody else's, or a file system without locks
+        os.close(descriptor)
+    own = path.with_name(f"{path.name}.{os.getpid()}-{os.urandom(4).hex()}{PART}")
+    return own, os.open(own, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o600)
+
+
+def _unusable(folder: Path, error: OSError) -> AssetError:
+    text = f"the cache of assets {folder} cannot be used: {error.strerror or error}; give another folder"
+    return AssetError("", "cache", text)

@@ -1,0 +1,211 @@
+"""Assets of a client: fetched from the session by address, in order, into a cache that outlives sessions."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from iris_session.client.asset_cache import AssetCache
+from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.asset_loading import AssetLoader, Failed
+from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored
+from iris_session.client.connection import Connection
+from iris_session.client.errors import AssetError, InvalidMessageError, NotConnectedError
+from iris_session.client.sockets import ClientSockets
+from iris_session.client.status import Phase
+from iris_session.protocol.assets import AssetRequest, is_address
+from iris_session.protocol.codec import decode_asset_chunk, decode_asset_refused, encode_asset_request
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.names import PROTOCOL_VERSION
+
+_CHUNK_FRAMES: Final = 2
+
+
+class Assets:
+    """Part of `Client`. `asset_cache`: where assets are kept; set another one before the first is fetched."""
+
+    connection: Connection
+    _sockets: ClientSockets
+    _lock: threading.RLock
+    asset_cache: AssetCache
+
+    def _init_assets(self) -> None:
+        self.asset_cache = AssetCache()
+        self._loader = AssetLoader()
+        self._workers: AssetWorkers | None = None
+        self._fetches: list[AssetFetch] = []
+        self._asset_generation = -1
+        self._news: list[AssetFetch] = []
+        #: Messages on the assets channel that do not fit the protocol, or that nobody here asked for.
+        self.assets_malformed = 0
+
+    def fetch_assets(
+        self,
+        addresses: Sequence[str] | Mapping[str, int],
+        on_progress: Callable[[AssetFetch], None] | None = None,
+        decode: Decode | None = None,
+    ) -> AssetFetch:
+        """Fetches assets in this order; what the cache has is not asked for. `poll` goes on with it, over any number
+        of connections. With sizes (a mapping), `bytes_total` is known from the beginning.
+
+        `on_progress(fetch)`: called from `poll` when something has come. `decode(address, bytes)`: called in another
+        thread with every asset when it is there (once, where two fetches want the same); what it returns is in
+        `AssetFetch.decoded`, what it raises is an `AssetError`. Raises `InvalidMessageError` for what is no address.
+
+            fetch = client.fetch_assets([scene_hash])
+            client.wait_for(lambda c: fetch.done, 30.0)
+            data = fetch.read(scene_hash)
+        """
+        for address in addresses:
+            if not is_address(address):
+                raise InvalidMessageError(f"{address[:80]!r} is no address of an asset: 64 digits 0-9, a-f")
+        sizes = addresses if isinstance(addresses, Mapping) else {}
+        with self._lock:
+            if self.connection.phase is Phase.CLOSED:
+                raise NotConnectedError(self.connection.describe())
+            fetch = AssetFetch(self.asset_cache, addresses, sizes, on_progress, decode)
+            self._fetches.append(fetch)
+            if self._workers is None or self._workers.cache is not self.asset_cache:
+                self._end_workers()
+                self._workers = AssetWorkers(self.asset_cache, self._sockets.wake)
+                self._sockets.wake_anybody()
+            for address in fetch.addresses:
+                self._loader.want(address)
+            self._sockets.wake()
+            return fetch
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _tend_assets(self) -> bool:
+        """Takes what the workers have done and what has come, and asks for more. True when there was something."""
+        workers, loader = self._workers, self._loader
+        if workers is None:
+            return False
+        if self._asset_generation != self.connection.generation:
+            self._asset_generation = self.connection.generation
+            self._drop_asset_link()
+        progressed = False
+        for result in workers.results():
+            self._take_result(result)
+            progressed = True
+        for address in loader.to_look():
+            workers.look(address, self._decode_of(address))
+        if loader.needs_link and self.connection.joined:
+            progressed |= self._exchange(workers)
+        elif not loader.needs_link:
+            self._sockets.close_assets()
+        for fetch in [fetch for fetch in self._fetches if fetch.done]:
+            self._fetches.remove(fetch)
+        return progressed
+
+    def _exchange(self, workers: AssetWorkers) -> bool:
+        """What has come, then what is to be asked for: credit comes back with what was stored."""
+        welcome = self.connection.welcome
+        assert welcome is not None
+        if not welcome.endpoints.assets:
+            error = AssetError("", "no_channel", "this session has no channel for assets")
+            for address in {address for fetch in self._fetches for address in fetch.pending}:
+                self._fail(address, error)
+            return True
+        self._sockets.open_assets(welcome.endpoints.assets)
+        messages = self._sockets.drain_assets()
+        now_ns = time.monotonic_ns()
+        for frames in messages:
+            try:
+                self._take_message(workers, frames, now_ns)
+            except ProtocolError:
+                self.assets_malformed += 1
+        if self._loader.overdue(now_ns):
+            self._drop_asset_link()
+            return True
+        for ask in self._loader.requests(now_ns):
+            request = AssetRequest(PROTOCOL_VERSION, welcome.connection_epoch, *ask)
+            if not self._sockets.send_assets(encode_asset_request(request)):
+                self._drop_asset_link()  # it takes nothing, though little was asked for: it is not there
+                break
+        return bool(messages)
+
+    def _take_message(self, workers: AssetWorkers, frames: list[bytes], now_ns: int) -> None:
+        loader = self._loader
+        if len(frames) != _CHUNK_FRAMES:
+            outcome = loader.refused(decode_asset_refused(frames[0]), now_ns)
+            if isinstance(outcome, Failed):
+                self._fail(outcome.address, AssetError(*outcome))
+            elif outcome:
+                workers.restart(outcome)
+            return
+        head, data = frames
+        chunk = decode_asset_chunk(head, len(data))
+        taken = loader.chunk(chunk, len(data), now_ns)
+        if isinstance(taken, Failed):
+            self._fail(taken.address, AssetError(*taken))
+            return
+        if not taken:
+            self.assets_malformed += 1
+            return
+        workers.write(chunk.address, data)
+        for fetch in self._fetches:
+            fetch.has(chunk.address, chunk.offset + len(data), chunk.total, len(data))
+        self._tell(chunk.address)
+        if loader.whole(chunk.address):
+            workers.finish(chunk.address, self._decode_of(chunk.address))
+
+    def _take_result(self, result: Result) -> None:
+        loader = self._loader
+        if isinstance(result, Stored):
+            loader.stored(result.size)
+        elif isinstance(result, Found):
+            loader.drop(result.address)
+            self._tell(result.address)
+            for fetch in self._fetches:
+                fetch.found(result.address, result.size, result.decoded, fetched=result.fetched)
+        elif isinstance(result, Missing):
+            loader.missing(result.address, result.offset)
+        elif isinstance(result, Broken):
+            self._fail(result.address, result.error)
+        elif not loader.again(result.address):
+            text = f"the session sent other bytes than those of asset {result.address}, twice"
+            self._fail(result.address, AssetError(result.address, "hash", text))
+
+    def _fail(self, address: str, error: AssetError) -> None:
+        self._loader.drop(address)
+        if self._workers is not None:
+            self._workers.leave(address)
+        self._tell(address)
+        for fetch in self._fetches:
+            fetch.fail(address, error)
+
+    def _tell(self, address: str) -> None:
+        self._news += [fetch for fetch in self._fetches if address in fetch.pending and fetch not in self._news]
+
+    def _decode_of(self, address: str) -> Decode | None:
+        """Of the fetches that wait for an asset, the first that wants it decoded."""
+        found = (fetch.decode for fetch in self._fetches if address in fetch.pending)
+        return next((decode for decode in found if decode is not None), None)
+
+    def _drop_asset_link(self) -> None:
+        self._sockets.close_assets()
+        self._loader.cut_off()
+
+    def _call_back_assets(self) -> None:
+        """Without the lock."""
+        news, self._news = self._news, []
+        for fetch in news:
+            if fetch.on_progress is not None:
+                fetch.on_progress(fetch)
+
+    def _end_workers(self) -> None:
+        if self._workers is not None:
+            self._workers.close()
+            self._workers = None
+
+    def _end_assets(self) -> None:
+        """The client is closed: what has not come will not."""
+        self._end_workers()
+        error = AssetError("", "closed", "the client was closed")
+        for fetch in self._fetches:
+            for address in list(fetch.pending):
+                fetch.fail(address, error)
+        self._fetches.clear()

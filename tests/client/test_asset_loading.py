@@ -1,0 +1,218 @@
+"""What is asked for, in which order and how much at once, against a session of plain values; and what it does wrong."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from iris_session.client.asset_loading import (
+    AT_ONCE,
+    CHUNK_BYTES,
+    FIRST_PAUSE_NS,
+    PATIENCE_NS,
+    WINDOW_BYTES,
+    WINDOW_REQUESTS,
+    Ask,
+    AssetLoader,
+    Failed,
+)
+from iris_session.protocol.assets import AssetChunk, AssetRefused
+from iris_session.protocol.names import AssetRefusal
+
+
+def started(*addresses: str, offset: int = 0) -> AssetLoader:
+    loader = AssetLoader()
+    for address in addresses:
+        assert loader.want(address)
+    for address in loader.to_look():
+        loader.missing(address, offset)
+    return loader
+
+
+def answer(loader: AssetLoader, ask: Ask, total: int, size: int = -1, now_ns: int = 0) -> bool | Failed:
+    size = max(0, min(ask.length, total - ask.offset)) if size < 0 else size
+    return loader.chunk(AssetChunk(1, ask.request_id, ask.address, ask.offset, total), size, now_ns)
+
+
+def refuse(loader: AssetLoader, ask: Ask, reason: str, now_ns: int = 0) -> Failed | str:
+    return loader.refused(AssetRefused(1, ask.request_id, ask.address, reason, "advice"), now_ns)
+
+
+def test_first_a_chunk_of_each_then_the_rest_in_order() -> None:
+    loader = started("a", "b", "c")
+    first = list(loader.requests(0))
+    assert [(ask.address, ask.offset, ask.length) for ask in first] == [(name, 0, CHUNK_BYTES) for name in "abc"]
+    total = 2 * CHUNK_BYTES + 10
+    assert answer(loader, first[0], total) is True
+    assert [(ask.address, ask.offset, ask.length) for ask in loader.requests(0)] == [
+        ("a", CHUNK_BYTES, CHUNK_BYTES),
+        ("a", 2 * CHUNK_BYTES, 10),
+    ]
+    assert answer(loader, first[1], 7) is True
+    assert loader.whole("b")
+    assert not loader.whole("a")
+
+
+def test_the_window_is_of_bytes_that_are_not_stored_yet() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    assert answer(loader, ask, 100 * WINDOW_BYTES) is True
+    asks = list(loader.requests(0))
+    assert len(asks) == WINDOW_BYTES // CHUNK_BYTES - 1
+    for ask in asks:
+        assert answer(loader, ask, 100 * WINDOW_BYTES) is True
+    assert list(loader.requests(0)) == []
+    loader.stored(CHUNK_BYTES)
+    assert len(list(loader.requests(0))) == 1
+
+
+def test_small_ones_are_bounded_by_number() -> None:
+    loader = AssetLoader()
+    names = [f"{i}" for i in range(AT_ONCE + 10)]
+    for name in names:
+        loader.want(name)
+    looked = list(loader.to_look())
+    assert looked == names[:AT_ONCE]
+    loader.drop(looked[0])  # it was in the cache
+    assert list(loader.to_look()) == [names[AT_ONCE]]
+    for name in looked[1:]:
+        loader.missing(name, 0)
+    asks = list(loader.requests(0))
+    assert len(asks) == min(WINDOW_REQUESTS, WINDOW_BYTES // CHUNK_BYTES)
+
+
+def test_a_connection_that_ends_costs_nothing_that_came() -> None:
+    loader = started("a", offset=1000)
+    (ask,) = loader.requests(0)
+    assert ask.offset == 1000
+    assert answer(loader, ask, 3 * CHUNK_BYTES) is True
+    pending = list(loader.requests(0))
+    loader.cut_off()
+    assert answer(loader, pending[0], 3 * CHUNK_BYTES) is False  # of the connection before
+    assert [ask.offset for ask in loader.requests(0)] == [ask.offset for ask in pending]
+
+
+def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
+    loader, now_ns = started("a"), 0
+    for pause_ns in (FIRST_PAUSE_NS, 2 * FIRST_PAUSE_NS, 4 * FIRST_PAUSE_NS):
+        (ask,) = loader.requests(now_ns)
+        assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
+        assert list(loader.requests(now_ns + pause_ns - 1)) == []
+        now_ns += pause_ns
+    (ask,) = loader.requests(now_ns)
+    assert answer(loader, ask, 5) is True
+    assert loader.whole("a")
+
+
+def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    answer(loader, ask, 4 * CHUNK_BYTES)
+    first, second, third = loader.requests(0)
+    assert answer(loader, first, 4 * CHUNK_BYTES) is True
+    assert refuse(loader, second, AssetRefusal.RATE) == ""
+    assert answer(loader, third, 4 * CHUNK_BYTES) is False  # there is a gap before it
+    again = list(loader.requests(FIRST_PAUSE_NS))
+    assert [ask.offset for ask in again] == [second.offset, third.offset]
+    assert [answer(loader, ask, 4 * CHUNK_BYTES) for ask in again] == [True, True]
+    assert loader.whole("a")
+
+
+@pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
+def test_refusals_that_do_not_pass_end_it(reason: str) -> None:
+    loader = started("a", "b")
+    asks = list(loader.requests(0))
+    failed = refuse(loader, asks[0], reason)
+    assert isinstance(failed, Failed)
+    assert (failed.address, failed.reason) == ("a", reason)
+    assert answer(loader, asks[1], 5) is True
+    loader.drop("b")
+    assert loader.idle
+
+
+def test_a_part_of_something_else_is_thrown_away_once() -> None:
+    loader = started("a", offset=1000)
+    (ask,) = loader.requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+    loader.missing("a", 0)
+    (ask,) = loader.requests(0)
+    assert ask.offset == 0
+    assert isinstance(refuse(loader, ask, AssetRefusal.BAD_RANGE), Failed)
+
+
+def test_wrong_bytes_are_asked_for_once_more() -> None:
+    loader = started("a")
+    for expected in (True, False):
+        (ask,) = loader.requests(0)
+        assert answer(loader, ask, 5) is True
+        assert loader.whole("a")
+        loader.stored(5)
+        assert loader.again("a") is expected
+    assert loader.idle
+
+
+def test_a_session_that_contradicts_itself() -> None:
+    loader = started("a", "b", "c")
+    a, b, c = loader.requests(0)
+    answer(loader, a, 4 * CHUNK_BYTES)
+    a2 = next(iter(loader.requests(0)))
+    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), Failed)  # another size than before
+    assert isinstance(answer(loader, b, 100, size=0), Failed)  # nothing, where there is something
+    assert isinstance(answer(loader, c, 2**40, size=CHUNK_BYTES + 1), Failed)  # more than was asked for
+    assert loader.idle
+    assert answer(loader, c, 5) is False
+    assert loader.refused(AssetRefused(1, 999, "", AssetRefusal.UNKNOWN), 0) == ""
+
+
+def test_nothing_for_long_is_overdue() -> None:
+    loader = started("a", "b")
+    asks = list(loader.requests(1000))
+    assert not loader.overdue(1000 + PATIENCE_NS)
+    answer(loader, asks[0], 5, now_ns=5000)
+    assert not loader.overdue(2000 + PATIENCE_NS)
+    assert loader.overdue(5001 + PATIENCE_NS)
+    loader.cut_off()
+    assert not loader.overdue(5001 + PATIENCE_NS)
+
+
+def test_whatever_happens_in_the_end_everything_is_there() -> None:
+    """A session that refuses, cuts off, sends less than was asked for, and a cache that is slow."""
+    for seed in range(20):
+        rng = Random(seed)
+        sizes = {f"{i}": rng.choice((0, 5, CHUNK_BYTES, 3 * CHUNK_BYTES + 1, 2 * WINDOW_BYTES)) for i in range(40)}
+        loader = AssetLoader()
+        for address in sizes:
+            loader.want(address)
+        got = dict.fromkeys(sizes, 0)
+        asks: list[Ask] = []
+        unstored: list[int] = []
+        for now_ns in range(0, 10**15, 20_000_000):
+            for address in loader.to_look():
+                loader.missing(address, 0)
+            asks += loader.requests(now_ns)
+            assert sum(ask.length for ask in asks) + sum(unstored) <= WINDOW_BYTES
+            assert len(asks) <= WINDOW_REQUESTS
+            for _ in range(rng.randrange(6)):
+                if not asks:
+                    break
+                ask = asks.pop(0)
+                there = min(ask.length, sizes[ask.address] - ask.offset)
+                if rng.random() < 0.1:
+                    assert refuse(loader, ask, AssetRefusal.TOO_MANY, now_ns) == ""
+                    continue
+                size = there if rng.random() < 0.8 else min(there, 1 + rng.randrange(CHUNK_BYTES))
+                if answer(loader, ask, sizes[ask.address], size, now_ns) is True:
+                    assert ask.offset == got[ask.address]
+                    got[ask.address] += size
+                    unstored.append(size)
+                    if loader.whole(ask.address):
+                        loader.drop(ask.address)
+            if rng.random() < 0.02:
+                loader.cut_off()
+                asks.clear()
+            while unstored and rng.random() < 0.7:
+                loader.stored(unstored.pop())
+            if loader.idle:
+                break
+        assert got == sizes

@@ -1,0 +1,191 @@
+"""Assets of a client at a real front: in order, over lost connections, out of the cache, and what goes wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from iris_session.client import AssetCache, AssetError, AssetFetch, Client, InvalidMessageError, NotConnectedError
+from iris_session.client.waiting import ClientGroup
+from iris_session.protocol.names import AssetRefusal
+from tests.client.harness import LiveSession
+from tests.transport.asset_rig import noise, put
+
+MIB = 1 << 20
+DEADLINE_S = 60.0
+
+
+class Store:
+    """What the session has, by address."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.data: dict[str, bytes] = {}
+        for size in (1000, 5 * MIB + 3, 0, 700_000, *[2000] * 50):
+            data = noise(size)
+            self.data[put(root, data)] = data
+
+    @property
+    def addresses(self) -> list[str]:
+        return list(self.data)
+
+    @property
+    def bytes(self) -> int:
+        return sum(map(len, self.data.values()))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def live(store: Store) -> Iterator[LiveSession]:
+    live = LiveSession(asset_root=str(store.root), assets=(*store.addresses, "0" * 64))
+    yield live
+    live.close()
+
+
+@pytest.fixture
+def join(live: LiveSession, tmp_path: Path) -> Iterator[Callable[..., Client]]:
+    clients: list[Client] = []
+
+    def make(name: str = "ann", cache: str = "cache") -> Client:
+        client = Client(live.address, name=name, role="observer", alignment="not_needed")
+        client.asset_cache = AssetCache(tmp_path / cache)
+        clients.append(client)
+        return client.connect(DEADLINE_S)
+
+    yield make
+    for client in clients:
+        client.close()
+
+
+def until_done(client: Client, fetch: AssetFetch) -> None:
+    assert client.wait_for(lambda _: fetch.done, DEADLINE_S), (fetch.bytes_done, fetch.bytes_total, fetch.pending)
+
+
+def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable[..., Client]) -> None:
+    client = join()
+    seen: list[int] = []
+
+    def decode(_address: str, data: memoryview) -> int:
+        return len(data)
+
+    sizes = {address: len(data) for address, data in store.data.items()}
+    fetch = client.fetch_assets(sizes, lambda f: seen.append(f.bytes_done), decode)
+    assert fetch.bytes_total == store.bytes
+    until_done(client, fetch)
+    assert fetch.failed == {}
+    assert {address: fetch.read(address) for address in store.addresses} == store.data
+    assert fetch.decoded == sizes
+    assert fetch.bytes_done == fetch.bytes_total == fetch.bytes_received == store.bytes
+    assert seen == sorted(seen)
+    assert seen[-1] == store.bytes
+    assert client.assets_malformed == 0
+    client.close()
+    again = join("bob")
+    second = again.fetch_assets(store.addresses, decode=decode)
+    until_done(again, second)
+    assert (second.bytes_received, second.cached, second.decoded) == (0, len(sizes), sizes)
+    report = again.status(DEADLINE_S).assets
+    assert report is not None
+    assert report.bytes_sent == store.bytes
+
+
+def test_a_front_that_is_killed_costs_no_byte_twice(
+    store: Store, live: LiveSession, join: Callable[..., Client]
+) -> None:
+    client = join()
+    killed: list[int] = []
+
+    def kill(fetch: AssetFetch) -> None:
+        if fetch.bytes_done > 2 * MIB and not killed:
+            killed.append(fetch.bytes_done)
+            os.kill(live.front.pid, signal.SIGKILL)
+
+    fetch = client.fetch_assets(store.addresses, kill)
+    until_done(client, fetch)
+    fetch.check()
+    assert 0 < killed[0] < store.bytes
+    assert live.front.restarts == 1
+    assert {address: fetch.read(address) for address in store.addresses} == store.data
+    assert fetch.bytes_received == store.bytes
+
+
+def test_a_client_that_comes_back_goes_on_where_it_was(store: Store, join: Callable[..., Client]) -> None:
+    large = store.addresses[1]
+    first = join()
+    begun = first.fetch_assets([large])
+    assert first.wait_for(lambda _: begun.bytes_done >= 2 * MIB, DEADLINE_S)
+    first.close()
+    assert begun.failed[large].reason == "closed"
+    second = join()
+    fetch = second.fetch_assets([large])
+    until_done(second, fetch)
+    assert fetch.read(large) == store.data[large]
+    assert 0 < fetch.bytes_received <= len(store.data[large]) - 2 * MIB
+
+
+def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Callable[..., Client]) -> None:
+    client = join()
+    damaged, good = store.addresses[3], store.addresses[0]
+    path = store.root / damaged[:2] / damaged
+    path.write_bytes(noise(700_000))
+
+    def decode(address: str, data: memoryview) -> None:
+        if address == store.addresses[4]:
+            raise ZeroDivisionError("of the application")
+
+    wanted = ["f" * 64, "0" * 64, damaged, store.addresses[4], good]
+    fetch = client.fetch_assets(wanted, decode=decode)
+    until_done(client, fetch)
+    assert {address: error.reason for address, error in fetch.failed.items()} == {
+        "f" * 64: AssetRefusal.UNKNOWN,
+        "0" * 64: AssetRefusal.UNKNOWN,
+        damaged: "hash",
+        store.addresses[4]: "decode",
+    }
+    assert fetch.read(good) == store.data[good]
+    assert fetch.bytes_received == 2 * 700_000 + 2000 + 1000  # the damaged one was asked for once more, and only once
+    with pytest.raises(AssetError, match="twice"):
+        fetch.read(damaged)
+    with pytest.raises(AssetError, match="refused"):
+        fetch.check()
+    with pytest.raises(InvalidMessageError, match="no address"):
+        client.fetch_assets(["../../etc/passwd"])
+    path.write_bytes(store.data[damaged])
+    client.close()
+    with pytest.raises(NotConnectedError):
+        client.fetch_assets([good])
+
+
+def test_several_at_once_by_thread_and_by_group(store: Store, join: Callable[..., Client]) -> None:
+    """One with a thread of its own, two in one loop, of which one shares the cache of the first."""
+    threaded, ann, bob = join("eve"), join("ann"), join("bob", "another")
+    threaded.start()
+    fetches = [client.fetch_assets(store.addresses) for client in (threaded, ann, bob)]
+    group = ClientGroup([ann, bob])
+    assert threaded.wait_for(lambda _: (group.poll(0.05), all(f.done for f in fetches))[1], DEADLINE_S)
+    for fetch in fetches:
+        fetch.check()
+        assert {address: fetch.read(address) for address in store.addresses} == store.data
+
+
+def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_so(
+    store: Store, join: Callable[..., Client], tmp_path: Path
+) -> None:
+    client = join()
+    (tmp_path / "file").write_bytes(b"")
+    client.asset_cache = AssetCache(tmp_path / "file")
+    fetch = client.fetch_assets(store.addresses[:2])
+    until_done(client, fetch)
+    assert {error.reason for error in fetch.failed.values()} == {"cache"}
+    client.asset_cache = AssetCache(tmp_path / "folder")
+    fetch = client.fetch_assets(store.addresses[:2])
+    until_done(client, fetch)
+    fetch.check()
