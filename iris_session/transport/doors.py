@@ -38,6 +38,8 @@ MAX_REMEMBERED: Final = 256
 MAX_SHOWN: Final = 8
 #: What waits for one client before it is called the cause of too much memory: more than any honest one leaves lying.
 HOG_BYTES: Final = MEBIBYTE // 4
+#: What libzmq itself keeps for a connection that has said nothing: its buffers and queues.
+STRANGER_BYTES: Final = 16 * 1024
 BEFORE_HELLO: Final = "before hello"
 
 
@@ -138,18 +140,23 @@ class Doors:
         self._silent(now_ns)
 
     def shed(self, give_way: Callable[[], str] = lambda: "") -> str:
-        """Makes room in memory: closes the client for which and from which most waits; when nobody stands out, a
-        quarter of those who said no hello. Says who it was, empty when nobody is there. `give_way`: lets go of
-        something else instead, where nobody holds much, and says of what."""
+        """Makes room in memory: closes the client for which and from which most waits, or a quarter of those who said
+        no hello, when they hold more together. `give_way`: lets go of something else instead, where nobody holds much,
+        and says of what. Says who it was; empty, and counted, when nobody holds what is too much: whoever it is closed
+        would be closed for nothing."""
         owners = self._owners()
         strangers = [descriptor for descriptor in self._visitors if descriptor not in owners]
         held = {descriptor: self._traffic.held(descriptor) for descriptor in (*owners, *strangers)}
         of_strangers = sum(held[descriptor] for descriptor in strangers)
         most = max((held[descriptor] for descriptor in owners), default=0)
-        if max(of_strangers, most) < HOG_BYTES and (what := give_way()):
+        of_strangers += STRANGER_BYTES * len(strangers)
+        if max(of_strangers, most) < HOG_BYTES:
+            what = give_way()
+            if not what:
+                self._drops.count("memory_elsewhere")
             return what
         hog = max(owners, key=lambda descriptor: (held[descriptor], owners[descriptor].number), default=None)
-        if strangers and (hog is None or held[hog] < max(of_strangers, HOG_BYTES)):
+        if strangers and most < of_strangers:
             strangers.reverse()  # of equal ones the newest
             strangers.sort(key=held.__getitem__, reverse=True)
             for descriptor in strangers[: max(1, len(strangers) // 4)]:

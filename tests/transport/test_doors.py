@@ -15,7 +15,7 @@ from iris_session.transport import visitors
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Connection, Peer, Route
 from iris_session.transport.config import SECOND, FrontLimits
-from iris_session.transport.doors import HOG_BYTES, LOOK_NS, MAX_SHOWN, OPENED_PER_S, Doors
+from iris_session.transport.doors import HOG_BYTES, LOOK_NS, MAX_SHOWN, OPENED_PER_S, STRANGER_BYTES, Doors
 from iris_session.transport.limiter import Drops
 from iris_session.transport.memory import LOOK_NS as MEMORY_LOOK_NS
 from iris_session.transport.memory import PATIENCE_NS, MemoryWatch
@@ -188,16 +188,26 @@ def test_what_is_remembered_of_floods_is_bounded(hall: Hall) -> None:
     assert hall.doors.warnings(hall.now_ns)[-1] == "memory ran short: closed Ann"
 
 
-def test_room_is_made_by_the_newest_strangers_when_nobody_stands_out_then_by_the_newest_client(hall: Hall) -> None:
-    crowd = [hall.open() for _ in range(4)]
+def test_room_is_made_by_the_newest_strangers_when_no_client_stands_out(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(4 * HOG_BYTES // STRANGER_BYTES // 3)]
     hall.hello(crowd[0][0], 1)
-    hall.hello(crowd[3][0], 2)
+    hall.hello(crowd[-1][0], 2)
+    newest_first = [theirs for _, theirs in crowd[-2:0:-1]]
+    quarter = len(newest_first) // 4
     assert hall.doors.shed() == "connections without hello"
-    assert [is_closed(theirs) for _, theirs in crowd] == [False, False, True, False]
-    hall.doors.shed()
-    assert hall.doors.shed() == "Ann from 127.0.0.1"
-    assert [is_closed(theirs) for _, theirs in crowd] == [False, True, True, True]
-    assert hall.drops.by_reason == {"memory": 3}
+    assert [is_closed(theirs) for theirs in newest_first] == [True] * quarter + [False] * (len(newest_first) - quarter)
+    assert not is_closed(crowd[0][1])
+    assert not is_closed(crowd[-1][1])
+    assert hall.drops.by_reason == {"memory": quarter}
+
+
+def test_nobody_is_closed_for_memory_that_nobody_holds(hall: Hall) -> None:
+    crowd = [hall.open() for _ in range(3)]
+    hall.hello(crowd[0][0])
+    hall.traffic.handed(crowd[0][0].descriptor, [b"x" * (HOG_BYTES // 2)])
+    assert hall.doors.shed() == ""
+    assert not any(is_closed(theirs) for _, theirs in crowd)
+    assert hall.drops.by_reason == {"memory_elsewhere": 1}
 
 
 def test_room_is_made_by_the_client_for_whom_most_waits_not_by_the_newest(hall: Hall) -> None:
@@ -216,7 +226,7 @@ def test_room_is_made_by_media_where_no_connection_holds_much(hall: Hall) -> Non
     hall.hello(crowd[0][0])
     assert hall.doors.shed(lambda: "media") == "media"
     assert [is_closed(theirs) for _, theirs in crowd] == [False, False]
-    assert hall.doors.shed(lambda: "") == "connections without hello"
+    assert hall.doors.shed(lambda: "") == ""
     hall.traffic.handed(crowd[0][0].descriptor, [b"x" * 2 * HOG_BYTES])
     assert hall.doors.shed(lambda: "media") == "Ann from 127.0.0.1"
 
