@@ -140,9 +140,9 @@ def _is_large(ctx: Context, away_m: float, turn_rad: float) -> bool:
 
 
 def _wait(ctx: Context, p: Participant) -> None:
-    """A clutch is engaged: the wearer is told once what will come."""
+    """A clutch is engaged: the wearer is told once what will come, unless it will slide in unseen."""
     c = p.correction
-    if c is not None and c.T_told is None and _may_tell(ctx, p):
+    if c is not None and c.T_told is None and _is_large(ctx, *_away(p, c)) and _may_tell(ctx, p):
         _tell(ctx, p, c, "the correction waits until you let go")
 
 
@@ -154,8 +154,9 @@ def _may_tell(ctx: Context, p: Participant) -> bool:
 def _tell(ctx: Context, p: Participant, c: Correction, what: str) -> None:
     away_m, turn_rad = _away(p, c)
     c.T_told, p.told_ns = c.T_world_tracking, ctx.now_ns
-    size = f"{away_m * 1e3:.0f} mm and {math.degrees(turn_rad):.1f} degrees"
-    telling.inform(ctx, p, f"the alignment of {p.name} is off by {size}: {what}")
+    far = f"{away_m * 1e3:.0f} mm" if away_m >= 0.001 else ""
+    turned = f"{math.degrees(turn_rad):.1f} degrees" if turn_rad >= 0.001 else ""
+    telling.inform(ctx, p, f"the alignment of {p.name} is off by {' and '.join(filter(None, (far, turned)))}: {what}")
 
 
 def _approach(ctx: Context, p: Participant, c: Correction) -> None:

@@ -172,6 +172,8 @@ def _result(person: Person, r: Result) -> Iterator[str]:
         tilt = math.degrees(r.last.residual_tilt_rad)
         advice = f"; {r.last.advice}" if r.last.advice else ""
         yield f"    solved again: {_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
+    if 2 * r.unused.get("against gravity", 0) > r.looks:
+        yield "    most looks contradict the vertical: the sheet does not lie as configured (on the table, on a wall?)"
     yield from _shown([_compared(one) for one in _worst(r.compared)], len(r.compared), "alignments")
     told = [
         f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} looks: "

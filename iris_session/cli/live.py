@@ -38,6 +38,35 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
+def rounded(value: Any) -> Any:
+    """Floats, also within lists, to four digits; below a tenth of a thousandth they are nothing."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}") if abs(value) >= 1e-4 else 0.0
+    return [rounded(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+class Noteworthy:
+    """Which events are worth a line on a screen; the recording has them all."""
+
+    def __init__(self) -> None:
+        self._agreed: dict[tuple[str, str], bool] = {}  # by pair of headsets: whether they did
+
+    def __call__(self, event: Event) -> bool:
+        from iris_session.doctor.headsets import BEYOND
+        from iris_session.protocol.server_messages import HeadsetsCompared, ParticipantLeft
+
+        body = event.body
+        if isinstance(body, HeadsetsCompared):  # every five seconds for every pair
+            pair = (min(body.a, body.b), max(body.a, body.b))
+            agreed = body.error_m <= BEYOND * body.expected_p95_m
+            changed = self._agreed.get(pair) is not agreed
+            self._agreed[pair] = agreed
+            return changed
+        if isinstance(body, ParticipantLeft) and not body.grace:
+            self._agreed = {pair: agreed for pair, agreed in self._agreed.items() if body.participant not in pair}
+        return body.__struct_config__.tag not in QUIET
+
+
 def event_line(event: Event) -> str:
     """One event as one line of printable text."""
     body = msgspec.to_builtins(event.body)
@@ -54,7 +83,7 @@ def event_line(event: Event) -> str:
     if isinstance(body.get("lease"), dict):
         lease = body.pop("lease")
         body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
-    text = " ".join(f"{key}={value}" for key, value in body.items() if value not in ("", None))
+    text = " ".join(f"{key}={rounded(value)}" for key, value in body.items() if value not in ("", None))
     return printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
 
@@ -68,6 +97,7 @@ class LiveView:
         self._title = title
         self._next_s = 0.0
         self._seen = 0
+        self._noteworthy = Noteworthy()
         self._pipe = -1
         self._pending = b""  # of a refresh that did not fit into the pipe: its rest goes out before any other
         self.skipped = 0
@@ -106,7 +136,7 @@ class LiveView:
             self.skipped += 1
             return
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
-        lines = [event_line(e) for e in fresh if e.body.__struct_config__.tag not in QUIET]
+        lines = [event_line(e) for e in fresh if self._noteworthy(e)]
         status = self._session.status().as_dict()
         status["handovers"] = len(status.get("handovers", ()))  # the list grows as long as the session lasts
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"

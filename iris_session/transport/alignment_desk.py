@@ -21,6 +21,9 @@ from iris_session.transport.touch_desk import TouchDesk
 
 #: What numbers of a stranger can make of linear algebra.
 UNSOLVABLE: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+AGAINST_GRAVITY: Final = (
+    "against gravity (seen wrongly: step closer; if it is most of them, configure how the sheet lies)"
+)
 #: The authority tells a wearer of at most one refusal a second: one that follows another sooner may not have been told.
 _CLOSE_NS: Final = 1_500_000_000
 #: How fast a tracking frame may drift (docs/anchors.md).
@@ -193,7 +196,7 @@ class AlignmentDesk:
         """What the last estimate advises, and why observations were of no use."""
         e = self._estimator
         counted = {"of a void tracking frame": e.stale_epochs, "no poses": e.invalid, "of a wrong size": e.wrong_size}
-        counted["against gravity"] = e.against_gravity
+        counted[AGAINST_GRAVITY] = e.against_gravity
         useless = ", ".join(f"{n} {why}" for why, n in counted.items() if n)
         told = ["" if self._last is None else self._last.advice, self._touches.advice]
         return "; ".join(filter(None, [*told, f"not used: {useless}" if useless else ""]))

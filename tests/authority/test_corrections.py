@@ -6,6 +6,7 @@ import itertools
 import math
 from typing import Any
 
+import msgspec
 import pytest
 
 from anchors.pose import quat_angle, quat_from_yaw
@@ -104,7 +105,7 @@ def test_a_large_correction_is_announced_and_comes_in_one_go() -> None:
     t, anna = settled()
     t.step(anna.says(at(1.05)))
     assert [(e.level, e.participant) for e in t.since(Notice)] == [("info", anna.id)]
-    assert "50 mm and 0.0 degrees" in t.since(Notice)[0].text
+    assert "off by 50 mm: the scene moves" in t.since(Notice)[0].text
     told_ns = t.now_ns
     ((when, alignment),) = rest(t, anna, seconds=3.0)
     assert 2 * SECOND <= when - told_ns <= 2 * SECOND + 20 * MS
@@ -115,7 +116,7 @@ def test_a_large_correction_is_announced_and_comes_in_one_go() -> None:
 def test_a_large_turn_is_large() -> None:
     t, anna = settled()
     t.step(anna.says(at(1.0, math.radians(2.1))))
-    assert len(t.since(Notice)) == 1
+    assert ["off by 2.1 degrees: the scene moves" in e.text for e in t.since(Notice)] == [True]
 
 
 def test_what_was_told_is_what_comes() -> None:
@@ -154,6 +155,22 @@ def test_while_engaged_a_correction_waits_and_is_told_once() -> None:
     assert report(t, anna).pending_m == pytest.approx(0.054)
     anna.sends("left")
     assert [e.alignment.T_world_tracking.p[0] for e in t.since(AlignmentChanged)] == [1.054]
+
+
+def test_a_small_correction_that_waits_is_not_worth_a_word() -> None:
+    """It slides in unseen when the clutch opens; one that says the same, but better, is off by nothing at all."""
+    t, anna = settled()
+    anna.engage("left")
+    better = tuple(0.1 * c for c in SMALL)
+    for x in (1.0, 1.006):
+        t.step(anna.says(msgspec.structs.replace(at(x), covariance=better)))
+        for _ in range(20):
+            t.step(anna.says(anna.sample("left", clutch=True)), dt_ns=20 * MS)
+    assert report(t, anna).pending_m == pytest.approx(0.006)
+    assert notices(t) == []
+    anna.sends("left")
+    assert rest(t, anna, seconds=3.0)[-1][1].T_world_tracking.p[0] == pytest.approx(1.006)
+    assert notices(t) == []
 
 
 def test_letting_go_at_once_after_it_was_told_does_not_bring_it_at_once() -> None:

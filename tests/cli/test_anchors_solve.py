@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
-from anchors.pose import PoseTuple, compose, distance, inverse
+from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
 from iris_session.cli.anchors_around import Anchors, Resolver, fused
 from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
@@ -176,6 +177,18 @@ def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> N
     assert frame["refused"]
     assert "measures 160 mm, not 120 mm" in frame["advice"]
     assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
+
+
+def test_a_sheet_on_the_wall_is_told_to_be_none_that_lies(tmp_path: Path, capsys: Capture) -> None:
+    played, T = Played({"table": TRUE["table"]}), frames()[0]
+    upright: PoseTuple = (TRUE["table"][0], quat_from_rotvec((math.pi / 2.0, 0.0, 0.0)))
+    played.join(1, "p1", "ann")
+    played.look(1, "table", upright, T, 1, n=8)
+    assert main(["anchors", "solve", str(played.write(tmp_path / "session.rrd"))]) == 0
+    shown = capsys.readouterr().out
+    assert "8 against gravity" in shown
+    assert "most looks contradict the vertical: the sheet does not lie as configured" in shown
+    assert "1 sheet was seen" in shown
 
 
 def test_numbers_of_strangers_end_nothing(tmp_path: Path, capsys: Capture) -> None:

@@ -9,15 +9,17 @@ import sys
 
 import pytest
 
-from iris_session.cli.live import LiveView, _table, event_line
+from iris_session.cli.live import LiveView, Noteworthy, _table, event_line
 from iris_session.protocol.common import Lease
 from iris_session.protocol.server_messages import (
     Event,
     Handover,
+    HeadsetsCompared,
     LeaseChanged,
     MarkerAdded,
     ParticipantInfo,
     ParticipantJoined,
+    ParticipantLeft,
 )
 
 STATUS = {
@@ -47,6 +49,26 @@ def test_events_are_lines_to_read() -> None:
     assert "giver=left receiver=right" in event_line(
         Event(4, 0, 0, Handover("hammer", "left", "right", "p1", "p2", 2_000_000))
     )
+
+
+def test_numbers_are_rounded() -> None:
+    compared = HeadsetsCompared("p1", "p2", "table", 0.0012345678, 1e-7, 0.0059999999, (0.1234567, -1e-9, 1.0), 40)
+    line = event_line(Event(1, 0, 0, compared))
+    assert "error_m=0.001235 error_rad=0.0 expected_p95_m=0.006 p_world=[0.1235, 0.0, 1.0] n=40" in line
+
+
+def test_headsets_that_agree_as_before_are_not_worth_a_line() -> None:
+    noteworthy = Noteworthy()
+
+    def told(error_m: float, a: str = "p1", b: str = "p2") -> bool:
+        return noteworthy(Event(1, 0, 0, HeadsetsCompared(a, b, "table", error_m, 0.0, 0.006, (0.0, 0.0, 0.0), 40)))
+
+    assert [told(0.001), told(0.005), told(0.011, "p2", "p1")] == [True, False, False]
+    assert [told(0.02), told(0.03), told(0.004)] == [True, False, True]
+    assert told(0.001, "p1", "p3")
+    assert noteworthy(Event(2, 0, 0, ParticipantLeft("p2", "bye", grace=False)))
+    assert [told(0.001), told(0.001, "p1", "p3")] == [True, False], "somebody new has the name"
+    assert noteworthy(Event(3, 0, 0, MarkerAdded("p1", "hello")))
 
 
 def test_the_table_says_who_is_lost_and_that_everything_stopped() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anchors.pose import IDENTITY_POSE, PoseTuple
+from anchors.pose import IDENTITY_POSE, PoseTuple, quat_from_rotvec
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import Entry, decode_entry, encode_entry
@@ -37,6 +37,19 @@ def test_a_misprinted_sheet_is_told_though_none_of_its_observations_is_used() ->
     proposal = desk.propose(PERIOD)
     assert proposal is not None
     assert not proposal.refused
+
+
+def test_looks_against_gravity_come_with_advice() -> None:
+    """A sheet that hangs on a wall where one that lies is configured, and one of which a few were seen wrongly."""
+    on_a_wall = Pose((0.0, 0.0, -0.5), quat_from_rotvec((math.pi / 2.0, 0.0, 0.0)))
+    desk = AlignmentDesk(ANCHORS, PERIOD)
+    for i in range(8):
+        desk.observe(seen(i, pose=Pose((0.0, 0.0, -0.5), IDENTITY.q)))
+    assert not desk.observe(seen(8, pose=on_a_wall))
+    desk.propose(0)
+    report = desk.report(None, 0)
+    assert report is not None
+    assert "not used: 1 against gravity (seen wrongly: step closer; if it is most of them, configure" in report.advice
 
 
 def test_too_few_observations_are_refused_with_advice_once() -> None:
