@@ -7,7 +7,10 @@ dropped for that subscriber alone, and what somebody gets is decided here, not t
 
 from __future__ import annotations
 
+import sys
 import threading
+import time
+import traceback
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
@@ -28,14 +31,16 @@ ROUND: Final = 16
 MAX_ASKING: Final = 64
 #: When memory runs short, nothing is taken for so long.
 PAUSE_NS: Final = 2_000_000_000
+#: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
+FAULT_S: Final = 0.25
 _SUBSCRIBE: Final = 1
 
 
 class MediaProxy:
     """`hub`, `sources` and `asking` belong to `lock`.
 
-    `sources`: keys that may hand in frames (the empty one: who needs none). `asking`: keys that try to, and are not
-    among them. `doors`, `back_doors`: of `out` and of `remote`.
+    `sources`: keys that may hand in frames (the empty one: who needs none). `asking`: keys that try to, and that nobody
+    has decided about yet; `refused`: those that may not. `doors`, `back_doors`: of `out` and of `remote`.
     """
 
     def __init__(
@@ -57,11 +62,13 @@ class MediaProxy:
         self._now_ns = now_ns
         self._encrypted = encrypted
         self._stopping = False
+        self._said = ""
         self._thread = threading.Thread(target=self._run, name="iris-media", daemon=True)
         self.lock = threading.Lock()
         self.hub = MediaHub()
         self.sources: set[str] = set()
         self.asking: set[str] = set()
+        self.refused: set[str] = set()
 
     @property
     def alive(self) -> bool:
@@ -87,6 +94,24 @@ class MediaProxy:
                 one.close(linger=0)
 
     def _run(self) -> None:
+        while not self._stopping:
+            try:
+                self._serve()
+            except Exception as error:  # a fault of ours: it costs what was under way, and media alone
+                self._begin_anew(error)
+
+    def _begin_anew(self, error: Exception) -> None:
+        """Counts every fault, and tells each the first time in a row."""
+        with self.lock:
+            self.hub.begin_anew()
+            self.hub.count("media_fault")
+        if repr(error) != self._said:
+            self._said = repr(error)
+            text = f"iris-session: a fault in the media thread, which goes on: {self._said}\n"
+            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+        time.sleep(FAULT_S)
+
+    def _serve(self) -> None:
         poller = zmq.Poller()
         for one in (self._out, self._local, self._remote):
             if one is not None:
@@ -180,8 +205,8 @@ class MediaProxy:
         with self.lock:
             welcome = not user or user in self.sources
             if not welcome:
-                self.hub.count("media_source_refused")
-                if len(self.asking) < MAX_ASKING:
+                self.hub.count("media_source_refused" if user in self.refused else "media_source_undecided")
+                if user not in self.refused and len(self.asking) < MAX_ASKING:
                     self.asking.add(user)
         self._back_doors.read(self._now_ns())
         cut = self._back_doors.heard(_descriptor(frames[0]), user, lengths, counts=not welcome)

@@ -28,6 +28,8 @@ MBIT: Final = 125_000.0
 MANY_FRAMES: Final = 20
 #: Roles that may hand in frames from elsewhere.
 SOURCES: Final = frozenset({Role.CAMERA, Role.SOURCE})
+#: Keys that may not, and are remembered for a look.
+MAX_REFUSED: Final = 256
 
 
 class _Told:
@@ -81,8 +83,8 @@ class MediaDesk:
 
     def turn(self, now_ns: int) -> None:
         """Lets in who came and out who left, at once; looks at everybody now and then."""
-        if not self._proxy.alive:
-            raise RuntimeError("the media thread has ended")  # a new front does better
+        if self._proxy.asking:
+            self._decide()
         here = {number for number, one in self._clients.by_number.items() if one.admitted}
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + LOOK_NS
@@ -139,9 +141,7 @@ class MediaDesk:
             reasons, superseded = proxy.hub.take_drops()
             wanted = {number: proxy.hub.wanted(number) for number in self._told}
             tallies = {number: proxy.hub.tally(number) for number in self._told}
-            asking, proxy.asking = proxy.asking, set()
-            known = set(proxy.sources)
-        self._look_at_sources(asking, known)
+        self._decide(again=True)
         for reason, count in reasons.items():
             self._drops.count(reason, n=count)
         for number, count in superseded.items():
@@ -189,20 +189,27 @@ class MediaDesk:
         gateway = self._clients.by_number.get(connection.gateway)
         return connection.key_id if gateway is None else gateway.key_id
 
-    def _look_at_sources(self, asking: set[str], known: set[str]) -> None:
-        """Who may hand in frames: keys with the role, as the list is now."""
+    def _decide(self, *, again: bool = False) -> None:
+        """Who may hand in frames: keys with the role, as the list is now. Whoever just came; `again`: everybody."""
         if self._keyring.key is None:
             return
-        self._names = {}
-        for mark in asking | known:
-            entry = self._keyring.find(mark)
-            if entry is None or self._revoked(mark):
-                continue
-            if not entry.roles or SOURCES.intersection(entry.roles):
-                self._names[mark] = entry.name
-        with self._proxy.lock:
-            self._proxy.hub.stop_sources(known - set(self._names))
-            self._proxy.sources = set(self._names)
+        proxy = self._proxy
+        with proxy.lock:
+            looked = proxy.asking | (proxy.sources | proxy.refused if again else set())
+            proxy.asking = set()
+            names = {mark: name for mark in looked if (name := self._source_name(mark)) is not None}
+            proxy.hub.stop_sources(looked.intersection(proxy.sources).difference(names))
+            proxy.sources = proxy.sources.difference(looked).union(names)
+            refused = proxy.refused.difference(names).union(looked.difference(names))
+            proxy.refused = refused if len(refused) <= MAX_REFUSED else set()  # many keys: each is asked about anew
+        self._names = {mark: name for mark, name in self._names.items() if mark not in looked} | names
+
+    def _source_name(self, mark: str) -> str | None:
+        """Name of a key that may hand in frames."""
+        entry = self._keyring.find(mark)
+        if entry is None or self._revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
+            return None
+        return entry.name
 
     def _budget_of(self, told: _Told, stream: str) -> StreamBudget:
         level = told.grant.levels.get(stream, _first(told.grant))

@@ -239,6 +239,14 @@ class MediaHub:
             self._closed_until_ns = until_ns
         return bool(held)
 
+    def begin_anew(self) -> None:
+        """After a fault: lets go of every frame and of what is due, which may be half noted. Who subscribed stays."""
+        for stream in self._streams.values():
+            stream.push, stream.frames = None, {}
+        for wish in self._wishes.values():
+            wish.pending = False
+        self._pending.clear()
+
     def take_stuck(self) -> set[int]:
         """Descriptors of connections that did not take what was due when media gave way: frames wait in them."""
         stuck, self._stuck = self._stuck, set()

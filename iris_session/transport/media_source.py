@@ -13,11 +13,17 @@ from iris_session.protocol.media import MAX_STREAMS
 
 #: Frames on their way to the front, one of every stream; while it does not take them, new ones are dropped and counted.
 WAITING: Final = MAX_STREAMS
+#: And bytes, of all streams: one of the largest frames in all its classes (24 MiB), and some smaller ones.
+WAITING_BYTES: Final = 32 * 1024 * 1024
 
 
 class MediaSource:
     """May be used by several threads, also while it is closed by one of them. `endpoint`: of
-    `FrontProcess.media_endpoint`; fronts may come and go. Opens nothing before the first frame."""
+    `FrontProcess.media_endpoint`; fronts may come and go. Opens nothing before the first frame.
+
+    Large frames are not copied, which would take a tick loop milliseconds: libzmq's thread reads them, and says when
+    it has done so.
+    """
 
     def __init__(self, endpoint: str) -> None:
         self._endpoint = endpoint
@@ -25,7 +31,14 @@ class MediaSource:
         self._socket: zmq.Socket[bytes] | None = None
         self._lock = threading.Lock()
         self._closed = False
+        self._under_way: list[tuple[zmq.MessageTracker, int]] = []  # what libzmq still reads, and how long it is
         self.dropped = 0
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that libzmq has not handed on yet, of frames that were too large to be copied."""
+        with self._lock:
+            return self._waiting()
 
     def publish(
         self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
@@ -35,14 +48,26 @@ class MediaSource:
         message = encode_media_frames(stream, frames, capture_ns, scene_epoch, encoding)
         with self._lock:
             try:
-                socket = self._open()
-                if socket is not None:
-                    socket.send_multipart(message, zmq.DONTWAIT)
+                if self._send(message):
                     return True
             except zmq.Again:
                 pass
             self.dropped += 1
             return False
+
+    def _send(self, message: list[bytes]) -> bool:
+        socket, waiting = self._open(), self._waiting()
+        if socket is None or (waiting and waiting + sum(map(len, message)) > WAITING_BYTES):
+            return False
+        # What could be changed while it is read (a bytearray) is copied.
+        parts = [zmq.Frame(bytes(part), track=True, copy=None) for part in message]
+        socket.send_multipart(parts, zmq.DONTWAIT, copy=False)
+        self._under_way += [(part.tracker, len(part)) for part in parts if part.tracker is not None]
+        return True
+
+    def _waiting(self) -> int:
+        self._under_way = [(tracker, size) for tracker, size in self._under_way if not tracker.done]
+        return sum(size for _, size in self._under_way)
 
     def _open(self) -> zmq.Socket[bytes] | None:
         if self._socket is None and not self._closed:

@@ -14,11 +14,17 @@ import zmq
 from iris_session.keys import KeyPair
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
+from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
 from iris_session.protocol.media import MediaHeader, media_topic
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
 from iris_session.transport import FrontLimits
+from iris_session.transport import media as media_module
+from iris_session.transport.media import MediaProxy
+from iris_session.transport.media_doors import MediaDoors
+from iris_session.transport.media_hub import Listener
 from iris_session.transport.media_source import MediaSource
+from iris_session.transport.sockets import watch_tcp
 from tests.transport.harness import N_BODIES, FrontSession, RawClient
 from tests.transport.lab import Lab, Open
 
@@ -407,3 +413,99 @@ def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
         pusher.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"), zmq.DONTWAIT)
     except zmq.Again:
         return
+
+
+def test_a_frame_of_a_source_that_nobody_has_decided_about_is_not_refused(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    stage.publishing = False
+    camera = KeyPair.new()
+    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    pusher = _pusher(lab, camera)
+    drops = lab.session.process.link.status.drops
+
+    def known() -> bool:
+        _send(pusher, b"camera")
+        nonlocal drops
+        drops = lab.session.process.link.status.drops
+        return "media_source_undecided" in drops
+
+    stage.until(known, "the first frames come before anybody has looked")
+    viewing = lab.allowed("bob", "observer")[1]
+    stage.joined(viewing, "bob")
+    stage.until(lambda: _send(pusher, b"camera") or "depth" in budgets(viewing), "the camera is let in")
+    assert "media_source_refused" not in lab.session.process.link.status.drops
+    pusher.close()
+
+
+def test_what_waits_for_the_front_is_bounded_in_bytes(tmp_path: Path) -> None:
+    """Nobody takes it. What is large is not copied, and counted until it was handed on."""
+    endpoint = f"ipc://{tmp_path}/media"
+    source, frame = MediaSource(endpoint), bytes(MAX_MEDIA_FRAME_BYTES)
+    largest = {"full": frame, "half": frame, "quarter": frame}
+    taken = [source.publish(f"s{n}", largest, 0, 1, "bytes") for n in range(4)]
+    assert taken == [True, False, False, False]
+    assert source.publish("small", b"x", 0, 1, "bytes")
+    assert source.dropped == 3
+    with zmq.Context() as context, context.socket(zmq.PULL) as front:
+        front.bind(endpoint)
+        assert front.poll(30_000)
+        assert [len(part) for part in front.recv_multipart()[1:]] == [MAX_MEDIA_FRAME_BYTES] * 3
+        deadline = time.monotonic() + 30.0
+        while source.waiting:
+            assert time.monotonic() < deadline, "libzmq is done with it"
+            time.sleep(0.001)
+        assert source.publish("again", largest, 0, 1, "bytes")
+        source.close()
+    assert not source.publish("late", b"x", 0, 1, "bytes")
+
+
+def test_what_is_changed_after_it_was_handed_in_is_sent_as_it_was(tmp_path: Path) -> None:
+    endpoint, picture = f"ipc://{tmp_path}/media", bytearray(b"a" * 200_000)
+    source = MediaSource(endpoint)
+    assert source.publish("cloud", picture, 0, 1, "bytes")  # type: ignore[arg-type]
+    picture[:] = b"b" * len(picture)
+    with zmq.Context() as context, context.socket(zmq.PULL) as front:
+        front.bind(endpoint)
+        assert front.poll(30_000)
+        assert set(front.recv_multipart()[1]) == {ord("a")}
+    source.close()
+
+
+def test_a_fault_costs_what_was_under_way_and_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(media_module, "FAULT_S", 0.001)
+    limits, endpoint = FrontLimits(), f"ipc://{tmp_path}/media"
+    with zmq.Context() as context:
+        out, local, remote = (context.socket(kind) for kind in (zmq.XPUB, zmq.PULL, zmq.PULL))
+        out.setsockopt(zmq.XPUB_MANUAL, 1)
+        port = out.bind_to_random_port("tcp://127.0.0.1")
+        local.bind(endpoint)
+        remote.bind_to_random_port("tcp://127.0.0.1")
+        doors = [
+            MediaDoors(watch_tcp(one, name), limits, 8, 1 << 20, curve=False)
+            for one, name in ((out, "fault-out"), (remote, "fault-in"))
+        ]
+        proxy = MediaProxy(out, *doors, local, remote, time.monotonic_ns, encrypted=False)
+        faults = iter([True] * 3)
+        send = proxy._send
+        monkeypatch.setattr(proxy, "_send", lambda *frame: 1 // 0 if next(faults, False) else send(*frame))
+        with proxy.lock:
+            proxy.hub.allow({1: Listener("", {})})
+        proxy.start()
+        source = MediaSource(endpoint)
+        with context.socket(zmq.SUB) as viewer:
+            viewer.connect(f"tcp://127.0.0.1:{port}")
+            viewer.subscribe(media_topic(1, "cloud"))
+            deadline = time.monotonic() + 30.0
+            while not viewer.poll(5):
+                assert time.monotonic() < deadline, "media go on"
+                source.publish("cloud", b"points", time.monotonic_ns(), 1, "bytes")
+        with proxy.lock:
+            counted = proxy.hub.take_drops()[0]["media_fault"]
+        source.close()
+        proxy.close()
+    said = capfd.readouterr().err
+    assert said.count("a fault in the media thread, which goes on: ZeroDivisionError") == 1
+    assert "Traceback" in said
+    assert counted == 3

@@ -154,6 +154,25 @@ def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [2, 1]
 
 
+def test_after_a_fault_everybody_gets_what_comes_next() -> None:
+    wire = Wire()
+    assert wire.hub.subscribe(ANN, "cloud", "a", 11)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 12)
+
+    def fault(_topic: bytes, _header: bytes, _frame: bytes) -> bool:
+        raise OSError
+
+    wire.full = {ANN, BOB}
+    wire.push()
+    with pytest.raises(OSError):
+        wire.hub.flush(fault, wire.now_ns)
+    wire.full.clear()
+    wire.hub.begin_anew()
+    assert not wire.hub.flush(wire.send, wire.now_ns), "what was under way is lost"
+    wire.push(2)
+    assert [len(got) for got in wire.got.values()] == [2, 2]
+
+
 @pytest.mark.parametrize(
     ("stream", "frames"),
     [
