@@ -78,8 +78,9 @@ class Media:
         self._media_bytes = 0
         self._media_ages: list[int] = []
         self._media_since_ns = 0
-        #: Media messages that do not fit the protocol, or that nobody here asked for.
+        #: Media messages that do not fit the protocol; and frames of a stream that was dropped before they came.
         self.media_malformed = 0
+        self.media_late = 0
 
     def media(self, stream: str) -> MediaFeed:
         """Subscribes to a media stream; one that is not there yet comes when it is. The same feed for the same name.
@@ -176,9 +177,12 @@ class Media:
             try:
                 _, head, data = frames
                 header = decode_media_header(head)
-                feed = self._feeds[header.stream]
-            except (ProtocolError, ValueError, KeyError):
+            except (ProtocolError, ValueError):
                 self.media_malformed += 1
+                continue
+            feed = self._feeds.get(header.stream)
+            if feed is None:  # it was under way when we let go of the stream
+                self.media_late += 1
                 continue
             feed.superseded += feed.stream in seen
             seen.add(feed.stream)

@@ -124,3 +124,15 @@ def test_a_source_hands_in_frames(join: Callable[..., Client]) -> None:
     assert ann.wait_for(comes, DEADLINE_S)
     assert feed.newest is not None
     assert (feed.newest.data, feed.newest.header.capture_ns) == (b"all", 5)
+
+
+@pytest.mark.usefixtures("cloud")
+def test_frames_of_a_stream_that_was_dropped_are_late_and_not_malformed(join: Callable[..., Client]) -> None:
+    ann = join()
+    feed = ann.media("cloud")
+    assert ann.wait_for(lambda _: feed.received >= 3, DEADLINE_S)
+    assert ann._sockets._media is not None
+    assert ann._sockets._media.poll(30_000)  # one is there already
+    ann.drop_media("cloud")
+    assert ann.wait_for(lambda one: one.media_late > 0, DEADLINE_S)
+    assert ann.media_malformed == 0
