@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
-	@echo "make test     lint, strict types, every test: the four below, one after the other"
+	@echo "make test     lint, strict types, every test: the four below"
 	@echo "  make check      lint, format, strict types"
 	@echo "  make test-unit  tests in one process;  make test-unit T=tests/control  those of one room"
 	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_people.py"
@@ -48,22 +48,39 @@ CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 JOBS ?= 2
 T ?= tests
 
-test: check
-	$(MAKE) --no-print-directory test-unit
-	$(MAKE) --no-print-directory test-e2e
-	$(MAKE) --no-print-directory coverage
-
-test-unit: install-dev
-	$(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report= $(T)
+UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report=
 
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
 # These tests run real processes in real time: a machine that is taken away for a second can fail one. When the run was
 # whole and tests failed (status 1), they are named and judged once more, alone; what fails twice fails.
+define E2E
+$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T); status=$$?; \
+if [ $$status -eq 1 ]; then \
+  echo "FAILED AT FIRST, judged once more, alone:"; \
+  $(BIN)/python -m pytest -v -m e2e --last-failed --last-failed-no-failures none $(T); status=$$?; \
+fi
+endef
+
+# Unit tests that start nothing and read no clock: `make test` runs them on what the processes of the tests end to end
+# leave of the machine, which wait for each other a third of the time. `IDLE` takes nothing from who wants to run.
+PURE := $(wildcard $(addprefix tests/,anchors authority control physics protocol scene streams \
+  $(addprefix emulator/test_,behaviours.py behaviours_parts.py demo_casts.py)))
+IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
+
+test: check
+	COVERAGE_FILE=.coverage-live $(UNIT) $(addprefix --ignore=,$(PURE)) tests
+	@mkdir -p build; echo "beside the next, told after it: $(UNIT) $(PURE)"; \
+	COVERAGE_FILE=.coverage-pure $(IDLE) $(UNIT) -p no:cacheprovider --timeout=1800 $(PURE) >build/pure.log 2>&1 & \
+	pure=$$!; trap 'kill $$pure' INT TERM; \
+	$(E2E); wait $$pure; beside=$$?; cat build/pure.log; exit $$((status + beside))
+	$(BIN)/python -m coverage combine --quiet .coverage-live .coverage-pure
+	$(MAKE) --no-print-directory coverage
+
+test-unit: install-dev
+	$(UNIT) $(T)
+
 test-e2e: install-dev
-	@$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T); status=$$?; \
-	if [ $$status -ne 1 ]; then exit $$status; fi; \
-	echo "FAILED AT FIRST, judged once more, alone:"; \
-	$(BIN)/python -m pytest -v -m e2e --last-failed --last-failed-no-failures none $(T)
+	@$(E2E); exit $$status
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import uuid
 from collections.abc import Iterator
 
@@ -62,3 +63,12 @@ def _home_of_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         del os.environ["IRIS_HOME"]
     else:
         os.environ["IRIS_HOME"] = before
+
+
+@pytest.fixture
+def untraced() -> Iterator[None]:
+    """Long plays of physics and control, which no bound of coverage needs: the recorder would double their time."""
+    tracer = sys.gettrace()
+    sys.settrace(None)
+    yield
+    sys.settrace(tracer)

@@ -31,6 +31,8 @@ from iris_session.protocol.server_messages import Event
 DEADLINE_S = 60.0
 #: A server that starts beside others that compute.
 START_S: Final = 90.0
+#: Emulated people that are told to end; after it they are killed.
+GOODBYE_S: Final = 10.0
 #: Commands that end by themselves; and a whole demo, which takes a minute on a machine with time to spare.
 COMMAND_S = 120.0
 DEMO_S = 300.0
@@ -45,7 +47,12 @@ LONGEST: Final = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+    """Long files first; in a file, those who share a session last: it runs no longer than it is used."""
+    places: dict[Path, int] = {}
+    for item in items:
+        name, path = item.path.name, item.path
+        places.setdefault(path, (LONGEST.index(name) if name in LONGEST else len(LONGEST)) * len(items) + len(places))
+    items.sort(key=lambda item: (places[item.path], "house" in getattr(item, "fixturenames", ())))
 
 
 def wait(condition: Callable[[], object], what: str, timeout_s: float = DEADLINE_S) -> None:
@@ -327,6 +334,35 @@ def stage(serve: Callable[..., Server]) -> Iterator[Stage]:
     stage.close()
 
 
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One session of the demo scene for the tests of a file that leave it as it was; what it recorded is verified."""
+    folder = tmp_path_factory.mktemp("house")
+    recording = folder / "session.rrd"
+    server = Server(folder, recording, serve_command("handover", recording))
+    try:
+        yield server
+        server.finish()
+    finally:
+        end_all([server])
+
+
+@pytest.fixture
+def visit(house: Server) -> Iterator[Stage]:
+    """People in the house: the scene is at its beginning, and nobody else is there or holds anything."""
+    with Client(house.address, role="director", name="host", alignment="not_needed").connect(DEADLINE_S) as host:
+
+        def alone() -> bool:
+            others = [p for p in host.mirror.participants.values() if p.id != host.participant_id and p.connected]
+            return not others and not any(lease.holder for lease in host.mirror.leases.values())
+
+        assert host.wait_for(lambda _: alone(), DEADLINE_S), "somebody is still there"
+        host.control("reset")
+    stage = Stage(house)
+    yield stage
+    stage.close()
+
+
 @pytest.fixture
 def emulate(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     """Starts emulated people in a process of their own; what they say is shown when a condition fails."""
@@ -344,7 +380,12 @@ def emulate(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
         return process
 
     yield start
+    for process in started:  # they say goodbye: who is killed keeps robots for a while
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
     for process in started:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(GOODBYE_S)
         if process.poll() is None:
             process.kill()
         process.wait()

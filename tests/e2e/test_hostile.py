@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -63,11 +62,10 @@ class Raw:
         self.socket.close(linger=0)
 
 
-def test_a_thousand_connections_without_hello(serve: Callable[..., Server]) -> None:
-    server = serve()
-    with Client(server.address, role="observer", name="Eve").connect(DEADLINE_S) as eve:
-        crowd = [socket.create_connection(where(server)) for _ in range(1000)]
-        Client(server.address, role="observer", name="Ann").connect(DEADLINE_S).close()
+def test_a_thousand_connections_without_hello(house: Server) -> None:
+    with Client(house.address, role="observer", name="Eve").connect(DEADLINE_S) as eve:
+        crowd = [socket.create_connection(where(house)) for _ in range(1000)]
+        Client(house.address, role="observer", name="Ann").connect(DEADLINE_S).close()
         deadline = time.monotonic() + DEADLINE_S
         while not all(hung_up(one) for one in crowd):
             assert time.monotonic() < deadline, "the silent ones stay"
@@ -77,11 +75,10 @@ def test_a_thousand_connections_without_hello(serve: Callable[..., Server]) -> N
         assert eve.ready
 
 
-def test_slow_talkers_and_half_greetings_are_closed(serve: Callable[..., Server]) -> None:
-    server = serve()
-    with Client(server.address, role="observer").connect(DEADLINE_S) as eve:
+def test_slow_talkers_and_half_greetings_are_closed(house: Server) -> None:
+    with Client(house.address, role="observer").connect(DEADLINE_S) as eve:
         assert eve.connection.welcome is not None
-        host, control = where(server)
+        host, control = where(house)
         ports = (control, eve.connection.welcome.endpoints.state, control - 1)
         slow = [socket.create_connection((host, port)) for port in ports]
         half = [socket.create_connection((host, port)) for port in ports]
@@ -108,9 +105,8 @@ def test_slow_talkers_and_half_greetings_are_closed(serve: Callable[..., Server]
         assert eve.ready
 
 
-def test_nonsense_of_every_depth_is_answered(serve: Callable[..., Server]) -> None:
-    server = serve()
-    raw = Raw(server)
+def test_nonsense_of_every_depth_is_answered(house: Server) -> None:
+    raw = Raw(house)
     raw.socket.send(encode_client(envelope(Hello("observer", "Mallory", secret=os.urandom(16)))))
     raw.said(Welcome)
     deep = b"\x94\x01\x00\xa0" + b"\x91" * 30_000
@@ -122,13 +118,12 @@ def test_nonsense_of_every_depth_is_answered(serve: Callable[..., Server]) -> No
         assert isinstance(fault, ProtocolFault)
         assert fault.code in ("malformed", "too_large", "version")
     raw.close()
-    Client(server.address, role="observer").connect(DEADLINE_S).close()
+    Client(house.address, role="observer").connect(DEADLINE_S).close()
 
 
-def test_a_replayed_hello_does_not_take_over(serve: Callable[..., Server]) -> None:
-    server = serve()
+def test_a_replayed_hello_does_not_take_over(house: Server) -> None:
     secret = os.urandom(16)
-    first = Raw(server)
+    first = Raw(house)
     first.socket.send(encode_client(envelope(Hello("operator", "Ann", alignment="not_needed", secret=secret))))
     welcome = first.said(Welcome)
     assert isinstance(welcome, Welcome)
@@ -136,14 +131,14 @@ def test_a_replayed_hello_does_not_take_over(serve: Callable[..., Server]) -> No
     back = encode_client(
         envelope(Hello("operator", "Ann", alignment="not_needed", secret=secret, resume_token=welcome.resume_token))
     )
-    second = Raw(server)
+    second = Raw(house)
     second.socket.send(back)
     again = second.said(Welcome)
     assert isinstance(again, Welcome)
     assert again.participant_id == welcome.participant_id
     second.socket.send(encode_client(envelope(ClockPing(1), again.connection_epoch)))  # shows that it has its welcome
     second.said(ClockPong)
-    replayed = Raw(server)
+    replayed = Raw(house)
     replayed.socket.send(back)
     answer = replayed.said(Message)
     assert isinstance(answer, Refused)
@@ -152,7 +147,8 @@ def test_a_replayed_hello_does_not_take_over(serve: Callable[..., Server]) -> No
         one.close()
 
 
-def test_a_hundred_subscribers_that_read_nothing(stage: Stage) -> None:
+def test_a_hundred_subscribers_that_read_nothing(visit: Stage) -> None:
+    stage = visit
     ann = stage.join("Ann", "observer")
     stage.run(lambda: ann.ready, "ready")
     welcome = ann.connection.welcome

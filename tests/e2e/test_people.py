@@ -20,6 +20,12 @@ from tests.e2e.conftest import Hand, Server, Stage
 pytestmark = pytest.mark.e2e
 
 
+@pytest.fixture
+def stage(visit: Stage) -> Stage:
+    """One session for all of them."""
+    return visit
+
+
 def _moved(a: PoseTuple, b: PoseTuple) -> float:
     return distance(a[0], b[0])
 
@@ -40,7 +46,6 @@ def test_second_operator_is_denied_and_told_by_whom(stage: Stage) -> None:
     before = hand.tip
     stage.seconds(0.7)
     assert _moved(before, hand.tip) < 1e-4
-    stage.server.finish()
 
 
 def test_operator_moves_the_robot_and_holding_stops_it(stage: Stage) -> None:
@@ -56,7 +61,6 @@ def test_operator_moves_the_robot_and_holding_stops_it(stage: Stage) -> None:
     resting = hand.tip
     stage.seconds(0.5)
     assert _moved(resting, hand.tip) < 5e-4
-    stage.server.finish()
 
 
 def test_killed_while_holding_then_resumes(
@@ -66,7 +70,7 @@ def test_killed_while_holding_then_resumes(
     headset = f"name=ann,behaviour=wander,robot=left,identity_file={tmp_path}/ann.identity"
     watcher = stage.join("watcher", "observer")
     first = emulate(stage.server.address, headset)
-    stage.run(lambda: _applied(watcher, "left"), "ann drives")
+    stage.run(lambda: _applied_since(watcher, "left"), "ann drives")
     lease = watcher.mirror.leases["left"]
     first.kill()
     stage.run(lambda: watcher.mirror.leases["left"].expires_ns > 0, "the lease is kept for a while")
@@ -85,11 +89,6 @@ def test_killed_while_holding_then_resumes(
     assert resumed.holder == lease.holder
     assert resumed.lease_version > lease.lease_version
     stage.run(lambda: _applied_since(watcher, "left"), "ann drives again")
-    stage.server.finish()
-
-
-def _applied(client: Client, robot: str) -> bool:
-    return client.state is not None and any(a.robot == robot for a in client.state.header.applied)
 
 
 def _applied_since(client: Client, robot: str) -> bool:
@@ -126,7 +125,6 @@ def test_late_joiner_has_the_same_state(stage: Stage) -> None:
         )
 
     stage.run(poses_agree, "the late joiner has the same poses")
-    stage.server.finish()
 
 
 def test_recentring_in_motion_does_not_move_the_robot(
@@ -151,16 +149,14 @@ def test_recentring_in_motion_does_not_move_the_robot(
     for (tick0, a), (tick1, b) in itertools.pairwise(tips):
         seconds = (tick1 - tick0) * 0.002
         assert _moved(a, b) <= 0.6 * max(seconds, 0.017), (tick0, tick1)
-    stage.server.finish()
 
 
-def test_wrong_version_is_refused_with_what_is_supported(serve: Callable[..., Server]) -> None:
-    server = serve()
+def test_wrong_version_is_refused_with_what_is_supported(house: Server) -> None:
     context = zmq.Context()
     try:
         socket = context.socket(zmq.DEALER)
         socket.setsockopt(zmq.LINGER, 0)
-        socket.connect(f"tcp://{server.address}")
+        socket.connect(f"tcp://{house.address}")
         socket.send(msgspec.msgpack.encode([99, 0, "", {"type": "hello", "from": "the future"}]))
         assert socket.poll(30_000)
         _, _, message = msgspec.msgpack.decode(socket.recv_multipart()[0])
@@ -170,10 +166,9 @@ def test_wrong_version_is_refused_with_what_is_supported(serve: Callable[..., Se
         socket.close()
     finally:
         context.term()
-    stage = Stage(server)
+    stage = Stage(house)
     stage.join("ann")  # the session takes others as before
     stage.close()
-    server.finish()
 
 
 IMPOSSIBLE: tuple[tuple[PoseTuple, str], ...] = (
@@ -210,7 +205,6 @@ def test_poses_that_cannot_be(stage: Stage) -> None:
         stage.clients.remove(ann)
         ann.close()
         stage.run(lambda: not watcher.mirror.leases["left"].holder, "the robot is free")
-    stage.server.finish()
 
 
 def test_takeover_estop_pause_reset_verify(serve: Callable[..., Server]) -> None:

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,28 +16,26 @@ from tests.e2e.conftest import COMMAND, DEADLINE_S, Server, iris
 pytestmark = pytest.mark.e2e
 
 
-def test_status_for_people_and_programs(serve: Callable[..., Server]) -> None:
-    plain = serve("handover")
-    with Client(plain.address, name="ann", alignment="not_needed").connect(DEADLINE_S).start() as ann:
+def test_status_for_people_and_programs(house: Server) -> None:
+    with Client(house.address, name="ann", alignment="not_needed").connect(DEADLINE_S).start() as ann:
         ann.acquire(["left"])
-        text = iris("status", plain.address, cwd=plain.folder)
+        text = iris("status", house.address, cwd=house.folder)
         assert text.returncode == 0, text.stderr
         assert "ann (p" in text.stdout
         assert "late ticks:" in text.stdout
-        report = json.loads(iris("status", plain.address, "--json", cwd=plain.folder).stdout)
+        report = json.loads(iris("status", house.address, "--json", cwd=house.folder).stdout)
         holders = {robot["name"]: robot["holder_name"] for robot in report["robots"]}
         assert holders == {"left": "ann", "right": ""}
         assert {p["name"] for p in report["participants"]} >= {"ann", "status"}
 
 
-def test_status_of_a_session_that_stands_still(serve: Callable[..., Server]) -> None:
-    server = serve("arm")
-    Client(server.address, role="observer").connect(DEADLINE_S).close()  # it steps
-    server.process.send_signal(signal.SIGSTOP)
+def test_status_of_a_session_that_stands_still(house: Server) -> None:
+    Client(house.address, role="observer").connect(DEADLINE_S).close()  # it steps
+    house.process.send_signal(signal.SIGSTOP)
     try:
-        done = iris("status", server.address, cwd=server.folder)
+        done = iris("status", house.address, cwd=house.folder)
     finally:
-        server.process.send_signal(signal.SIGCONT)
+        house.process.send_signal(signal.SIGCONT)
     assert done.returncode == 0, done.stderr
     assert "STANDS STILL since" in done.stdout.splitlines()[0]
 
@@ -50,13 +47,12 @@ def test_status_of_nothing(tmp_path: Path) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_metrics(serve: Callable[..., Server]) -> None:
-    plain = serve("arm")
-    metrics = iris("status", plain.address, "--prometheus", cwd=plain.folder).stdout
-    assert 'iris_session_robot_held{robot="arm",holder=""} 0' in metrics
+def test_metrics(house: Server) -> None:
+    metrics = iris("status", house.address, "--prometheus", cwd=house.folder).stdout
+    assert 'iris_session_robot_held{robot="right",holder=""} 0' in metrics
     assert "iris_session_stalled 0" in metrics
     with subprocess.Popen(
-        [*COMMAND, "status", plain.address, "--metrics-port", "0"],
+        [*COMMAND, "status", house.address, "--metrics-port", "0"],
         stdout=subprocess.PIPE,
         text=True,
         # Tests that run in the background inherit that Ctrl-C is ignored; a command in a terminal does not.

@@ -11,6 +11,8 @@ from iris_session.emulator.behaviours import Behaviour, Giver, Idle, Receiver, W
 from iris_session.physics.scenes import n_arms_scene
 from tests.emulator.handover_rig import DEVICE, Referee, Rig, handover, verdict
 
+pytestmark = pytest.mark.usefixtures("untraced")
+
 
 def _until(robot: str, phase: str):  # type: ignore[no-untyped-def]
     return lambda rig: rig.behaviours[robot].phase == phase

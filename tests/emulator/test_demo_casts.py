@@ -14,8 +14,7 @@ from tests.models import robot_models
 __all__ = ["robot_models"]
 
 
-@pytest.mark.e2e  # without the recorder of coverage, with which it takes twice as long
-@pytest.mark.usefixtures("robot_models")
+@pytest.mark.usefixtures("robot_models", "untraced")
 def test_everything_changes_hands() -> None:
     """By friction, in mid-air, and ends on a table. Two iiwa, and ALOHA: `tests/e2e/test_demos_paper.py`."""
     rig = demo(make_play("iiwa", 4), seed=0)
@@ -24,7 +23,7 @@ def test_everything_changes_hands() -> None:
     assert rig.fastest_hand < 0.5
 
 
-@pytest.mark.e2e
+@pytest.mark.usefixtures("untraced")
 def test_eight_arms_around_a_table() -> None:
     rig = demo(make_play("handover", 8), seed=3)
     rig.run(40.0, until=over)
