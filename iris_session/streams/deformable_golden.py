@@ -36,7 +36,7 @@ def cloth(rows: int, cols: int, spacing_m: float = 0.01) -> tuple[DeformableTopo
     return DeformableTopology(rows * cols, faces), vertices
 
 
-def shell(side: int, spacing_m: float = 0.02, seed: int = 1) -> tuple[DeformableTopology, Floats]:
+def shell(side: int, spacing_m: float = 0.02) -> tuple[DeformableTopology, Floats]:
     """The outside of a box of `side`^3 vertices that somebody squeezes: closed, and numbered without order."""
     grid = np.array(list(itertools.product(range(side), repeat=3)))
     number = {tuple(place): i for i, place in enumerate(grid.tolist())}
@@ -47,7 +47,7 @@ def shell(side: int, spacing_m: float = 0.02, seed: int = 1) -> tuple[Deformable
             a, b, c, d = (number[tuple(np.insert(np.array(place), axis, end).tolist())] for place in corners)
             faces += [(a, b, c), (a, c, d)]
     used, table = used_vertices(len(grid), faces)
-    shuffled = np.random.default_rng(seed).permutation(len(used))
+    shuffled = np.argsort(_scattered(len(used)))
     places = np.empty((len(used), 3))
     places[shuffled] = grid[used] * spacing_m
     height = places[:, 2:] / (side * spacing_m)
@@ -55,13 +55,18 @@ def shell(side: int, spacing_m: float = 0.02, seed: int = 1) -> tuple[Deformable
     return DeformableTopology(len(used), shuffled[table]), places + np.array((3.0, -2.0, 0.5))
 
 
-def rope(n: int, spacing_m: float = 0.015, seed: int = 2) -> tuple[DeformableTopology, Floats]:
+def rope(n: int, spacing_m: float = 0.015) -> tuple[DeformableTopology, Floats]:
     """A hanging rope whose vertices are numbered without order."""
-    shuffled = np.random.default_rng(seed).permutation(n)
+    shuffled = np.argsort(_scattered(n))
     x = (np.arange(n) - n / 2) * spacing_m
     vertices = np.empty((n, 3))
     vertices[shuffled] = np.stack([x, 0.1 * x, 1.0 + 2.0 * x**2], axis=1)
     return DeformableTopology(n, edges=np.stack([shuffled[:-1], shuffled[1:]], axis=1)), vertices
+
+
+def _scattered(n: int) -> Floats:
+    """(n,) numbers in [0, 1) without visible order, none twice: multiples of the golden ratio."""
+    return np.asarray(np.arange(n) * ((5.0**0.5 - 1.0) / 2.0) % 1.0)
 
 
 def meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
@@ -69,8 +74,8 @@ def meshes() -> Iterator[tuple[str, DeformableTopology, dict[str, Floats]]]:
     topology, vertices = cloth(6, 5)
     broken = vertices.copy()
     broken[3], broken[17] = (np.nan, 0.0, np.inf), (0.25, -5e6, 1.0)
-    scattered = np.random.default_rng(3).uniform(-4000.0, 4000.0, vertices.shape)
-    crumpled = vertices + np.random.default_rng(4).uniform(-0.2, 0.2, vertices.shape)
+    noise = 2.0 * _scattered(vertices.size).reshape(vertices.shape) - 1.0
+    crumpled, scattered = vertices + 0.2 * noise, 4000.0 * noise
     yield (
         "cloth",
         topology,
