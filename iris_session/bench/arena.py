@@ -36,6 +36,7 @@ from iris_session.runtime.session import Session
 #: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
 WARM_UP_S: Final = 3.0
+CLIENTS: Final = "iris_session.bench.clients"
 Log = dict[str, NDArray[Any]]
 
 
@@ -77,13 +78,11 @@ class Measured:
 
 
 class ClientProcess:
-    """The clients of one group."""
+    """The clients of one group. `module`: what they run."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, module: str = CLIENTS) -> None:
         self.job = job
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "iris_session.bench.clients"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+        self._process = subprocess.Popen([sys.executable, "-m", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(msgspec.json.encode(job) + b"\n")
@@ -151,11 +150,15 @@ def measure(
     actions: Sequence[Action] = (),
     keep_poses: bool = False,
     curve: bool = False,
+    module: str = CLIENTS,
+    make_job: Callable[..., Job] = Job,
+    beside: Callable[[Session], None] = lambda _: None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Measured:
     """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
 
-    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times.
+    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `module` and
+    `make_job`: what other clients run, and their jobs. `beside`: what the loop does after every tick, warm-up included.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
@@ -172,7 +175,7 @@ def measure(
         proxy = stack.enter_context(links_before(session, links, seed)) if links else None
         arena = Arena(session, [], {}, proxy)
         for i, group in enumerate(groups):
-            job = Job(
+            job = make_job(
                 session.address,
                 session.origin_ns,
                 str(folder / f"log{i}.npz"),
@@ -180,15 +183,20 @@ def measure(
                 keep_poses,
                 **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
             )
-            process = ClientProcess(job)
+            process = ClientProcess(job, module)
             stack.callback(process.kill)
             arena.processes.append(process)
             arena.by_client.update((spec.name, process) for spec in group)
-        return _run(arena, seconds, actions, keep_poses, progress)
+        return _run(arena, seconds, actions, beside, keep_poses, progress)
 
 
 def _run(
-    arena: Arena, seconds: float, actions: Sequence[Action], keep_poses: bool, progress: Callable[[str], None]
+    arena: Arena,
+    seconds: float,
+    actions: Sequence[Action],
+    beside: Callable[[Session], None],
+    keep_poses: bool,
+    progress: Callable[[str], None],
 ) -> Measured:
     session, processes = arena.session, arena.processes
     waiting = list(processes)
@@ -211,7 +219,12 @@ def _run(
     restart = [] if arena.proxy is None else [(0.0, _begin_profiles)]
     meter = _Meter(session, begin, end)
     script = _Script(arena, begin, [*restart, *actions])
-    session.run(until=lambda: script.due() or meter.passed())
+
+    def until() -> bool:
+        beside(session)
+        return script.due() or meter.passed()
+
+    session.run(until=until)
     _unless_stopped(session)
     stats, cpu_share = meter.result()
     session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))

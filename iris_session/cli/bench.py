@@ -24,11 +24,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench input --operators 4 --robots 4 --seconds 10\n"
         "  iris-session bench slow-client --check\n"
         "  iris-session bench state --profile busy-wifi\n"
-        "  iris-session bench alignment --pairs 2000 --seed 1 --check",
+        "  iris-session bench alignment --pairs 2000 --seed 1 --check\n"
+        "  iris-session bench deformable --check",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment"))
-    parser.add_argument("--clients", type=int, default=16, help="state, slow-client: how many (default: %(default)s)")
+    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable"))
+    parser.add_argument(
+        "--clients", type=int, help="state, slow-client, deformable: how many (default: 16; deformable: 4)"
+    )
     parser.add_argument(
         "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
     )
@@ -36,6 +39,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--robots", type=int, default=8, help="input: seven-joint arms (default: %(default)s)")
     parser.add_argument("--observers", type=int, default=8, help="input: people who look (default: %(default)s)")
     parser.add_argument("--pairs", type=int, default=2000, help="alignment: pairs of headsets (default: %(default)s)")
+    parser.add_argument(
+        "--vertices", type=int, default=10_000, help="deformable: of the cloth, a square number (default: %(default)s)"
+    )
     parser.add_argument("--seconds", type=positive_seconds, help="measured part (default: 20; slow-client: 50)")
     parser.add_argument(
         "--profile",
@@ -62,6 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iris_session.bench.contract import BenchError
 
+    if arguments.clients is None:
+        arguments.clients = 4 if arguments.bench == "deformable" else 16
     _check(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
         raise CommandError(f"--clients {arguments.clients}: slow-client needs two that are slow and one other, so 3")
@@ -85,6 +93,8 @@ def _check(arguments: argparse.Namespace) -> None:
         limits = {"robots": (1, 12), "operators": (1, arguments.robots), "observers": (0, 64)}
     elif arguments.bench == "alignment":
         limits = {"pairs": (10, 100_000)}
+    elif arguments.bench == "deformable":
+        limits = {"clients": (1, 64), "vertices": (16, 10_000)}
     for name, (low, high) in limits.items():
         if not low <= (value := getattr(arguments, name)) <= high:
             per = ", one robot each" if name == "operators" else ""
@@ -105,6 +115,10 @@ def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> B
         from iris_session.bench.slow_client import run_slow_client
 
         return run_slow_client(arguments.clients, arguments.bodies, arguments.seconds or 50.0, **common)
+    if arguments.bench == "deformable":
+        from iris_session.bench.deformable import run_deformable
+
+        return run_deformable(arguments.vertices, arguments.clients, arguments.seconds or 20.0, **common)
     from iris_session.bench.input import run_input
 
     people = (arguments.operators, arguments.robots, arguments.observers)

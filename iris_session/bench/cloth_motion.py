@@ -1,0 +1,154 @@
+"""The motion that `bench deformable` streams: a cloth of 1 m whose corners hands lead, simulated once by MuJoCo.
+
+It is swung, dragged over a ball, let down to the floor, and lifted again, so it folds and wrinkles. To simulate
+100 x 100 vertices takes some minutes (a cloth vertex is a body), so the recording is kept in the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from iris_session.bench.contract import BenchError
+
+HZ: Final = 60
+SECONDS: Final = 6
+EDGE_M: Final = 1.0
+#: Height from which the hands begin.
+TOP_M: Final = 1.4
+#: Three steps a frame.
+TIMESTEP_S: Final = 1.0 / (3 * HZ)
+#: Of the scene and of the file: raise it with either.
+VERSION: Final = 1
+#: Coordinates are kept in 16 bits: 2 m of them in steps of 0.03 mm.
+_LEVELS: Final = 2**16 - 1
+
+_SCENE: Final = """
+<mujoco model="cloth">
+  <option integrator="discrete" solver="CG" timestep="{timestep}" iterations="80" tolerance="1e-6"/>
+  <size memory="1G"/>
+  <worldbody>
+    <geom type="plane" size="3 3 .1"/>
+    <geom type="sphere" size=".18" pos="0.2 0 .6"/>
+    <body name="left" mocap="true" pos="{left}"/>
+    <body name="right" mocap="true" pos="{right}"/>
+    <flexcomp name="cloth" type="grid" dim="2" count="{side} {side} 1" spacing="{spacing} {spacing} {spacing}"
+              pos="0 0 {top}" radius="0.004" mass="0.3">
+      <edge equality="true" solref="0.012 1"/>
+      <contact selfcollide="none"/>
+    </flexcomp>
+  </worldbody>
+  <equality>
+    <connect body1="cloth_0" body2="left" anchor="0 0 0"/>
+    <connect body1="cloth_{last}" body2="right" anchor="0 0 0"/>
+  </equality>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class ClothMotion:
+    """`nodes` (frames, n, 3): coordinates in units of `scale` [m] from `origin` (3,) [m], at 60 Hz. `faces` (m, 3)."""
+
+    nodes: npt.NDArray[np.uint16]
+    origin: npt.NDArray[np.float64]
+    scale: float
+    faces: npt.NDArray[np.int32]
+
+    @property
+    def n_vertices(self) -> int:
+        return int(self.nodes.shape[1])
+
+    def index(self, frame: int) -> int:
+        """Of the recorded frame to show as the `frame`-th: the motion runs to its end and back again."""
+        period = 2 * (len(self.nodes) - 1)
+        return min(frame % period, period - frame % period)
+
+    def vertices(self, index: int) -> npt.NDArray[np.float64]:
+        """(n, 3) [m], world frame."""
+        p_world: npt.NDArray[np.float64] = self.origin + self.nodes[index] * self.scale
+        return p_world
+
+
+def cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+    """The recording of a cloth of `side` x `side` vertices: from the cache, or made now and kept there."""
+    path = _folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
+    try:
+        with path.open("rb") as file, np.load(file) as kept:  # numpy leaves a damaged file open
+            return ClothMotion(kept["nodes"], kept["origin"], float(kept["scale"]), kept["faces"])
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        progress(f"{path} cannot be read ({error}): made anew")
+    motion = simulate(side, seed, progress)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")  # numpy insists on the ending
+    try:
+        np.savez(
+            part, allow_pickle=False, nodes=motion.nodes, origin=motion.origin, scale=motion.scale, faces=motion.faces
+        )
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        progress(f"the recording cannot be kept for the next time: {error}")
+    return motion
+
+
+def simulate(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+    """`SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
+    spacing = EDGE_M / (side - 1)
+    hands = _Hands(seed)
+    left, right = (" ".join(map(str, p)) for p in hands.at(0.0))
+    progress(f"simulating a cloth of {side} x {side} vertices, this once: some minutes for 100 x 100")
+    model = mujoco.MjModel.from_xml_string(
+        _SCENE.format(timestep=TIMESTEP_S, top=TOP_M, left=left, right=right, side=side, spacing=spacing, last=side - 1)
+    )
+    data = mujoco.MjData(model)
+    frames = np.empty((HZ * SECONDS, model.nflexvert, 3))
+    for frame in range(len(frames)):
+        if frame % (HZ // 2) == 0:
+            progress(f"{frame / HZ:g} s of {SECONDS} s are simulated")
+        for _ in range(3):
+            data.mocap_pos[:] = hands.at(data.time)
+            mujoco.mj_step(model, data)
+        frames[frame] = data.flexvert_xpos
+    if not np.isfinite(frames).all():
+        raise BenchError(f"the simulated cloth of {side} x {side} vertices (seed {seed}) diverged: take another --seed")
+    origin = frames.min(axis=(0, 1))
+    scale = float((frames.max(axis=(0, 1)) - origin).max()) / _LEVELS
+    nodes = np.rint((frames - origin) / scale).astype(np.uint16)
+    return ClothMotion(nodes, origin, scale, np.array(model.flex_elem, np.int32).reshape(-1, 3))
+
+
+class _Hands:
+    """Where two hands lead two corners of one edge: slow large movements with small fast ones on top, from rest."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self._phase = rng.uniform(0.0, 2.0 * math.pi, (2, 3))
+        self._hz = rng.uniform(1.2, 2.2, (2, 3))
+
+    def at(self, t: float) -> npt.NDArray[np.float64]:
+        """(2, 3) [m]: left and right at time `t` [s]."""
+        ramp = min(1.0, t)
+        turn = 2.0 * math.pi * t / SECONDS
+        reach = 0.35 * (1.0 - math.cos(turn))  # over the ball and back
+        height = TOP_M - 0.45 * (1.0 - math.cos(turn))  # down to 0.5 m, and up again
+        gap = 0.5 - 0.18 * (1.0 - math.cos(turn))
+        shake = 0.05 * ramp * (np.sin(2.0 * math.pi * self._hz * t + self._phase) - np.sin(self._phase))
+        base = np.array(((-0.5 + reach, -gap, height), (-0.5 + reach, gap, height)))
+        return np.asarray(base + shake)
+
+
+def _folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iris-session" / "bench"

@@ -1,0 +1,226 @@
+"""`bench deformable`: a cloth of 1 m in motion, from the session's loop by the media channel to clients that decode."""
+
+from __future__ import annotations
+
+import functools
+import math
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import zstandard
+
+from iris_session.bench.arena import Log, Measured, grouped, linked, measure
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.cloth_motion import HZ, ClothMotion, cloth_motion
+from iris_session.bench.contract import NO_BARS, BenchError, BenchReport, bar
+from iris_session.bench.deformable_clients import DeformableJob
+from iris_session.physics.scenes import free_bodies_scene
+from iris_session.protocol.names import BudgetClass
+from iris_session.runtime.session import Session
+from iris_session.streams.deformable import COARSER, DeformableDecoder, DeformableEncoder
+from iris_session.streams.deformable_topology import DeformableTopology
+
+STREAM: Final = "cloth"
+BOUND_M: Final = 0.0005
+#: Rigid bodies that move beside the cloth.
+BODIES: Final = 50
+#: Every so manieth recorded frame is encoded for figures that need no session.
+_SAMPLE: Final = 6
+
+
+def run_deformable(
+    vertices: int = 10_000,
+    clients: int = 4,
+    seconds: float = 20.0,
+    seed: int = 0,
+    curve: bool = False,
+    profile: str = "",
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """`vertices` (a square number) of a cloth at 60 Hz to `clients` observers, beside 50 rigid bodies.
+
+    `profile`: everybody joins over a link of this kind of their own; no bar applies then.
+    Reference: the same frames as float32, and as float32 through zstd.
+    """
+    side = math.isqrt(vertices)
+    if side * side != vertices:
+        raise BenchError(f"--vertices {vertices}: the cloth is square, take {side * side} or {(side + 1) ** 2}")
+    motion = cloth_motion(side, seed, progress)
+    topology = DeformableTopology(motion.n_vertices, motion.faces)
+    specs, links = linked([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
+    source = _Source(motion, topology)
+    with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
+        file = Path(folder) / "topology"
+        file.write_bytes(topology.to_bytes())
+        got = measure(
+            free_bodies_scene(BODIES, seed).compile(),
+            grouped(specs),
+            seconds,
+            links=links,
+            seed=seed,
+            curve=curve,
+            module="iris_session.bench.deformable_clients",
+            make_job=functools.partial(DeformableJob, stream=STREAM, topology=str(file)),
+            beside=source.publish,
+            progress=progress,
+        )
+    progress("comparing every delivered frame with the motion")
+    results = {**_results(got, source), **_offline(motion, topology)}
+    bars = [
+        bar(results, "encode_ms_p50", "<=", 1.0),
+        bar(results, "encode_ms_p99", "<=", 1.0),
+        bar(results, "mbit_per_s", "<=", 20.0),
+        bar(results, "max_error_mm", "<=", 0.5),
+        bar(results, "delivered_hz_min", ">=", 59.0),
+    ]
+    params: dict[str, Any] = {"vertices": vertices, "clients": clients, "seconds": seconds, "seed": seed}
+    params |= {"curve": curve, "hz": HZ, "bound_mm": BOUND_M * 1e3}
+    if profile:
+        params |= {"profile": profile, "bars": NO_BARS}
+    return BenchReport("deformable", params, results, () if profile else tuple(bars), _reference(motion))
+
+
+class _Source:
+    """Publishes the motion from the session's loop, 60 frames a second, as `runtime` does with what physics bends.
+
+    `frames`: index into the motion by `capture_ns`. `encoded`: of every frame session time, what it
+    took on the wall and of the processor [ns], and its bytes.
+    """
+
+    def __init__(self, motion: ClothMotion, topology: DeformableTopology) -> None:
+        self.motion, self.topology = motion, topology
+        self._encoder = DeformableEncoder(topology, BOUND_M)
+        self._begin_ns = -1
+        self._next = 0
+        self.frames: dict[int, int] = {}
+        self.encoded: list[tuple[int, int, int, int]] = []
+        self.refused = 0
+
+    def publish(self, session: Session) -> None:
+        """Publishes a frame when it is time."""
+        now_ns = session.clock()
+        if self._begin_ns < 0:
+            self._begin_ns = now_ns
+        due = int((now_ns - self._begin_ns) * HZ // 1_000_000_000)
+        if due < self._next:
+            return
+        self._next = due + 1  # what the loop had no time for is left out
+        index = self.motion.index(due)
+        vertices = self.motion.vertices(index)
+        wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+        made = self._encoder.encode(vertices)
+        wall_ns, cpu_ns = time.perf_counter_ns() - wall_ns, time.thread_time_ns() - cpu_ns
+        size = 0 if made is None else len(made[BudgetClass.FULL])
+        self.encoded.append((now_ns, wall_ns, cpu_ns, size))
+        if made is not None:
+            self.frames[now_ns] = index
+            self.refused += not session.publish_media(STREAM, made, capture_ns=now_ns)
+
+
+def _results(got: Measured, source: _Source) -> dict[str, Any]:
+    """Figures of the window. Bits are those of the messages that were sent to a client, with topic and header."""
+    end_ns = got.begin_ns + got.seconds * 1e9
+    rows = np.array([row[1:] for row in source.encoded if got.begin_ns <= row[0] < end_ns]).reshape(-1, 3)
+    spent, sizes = rows[:, :2] * 1e-6, rows[:, 2]
+    logs = got.logs.values()
+    ages = np.concatenate([(log["handed_ns"] - log["capture_ns"]) * 1e-6 for log in logs])
+    decode = np.concatenate([log["decode_ns"] for log in logs]) * 1e-6
+    if not len(ages) or not len(spent):
+        raise BenchError("no frame of the cloth reached a client within the window")
+    superseded, dropped, malformed, overflow, heads = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    sent = sizes.sum() + np.count_nonzero(sizes) * heads / len(ages)
+    return {
+        "encode_ms_p50": _percentile(spent[:, 0], 50),
+        "encode_ms_p99": _percentile(spent[:, 0], 99),
+        "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
+        "max_error_mm": round(_max_error_m(got.logs, source) * 1e3, 5),
+        "delivered_hz_min": round(min(len(log["handed_ns"]) for log in logs) / got.seconds, 2),
+        "encode_cpu_ms_p50": _percentile(spent[:, 1], 50),
+        "encode_cpu_ms_p99": _percentile(spent[:, 1], 99),
+        "decode_cpu_ms_p50": _percentile(decode, 50),
+        "age_ms_p50": _percentile(ages, 50),
+        "age_ms_p99": _percentile(ages, 99),
+        "bytes_per_frame": round(float(sizes[sizes > 0].mean()), 1),
+        "frames_encoded": len(spent),
+        "frames_refused": source.refused,
+        "frames_superseded": superseded,
+        "frames_dropped": dropped,
+        "frames_malformed": malformed,
+        "frames_not_logged": overflow,
+        "late_tick_share": round(got.stats.late_share, 6),
+        "late_causes": got.late_causes,
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+
+
+def _max_error_m(logs: dict[str, Log], source: _Source) -> float:
+    """Over all vertices of all frames that were delivered. Also checks that clients decoded them as we do here."""
+    decoder = DeformableDecoder(source.topology)
+    errors: dict[tuple[int, int], float] = {}  # by capture and checksum: the same frame goes to every client
+    worst = 0.0
+    for name, log in logs.items():
+        for capture_ns, checksum, payload in _payloads(log):
+            key = (capture_ns, checksum)
+            if key not in errors:
+                decoded = decoder.decode(payload)
+                if zlib.crc32(decoded.data) != checksum:
+                    raise BenchError(f"{name} decoded a frame to other vertices than its bytes hold")
+                truth = source.motion.vertices(source.frames[capture_ns])
+                errors[key] = float(np.linalg.norm(decoded - truth, axis=1).max())
+            worst = max(worst, errors[key])
+    return worst
+
+
+def _payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
+    """`capture_ns`, checksum and bytes of every frame that one client took."""
+    end = np.cumsum(log["sizes"])
+    for i, capture_ns in enumerate(log["capture_ns"]):
+        payload = log["payloads"][end[i] - log["sizes"][i] : end[i]].tobytes()
+        yield int(capture_ns), int(log["checksums"][i]), payload
+
+
+def _offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:
+    """What the coarser classes would cost at 60 Hz, and what of the motion it is measured on."""
+    found: dict[str, Any] = {}
+    for name in (BudgetClass.HALF, BudgetClass.QUARTER):
+        encoder = DeformableEncoder(topology, BOUND_M)
+        sizes = []
+        for index in range(0, len(motion.nodes), _SAMPLE):
+            encoder.reset()
+            made = encoder.encode(motion.vertices(index), (name,))
+            assert made is not None
+            sizes.append(len(made[name]))
+        found[f"{name}_bound_mm"] = BOUND_M * COARSER[name] * 1e3
+        found[f"{name}_mbit_per_s"] = round(float(np.mean(sizes)) * 8e-6 * HZ, 3)
+    pairs = range(0, len(motion.nodes) - 1, _SAMPLE)
+    steps = np.stack([motion.vertices(index + 1) - motion.vertices(index) for index in pairs])
+    speeds = np.linalg.norm(steps, axis=2) * HZ
+    found["vertex_speed_m_per_s_p50"] = _percentile(speeds, 50)
+    found["vertex_speed_m_per_s_p99"] = _percentile(speeds, 99)
+    return found
+
+
+def _reference(motion: ClothMotion) -> dict[str, float]:
+    """The same frames without a codec of their own: float32, and float32 through zstd, level 1."""
+    compressor = zstandard.ZstdCompressor(level=1)
+    sizes, spent_ns = [], []
+    for index in range(0, len(motion.nodes), _SAMPLE):
+        raw = motion.vertices(index).astype("<f4").tobytes()
+        began_ns = time.perf_counter_ns()
+        sizes.append(len(compressor.compress(raw)))
+        spent_ns.append(time.perf_counter_ns() - began_ns)
+    return {
+        "float32_mbit_per_s": round(12 * motion.n_vertices * HZ * 8e-6, 3),
+        "float32_zstd_mbit_per_s": round(float(np.mean(sizes)) * HZ * 8e-6, 3),
+        "float32_zstd_encode_ms_p50": _percentile(np.array(spent_ns) * 1e-6, 50),
+    }
+
+
+def _percentile(values: np.ndarray[Any, Any], q: float) -> float:
+    return round(float(np.percentile(values, q)), 3)
