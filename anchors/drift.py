@@ -32,7 +32,8 @@ _MEDIAN_VARIANCE: Final = math.pi / 2.0  # of a median over that of a mean, Gaus
 class Alarm(NamedTuple):
     """What was seen: `changed` and `differs` ask for a new look, `jump` and `epoch` invalidate the alignment at once.
 
-    `size_m`: by how much; `beside`: other anchors that did not change in that time (then this one was moved)."""
+    `size_m`: by how much; `capture_ns`: when it was found out, of a jump when it was first seen; `beside`: other
+    anchors that did not change in that time (then this one was moved)."""
 
     kind: AlarmKind
     anchor_id: str
@@ -144,11 +145,12 @@ class DriftMonitor:
         reference = self._before(anchor_id, now_ns, new[-1].viewpoint_id)
         jumped = self._jump(new, reference)
         if jumped:
-            beside = self._stayed_beside(anchor_id, new[-self.config.jump_in_a_row].capture_ns, jumped)
+            since_ns = new[-self.config.jump_in_a_row].capture_ns
+            beside = self._stayed_beside(anchor_id, since_ns, jumped)
             if beside:
                 return self._alarm("changed", anchor_id, jumped, now_ns, beside)
             self._forget()
-            return Alarm("jump", anchor_id, jumped, now_ns)
+            return Alarm("jump", anchor_id, jumped, since_ns)
         if len(new) < self.config.min_in_window:
             return None
         now = self._summary(new)

@@ -14,7 +14,7 @@ from anchors.drift import Alarm
 from anchors.pose import PoseTuple, Vec3, is_rigid
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
-from iris_session.protocol.entries import Entry
+from iris_session.protocol.entries import AlignmentProposal, Entry
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, SampleKind
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
@@ -41,20 +41,37 @@ _COVARIANCE: Final = 36
 _REMEMBERED: Final = 4
 
 
+#: Proposals whose pivot is remembered: of 13 s, so that corrections that are announced or slide in find theirs.
+_PIVOTS: Final = 64
+
+
 class _Person:
     """What is kept of one connection. Alarms and proposals are stamped so that their order shows in their times.
 
     `jumped`: tracking epoch and time of the last jump: what was seen before it was seen in another frame, though it may
-    come later (sheets are found in pictures that are tenths of a second old).
+    come later (sheets are found in pictures that are tenths of a second old). `pivots`: where the covariances of the
+    last proposals are stated, oldest first.
     """
 
-    __slots__ = ("alarm_ns", "desk", "jumped", "proposal_ns", "watch")
+    __slots__ = ("alarm_ns", "desk", "jumped", "pivots", "proposal_ns", "watch")
 
     def __init__(self, desk: AlignmentDesk, watch: AlignmentWatch) -> None:
         self.desk = desk
         self.watch = watch
         self.alarm_ns = self.proposal_ns = -1
+        self.pivots: dict[tuple[float, ...], Vec3] = {}
         self.jumped: tuple[int, int] | None = None
+
+    def proposed(self, proposal: AlignmentProposal) -> None:
+        self.pivots.pop(proposal.covariance, None)
+        self.pivots[proposal.covariance] = proposal.pivot_world
+        if len(self.pivots) > _PIVOTS:
+            del self.pivots[next(iter(self.pivots))]
+
+    def pivot_of(self, covariance: tuple[float, ...]) -> Vec3 | None:
+        """Where this covariance is stated: an `Alignment` does not say it, but it was proposed here. One that slides in
+        is wider than what was proposed, and is stated where the newest is."""
+        return self.pivots.get(covariance) or next(reversed(self.pivots.values()), None)
 
     def is_of_before(self, observation: Observation) -> bool:
         """Whether it is of the frame before the last jump."""
@@ -207,14 +224,15 @@ class Anchoring:
         """As the estimators write it. `None`: nothing, or nobody knows how far it may be off."""
         if alignment is None or len(alignment.covariance) != _COVARIANCE or not self.anchors:
             return None
-        newest = person.desk.newest
-        anywhere = next(iter(self.anchors.values()))[0]
+        pivot_world = person.pivot_of(alignment.covariance)
+        if pivot_world is None:  # a front that was started anew
+            pivot_world = next(iter(self.anchors.values()))[0]
         pose = alignment.T_world_tracking
         return AlignmentEstimate(
             (pose.p, pose.q),
             alignment.tracking_epoch,
             alignment.covariance,
-            anywhere if newest is None else newest.pivot_world,
+            pivot_world,
             alignment.error_at_anchor_m,
             residual_tilt_rad=0.0,
             n_observations=0,
@@ -269,6 +287,7 @@ class Anchoring:
             return
         if person.desk.newest is not None and not proposal.refused:
             person.watch.estimated(person.desk.newest)
+            person.proposed(proposal)
         person.proposal_ns = max(now_ns, person.alarm_ns + 1)
         self._offer(Entry(number, number, person.proposal_ns, proposal))
 

@@ -37,6 +37,7 @@ class Comparisons:
         self._check = CrossCheck(config=CrossCheckConfig(max_things=_THINGS))
         self._looks: dict[int, int] = {}  # by connection: how many were taken
         self._moving: dict[int, set[str]] = {}
+        self._epochs: dict[int, int] = {}  # tracking epochs that `_moving` is of
         self._told: dict[Pair, tuple[int, Pair]] = {}  # when, and of how many looks of either
         self._waiting: deque[Pair] = deque()
         self._next_scan_ns = 0
@@ -55,17 +56,18 @@ class Comparisons:
         """One look. False: not kept (no pose, old, out of order, or too many things)."""
         if abs(now_ns - capture_ns) > _PLAUSIBLE_NS:
             return False
-        if thing not in self._anchors:
-            moving = self._moving.setdefault(connection, set())
-            if thing not in moving and len(moving) >= MOVING:
-                return False
-            moving.add(thing)
+        if tracking_epoch > self._epochs.get(connection, tracking_epoch):
+            self._moving.pop(connection, None)  # those of the frame before need not be there any more
+        moving = self._moving.get(connection, set()) | (set() if thing in self._anchors else {thing})
+        if len(moving) > MOVING:
+            return False
         dropped = self._check.dropped
         self._check.see(
             str(connection), thing, T_tracking_thing, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
         )
         if self._check.dropped > dropped:
             return False
+        self._moving[connection], self._epochs[connection] = moving, tracking_epoch
         self._looks[connection] = self._looks.get(connection, 0) + 1
         return True
 
@@ -73,6 +75,7 @@ class Comparisons:
         """Its tracking frame is another one: what it saw before is elsewhere now."""
         self._check.forget(str(connection))
         self._moving.pop(connection, None)
+        self._epochs.pop(connection, None)
 
     def forget_thing(self, thing: str) -> None:
         """It was moved: who looked before saw it elsewhere."""

@@ -206,8 +206,9 @@ def test_a_bump_of_5_cm_is_a_jump_at_the_third_look(seed: int) -> None:
     assert _watch(monitor, look, frame, range(30)) == []
     way = rng.normal(size=3)
     x, y, z = (0.05 * way / np.linalg.norm(way)).tolist()
-    (alarm,) = _watch(monitor, look, shifted(frame, (x, y, z)), range(30, 33))
-    assert (alarm.kind, alarm.capture_ns) == ("jump", 32 * PERIOD)
+    assert _watch(monitor, look, shifted(frame, (x, y, z)), range(30, 32)) == []
+    (alarm,) = _watch(monitor, look, shifted(frame, (x, y, z)), range(32, 33))
+    assert (alarm.kind, alarm.capture_ns) == ("jump", 30 * PERIOD), "the first that was of the new frame"
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -8,7 +8,7 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from anchors.pose import PoseTuple, apply, compose, inverse, quat_from_yaw
+from anchors.pose import PoseTuple, apply, compose, distance, inverse, quat_from_yaw
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, decode_entry, encode_entry
@@ -425,6 +425,40 @@ def test_a_controller_that_both_see_moves_and_is_compared_at_the_same_instants()
     assert not [m for m in (e.message for e in lab.entries) if isinstance(m, AlignmentProposal) and m.refused], (
         "no anchor, and none is missed"
     )
+
+
+def test_controllers_of_an_earlier_tracking_epoch_take_no_room() -> None:
+    """A headset may have four things that move; after it has recentred they may have other names."""
+    lab = Lab()
+    ann, _ = _pair(lab, 0.0)
+    for epoch in (1, 2, 3):
+        ann.epoch = epoch
+        lab.now_ns += 100 * MS
+        for i in range(5):
+            pose = Pose(*compose(inverse(ann.frame), ((0.1 * i, -0.4, 1.0), IDENTITY.q)))
+            ann.observe(Observation(f"thing {epoch} {i}", "controller", pose, lab.now_ns, epoch))
+        assert lab.drops.by_reason["observation_unusable"] == epoch, "one in every epoch is one too many"
+
+
+def test_the_covariance_in_force_is_stated_where_it_was_proposed() -> None:
+    """Though looks at another sheet have moved the pivot of what is proposed meanwhile."""
+    lab = Lab()
+    ann = lab.wearer()
+    ann.survey()
+    accepted = ann.proposals()[-1]
+    for _ in range(3):
+        ann.watch(ann.place("other"), 15, "other")
+    newest = ann.proposals()[-1]
+    assert distance(newest.pivot_world, accepted.pivot_world) > 0.2
+    lab.put_in_force(ann, accepted)
+    in_force = lab.anchoring._people[1].watch.in_force
+    assert in_force is not None
+    assert in_force.pivot_world == accepted.pivot_world
+    assert in_force.error_at(SHEET[0]) == pytest.approx(accepted.error_at_anchor_m)
+    lab.put_in_force(ann, newest, covariance=tuple(2.0 * c for c in newest.covariance))
+    sliding = lab.anchoring._people[1].watch.in_force
+    assert sliding is not None
+    assert sliding.pivot_world == newest.pivot_world
 
 
 def test_a_front_that_was_started_anew_learns_from_a_snapshot_what_is_in_force() -> None:
