@@ -140,7 +140,7 @@ class Part:
             self._hash.update(block)
             self.offset += len(block)
 
-    def append(self, data: bytes) -> None:
+    def append(self, data: bytes | memoryview) -> None:
         """The next bytes. Raises `AssetError` when they cannot be written."""
         rest = memoryview(data)
         try:

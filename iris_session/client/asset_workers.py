@@ -86,7 +86,7 @@ class AssetWorkers:
 
         self._submit(address, work)
 
-    def write(self, address: str, data: bytes) -> None:
+    def write(self, address: str, data: memoryview) -> None:
         """The next bytes of an asset that was `Missing`: `Stored`."""
 
         def work() -> Result:

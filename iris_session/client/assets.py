@@ -127,7 +127,7 @@ class Assets:
                 break
         return bool(messages)
 
-    def _take_message(self, workers: AssetWorkers, frames: list[bytes], now_ns: int) -> None:
+    def _take_message(self, workers: AssetWorkers, frames: list[memoryview], now_ns: int) -> None:
         loader = self._loader
         if len(frames) != _CHUNK_FRAMES:
             outcome = loader.refused(decode_asset_refused(frames[0]), now_ns)

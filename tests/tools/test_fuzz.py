@@ -15,6 +15,7 @@ TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 import fuzz  # noqa: E402
+from fuzz_assets import ASSET_DECODERS  # noqa: E402
 from fuzz_decoders import DECODERS, Decoder  # noqa: E402
 from fuzz_inputs import encoded  # noqa: E402
 from fuzz_media import MEDIA_DECODERS  # noqa: E402
@@ -22,14 +23,16 @@ from fuzz_media import MEDIA_DECODERS  # noqa: E402
 from iris_session.protocol.common import Lease  # noqa: E402
 
 
-@pytest.mark.parametrize("target", [*DECODERS, *MEDIA_DECODERS])
+@pytest.mark.parametrize("target", [*DECODERS, *MEDIA_DECODERS, *ASSET_DECODERS])
 def test_no_decoder_raises_what_it_does_not_promise(target: str) -> None:
     result = fuzz.fuzz(target, 2000, seed=11)
     assert result.findings == []
     assert 0 < result.accepted < result.inputs == 2000
 
 
-@pytest.mark.parametrize(("target", "inputs"), [("connection", 10_000), ("state-stream", 3000), ("core", 3000)])
+@pytest.mark.parametrize(
+    ("target", "inputs"), [("connection", 10_000), ("state-stream", 3000), ("core", 3000), ("asset-loader", 5000)]
+)
 def test_no_conversation_breaks_a_state_machine(target: str, inputs: int) -> None:
     result = fuzz.fuzz(target, inputs, seed=11)
     assert result.findings == []
@@ -37,7 +40,9 @@ def test_no_conversation_breaks_a_state_machine(target: str, inputs: int) -> Non
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(("target", "inputs"), [("front", 10_000), ("front-tcp", 2000), ("front-media", 4000)])
+@pytest.mark.parametrize(
+    ("target", "inputs"), [("front", 10_000), ("front-tcp", 2000), ("front-media", 4000), ("front-assets", 4000)]
+)
 def test_no_peer_breaks_the_front(target: str, inputs: int) -> None:
     """Whole and damaged messages of every type, and damaged handshakes, over real sockets."""
     result = fuzz.fuzz(target, inputs, seed=11)
