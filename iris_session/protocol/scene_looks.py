@@ -80,8 +80,8 @@ class Texture(msgspec.Struct, frozen=True):
 
 
 class MeshLevel(msgspec.Struct, frozen=True):
-    """One level of detail. `max_error_m`: how far its points lie from the exact mesh at most [m], 0: exact. Parts of the
-    exact mesh that are smaller than this may be missing.
+    """One level of detail. `max_error_m`: how far its points lie from the exact mesh at most [m], 0: exact. Parts of
+    the exact mesh that are smaller than this may be missing.
     """
 
     address: Address

@@ -1,8 +1,8 @@
 """Scenes to share: MuJoCo models as specifications with content-addressed assets, their encodings, levels of detail.
 
-Imports only `protocol`. `parse_mujoco` makes, `AssetStore` keeps, `decode_mesh`, `decode_image` and `decode_arrays` read
-(layouts in docs/scene.md); `choose_levels` fits a scene to what a client can draw. MuJoCo is imported by `parse_mujoco`
-alone: take it from `iris_session.scene.mujoco_scene`.
+Imports only `protocol`. `AssetStore` keeps assets; `decode_mesh`, `decode_image`, `decode_arrays` read them (layouts in
+docs/scene.md). `mujoco_scene.parse_mujoco` makes a scene, `budget.choose_levels` fits it to what a client draws. Only
+modules named `mujoco_*` import MuJoCo.
 """
 
 from iris_session.scene.arrays import decode_arrays, encode_arrays

@@ -116,7 +116,7 @@ def require(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence
 
 def filtered(values: Array, kind: str) -> memoryview:
     """The bytes that are compressed, of an array in C order."""
-    if kind == ArrayFilter.NONE:
+    if kind == ArrayFilter.NONE or not values.size:
         return _bytes(values)
     if kind == ArrayFilter.UP:
         rows = values.reshape(values.shape[0], -1).view(np.uint8)

@@ -32,8 +32,7 @@ def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | N
         return None
     points, inverse = np.unique(mesh.position.astype(np.float64), axis=0, return_inverse=True)
     index = inverse.reshape(-1)[mesh.index].astype(np.int64)
-    corners = points[index]
-    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+    area = float(np.linalg.norm(_across(points[index]), axis=1).sum())
     cell = np.sqrt(max(area, 1e-18) / triangles)  # a cell of surface is about two triangles; `area` is twice the area
     best: tuple[Doubles, Ints, float] | None = None
     for _ in range(_TRIES):
@@ -57,7 +56,10 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
     order = np.lexsort((off, cluster))
     keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # of each cell the point nearest to the mean
     faces = cluster[index]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[whole]
+    turned_over = np.einsum("fc,fc->f", _across(points[index[whole]]), _across(points[keep][faces])) < 0
+    faces[turned_over] = faces[turned_over][:, ::-1]
     turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
     faces = np.unique(np.take_along_axis(faces, turned % 3, axis=1), axis=0) if len(faces) else faces
     used, faces = np.unique(faces, return_inverse=True)
@@ -68,7 +70,7 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
 def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
     """Corners with area-weighted normals, creased by `CREASE`."""
     corners = points[faces]
-    face_normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face_normal = _across(corners)
     vertex_normal = np.zeros_like(points)
     for k in range(3):
         np.add.at(vertex_normal, faces[:, k], face_normal)
@@ -77,6 +79,12 @@ def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
     creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE
     normal[creased] = np.broadcast_to(face_normal[:, None], normal.shape)[creased]
     return index_corners(corners.astype(np.float32), normal.astype(np.float32), None)
+
+
+def _across(corners: Doubles) -> Doubles:
+    """Normals of triangles (n, 3, 3), as long as twice the area."""
+    normals: Doubles = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals
 
 
 def unit(vectors: NDArray[Any]) -> NDArray[Any]:

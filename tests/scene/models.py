@@ -1,0 +1,147 @@
+"""Models for the tests of scenes: one with every shape, mapping and kind of light; a large one; one with flexes."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+#: A closed solid without symmetry, so that MuJoCo finds the same inertial frame for it again.
+WEDGE = "0 0 0  .5 0 0  0 .35 0  0 0 .2"
+#: A square with texture coordinates, drawn from both sides.
+QUAD = (
+    'vertex="-.3 -.3 0 .3 -.3 0 .3 .3 .1 -.3 .3 0" texcoord="0 0 1 0 1 1 0 1" '
+    'face="0 1 2 0 2 3 0 2 1 0 3 2" inertia="shell"'
+)
+SHAPES = {
+    "sphere": "type='sphere' size='.3'",
+    "capsule": "type='capsule' size='.15 .25'",
+    "ellipsoid": "type='ellipsoid' size='.35 .2 .25'",
+    "cylinder": "type='cylinder' size='.25 .2'",
+    "box": "type='box' size='.3 .2 .25'",
+    "plane": "type='plane' size='.35 .25 .1'",
+    "wedge": "type='mesh' mesh='wedge'",
+    "quad": "type='mesh' mesh='quad'",
+    "hills": "type='hfield' hfield='hills'",
+}
+LOOKS = ("", "image", "uniform", "cube", "cubeuniform", "plain")
+
+
+def every_shape() -> mujoco.MjModel:
+    """Every shape in every look, on a floor without end, under a sky, lit by spots and a sun."""
+    rng = np.random.default_rng(4)
+    hills = " ".join(f"{v:.3f}" for v in rng.uniform(0, 1, 30))
+    faces = " ".join(f'file{face}="{face}.png"' for face in ("right", "left", "up", "down", "front", "back"))
+    geoms = []
+    for row, shape in enumerate(SHAPES.values()):
+        for column, look in enumerate(LOOKS):
+            wears = f'material="{look}"' if look else f'rgba=".{row} .{column + 3} .7 1"'
+            geoms.append(
+                f'<body pos="{0.9 * column} {0.9 * row} .5" euler="{20 * column} {10 * row} {30 * column}">'
+                f"<geom {shape} {wears}/></body>"
+            )
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><compiler angle="degree"/><statistic center="2.2 3.6 .5" extent="4"/><asset>
+        <texture name="sky" type="skybox" builtin="gradient" rgb1=".2 .4 .8" rgb2="1 1 .8" width="64" height="64"/>
+        <texture name="image" type="2d" file="image.png"/>
+        <texture name="dice" type="cube" {faces}/>
+        <material name="image" texture="image" texrepeat="2 3" specular=".2" shininess=".9"/>
+        <material name="uniform" texture="image" texrepeat="4 2" texuniform="true" emission=".3"/>
+        <material name="cube" texture="dice" rgba="1 .9 .8 1"/>
+        <material name="cubeuniform" texture="dice" texuniform="true"/>
+        <material name="plain" rgba=".9 .4 .1 .6" specular="1" shininess=".1"/>
+        <mesh name="wedge" vertex="{WEDGE}"/><mesh name="quad" {QUAD}/>
+        <hfield name="hills" nrow="5" ncol="6" size=".35 .3 .2 .05" elevation="{hills}"/>
+        </asset><worldbody>
+        <light type="directional" dir="-.3 .2 -1" diffuse=".4 .4 .3" castshadow="false"/>
+        <light pos="2 2 4" dir="0 0 -1" cutoff="50" exponent="3" attenuation=".5 .1 .02" specular=".8 .2 .2"/>
+        <light type="point" pos="4 4 3" diffuse=".2 .2 .6"/>
+        <geom type="plane" size="0 0 1" material="image"/>
+        <geom type="box" size="9 9 9" rgba="1 0 0 0"/><geom type="box" size="9 9 9" group="4"/>
+        <camera name="top" pos="2 4 12" xyaxes="1 0 0 0 1 0" fovy="50"/>
+        <camera name="flat" pos="2 4 9" xyaxes="1 0 0 0 1 0" fovy="9" projection="orthographic"/>
+        <camera name="real" pos="2 -6 5" xyaxes="1 0 0 0 .6 .8" resolution="240 180" sensorsize=".004 .003"
+                focalpixel="200 210" principalpixel="9 -7"/>
+        {"".join(geoms)}</worldbody></mujoco>""",
+        _pictures(rng),
+    )
+
+
+def _pictures(rng: np.random.Generator) -> dict[str, bytes]:
+    from tests.scene.rebuild import png
+
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:24, :32] = (200, 30, 30)
+    image[24:, 32:] = (30, 200, 60)
+    image[:24, 32:, 2] = np.linspace(0, 255, 32).astype(np.uint8)
+    files = {"image.png": png(image)}
+    for face in ("right", "left", "up", "down", "front", "back"):
+        side = np.full((32, 32, 3), rng.integers(60, 255, 3), np.uint8)
+        side[:8, :16] = 0  # tells up from down, and left from right
+        files[f"{face}.png"] = png(side)
+    return files
+
+
+def many_objects(n: int, assets: int, triangles: int, side: int, seed: int = 0) -> mujoco.MjModel:
+    """`n` free objects that share `assets` meshes of about `triangles` and as many noisy textures of `side` pixels."""
+    from tests.scene.rebuild import png
+
+    rng = np.random.default_rng(seed)
+    spec = mujoco.MjSpec()
+    files: dict[str, bytes] = {}
+    rings = max(3, int((triangles / 2) ** 0.5))
+    for k in range(assets):
+        vertices, faces = _ball(rng, rings)
+        spec.add_mesh(name=f"m{k}", uservert=vertices.reshape(-1), userface=faces.reshape(-1))
+        noise = rng.integers(0, 255, (side, side, 3), dtype=np.uint8)
+        files[f"t{k}.png"] = png(noise)
+        spec.add_texture(name=f"t{k}", type=int(mujoco.mjtTexture.mjTEXTURE_2D), file=f"t{k}.png")
+        material = spec.add_material(name=f"a{k}")
+        material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = f"t{k}"
+    for i in range(n):
+        body = spec.worldbody.add_body(pos=rng.uniform(-3, 3, 3))
+        body.add_freejoint()
+        k = i % assets
+        body.add_geom(type=int(mujoco.mjtGeom.mjGEOM_MESH), meshname=f"m{k}", material=f"a{k}")
+    spec.assets = files
+    return spec.compile()
+
+
+def _ball(rng: np.random.Generator, rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """A dented ball: closed, `2 * rings * rings` triangles."""
+    u = np.arange(rings) / rings * 2 * np.pi
+    v = (np.arange(rings) + 0.5) / rings * np.pi
+    radius = 0.1 * (1 + 0.1 * rng.normal(size=(rings, rings)))
+    around, down = np.meshgrid(u, v)
+    points = radius[..., None] * np.stack(
+        [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)], axis=-1
+    )
+    points = np.concatenate([points.reshape(-1, 3), [[0, 0, 0.1], [0, 0, -0.1]]])
+    top, bottom = len(points) - 2, len(points) - 1
+    faces = []
+    for r in range(rings):
+        for c in range(rings):
+            a, b = r * rings + c, r * rings + (c + 1) % rings
+            if r == 0:
+                faces.append((top, a, b))
+            if r + 1 < rings:
+                faces += [(a, a + rings, b + rings), (a, b + rings, b)]
+            else:
+                faces.append((bottom, b, a))
+    return points, np.array(faces, np.int32)
+
+
+def flexes() -> mujoco.MjModel:
+    """A rope, a cloth with texture coordinates, and a soft body."""
+    return mujoco.MjModel.from_xml_string(
+        """<mujoco><option timestep="0.005" integrator="discrete" solver="CG"/><asset>
+        <texture name="t" type="2d" builtin="checker" width="8" height="8" rgb1="1 0 0"/>
+        <material name="m" texture="t"/></asset><worldbody>
+        <flexcomp name="cloth" type="grid" dim="2" count="5 4 1" spacing=".1 .1 .1" pos="0 0 1" radius=".01"
+                  material="m"><edge equality="true"/></flexcomp>
+        <flexcomp name="rope" type="grid" dim="1" count="6 1 1" spacing=".1 .1 .1" pos="0 1 1" radius=".02">
+          <edge equality="true"/></flexcomp>
+        <flexcomp name="soft" type="grid" dim="3" count="4 4 4" spacing=".1 .1 .1" pos="0 2 1" radius=".005"
+                  dof="trilinear"><elasticity young="1e4" damping=".01"/></flexcomp>
+        <body name="box" pos="1 0 1"><freejoint/><geom size=".1"/></body>
+        </worldbody></mujoco>"""
+    )

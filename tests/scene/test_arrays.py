@@ -1,0 +1,100 @@
+"""The container of arrays: exact there and back, and whatever bytes come, one typed error at most."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from iris_session.protocol.arrays import MAGIC, ArrayHeader, ArrayInfo
+from iris_session.scene import AssetError, decode_arrays, encode_arrays
+from iris_session.scene.arrays import Stored
+
+FILTERS = ("none", "shuffle", "delta", "up")
+
+
+def asset(*infos: ArrayInfo, body: bytes = b"", kind: str = "mesh") -> bytes:
+    header = msgspec.msgpack.encode(ArrayHeader(kind, infos))
+    return MAGIC + len(header).to_bytes(4, "little") + header + body
+
+
+@given(
+    st.sampled_from(["u1", "i1", "<u2", "<u4", "<f4"]),
+    st.sampled_from(FILTERS),
+    st.lists(st.integers(0, 9), min_size=1, max_size=3),
+    st.integers(0, 2**32),
+)
+def test_every_filter_gives_the_same_bits_back(dtype: str, kind: str, shape: list[int], seed: int) -> None:
+    if dtype == "<f4" and kind == "delta":
+        return
+    raw = np.random.default_rng(seed).bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize)
+    values: NDArray[Any] = np.frombuffer(raw, dtype).reshape(shape)
+    back = decode_arrays(encode_arrays("mesh", [Stored("a", values, kind)]), "mesh")["a"]
+    assert back.dtype == values.dtype
+    assert back.shape == values.shape
+    assert back.tobytes() == values.tobytes()
+
+
+def test_smooth_content_shrinks_and_noise_costs_no_more_than_itself() -> None:
+    slope = (np.arange(200)[:, None] + np.arange(300)).astype(np.uint8)
+    noise = np.frombuffer(np.random.default_rng(0).bytes(60_000), np.uint8)
+    assert len(encode_arrays("image", [Stored("a", slope, "up")])) < slope.nbytes / 50
+    assert len(encode_arrays("image", [Stored("a", noise)])) < noise.nbytes + 200
+
+
+@given(st.binary(max_size=200))
+def test_bytes_of_anybody(data: bytes) -> None:
+    for candidate in (data, MAGIC + data, MAGIC + len(data).to_bytes(4, "little") + data):
+        with pytest.raises(AssetError):
+            decode_arrays(candidate, "mesh")
+
+
+@given(st.integers(0, 400), st.integers(0, 255), st.integers(0, 400))
+def test_damaged_assets(at: int, byte: int, length: int) -> None:
+    values = np.arange(600, dtype=np.float32).reshape(-1, 3)
+    good = bytearray(encode_arrays("mesh", [Stored("position", values, "shuffle")]))
+    good[at % len(good)] = byte
+    for damaged in (good, good[:length]):
+        try:
+            decode_arrays(damaged, "mesh")
+        except AssetError:
+            continue
+
+
+HUGE = ArrayInfo("a", "f4", (2**40, 3), 4)
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (asset(HUGE, body=b"abcd"), "at most 1073741824 are read"),
+        (asset(ArrayInfo("a", "f8", (1,), 8), body=bytes(8)), "unknown dtype"),
+        (asset(ArrayInfo("a", "u1", (4,), 4, "wavelet"), body=bytes(4)), "unknown filter"),
+        (asset(ArrayInfo("a", "u1", (4,), 4, codec="lzma"), body=bytes(4)), "unknown compression"),
+        (asset(ArrayInfo("a", "u1", (4,), 5), body=bytes(4)), "lengths in the header"),
+        (asset(ArrayInfo("a", "u1", (4,), 3), body=bytes(3)), "need 4"),
+        (asset(ArrayInfo("a", "u1", (1,), 1), ArrayInfo("a", "u1", (1,), 1), body=bytes(2)), "same name"),
+        (asset(ArrayInfo("a", "u1", (2,), 2, scale=(1.0,), offset=(0.0,)), body=bytes(2)), "scale and offset"),
+        (asset(ArrayInfo("a", "u1", (1,), 1, scale=(float("nan"),), offset=(0.0,)), body=b"a"), "not finite"),
+        (asset(ArrayInfo("a", "u1", (1,), 1), body=b"a", kind="image"), "where 'mesh' is expected"),
+        (asset(ArrayInfo("a", "u1", (9,), 3, codec="zstd"), body=b"abc"), "Zstandard"),
+    ],
+)
+def test_what_is_wrong_is_said(data: bytes, text: str) -> None:
+    with pytest.raises(AssetError, match=text):
+        decode_arrays(data, "mesh")
+
+
+def test_a_bomb_is_refused_before_it_unfolds() -> None:
+    bomb = zstandard.ZstdCompressor().compress(bytes(50_000_000))
+    with pytest.raises(AssetError, match="another size"):
+        decode_arrays(asset(ArrayInfo("a", "u1", (100,), len(bomb), codec="zstd"), body=bomb), "mesh")
+    honest = asset(ArrayInfo("a", "u1", (50_000_000,), len(bomb), codec="zstd"), body=bomb)
+    with pytest.raises(AssetError, match="at most 1000 are read"):
+        decode_arrays(honest, "mesh", max_bytes=1_000)

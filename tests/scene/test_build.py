@@ -1,0 +1,88 @@
+"""Building: nothing twice, levels of detail, damaged notes, and a warm start that encodes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.scene.models import many_objects
+from tests.scene.test_images import picture
+from tests.scene.test_meshes import ball
+
+
+def test_equal_content_is_built_once_and_remembered(tmp_path: Path) -> None:
+    model = many_objects(40, 3, 1_000, 64)
+    cold = parse_mujoco(model, AssetStore(tmp_path))
+    assert (cold.built, cold.recalled) == (6, 0)
+    warm = parse_mujoco(model, AssetStore(tmp_path), threads=1)
+    assert (warm.built, warm.recalled) == (0, 6)
+    assert warm.spec == cold.spec
+    twins = parse_mujoco(many_objects(4, 3, 1_000, 64, seed=0), AssetStore(tmp_path))
+    assert twins.built == 0
+    other = parse_mujoco(model, AssetStore(tmp_path), options=EncodeOptions(levels=False))
+    assert other.built == 6
+
+
+def test_lost_assets_and_damaged_notes_are_built_anew(tmp_path: Path) -> None:
+    model = many_objects(3, 2, 1_000, 64)
+    store = AssetStore(tmp_path)
+    first = parse_mujoco(model, store)
+    store.path(first.spec.meshes[0].levels[0].address).unlink()
+    assert parse_mujoco(model, store).built == 1
+    next(path for path in (tmp_path / "index").rglob("*") if path.is_file()).write_bytes(b"\xc1")
+    again = parse_mujoco(model, store)
+    assert again.built == 1
+    assert again.spec == first.spec
+
+
+def test_levels_of_a_mesh(tmp_path: Path) -> None:
+    store, mesh = AssetStore(tmp_path), ball(5)
+    (note,) = Builder(store).run([Builder(store).mesh([mesh.position], lambda: mesh)])
+    exact, *coarse = note.levels
+    assert np.array_equal(decode_mesh(store.get(exact.address)).index, mesh.index)
+    assert (exact.max_error_m, exact.triangles, exact.bytes) == (0.0, 20_480, store.size(exact.address))
+    assert len(coarse) >= 2
+    for fine, level in zip(note.levels, coarse, strict=False):
+        assert level.triangles < 0.5 * fine.triangles
+        assert level.max_error_m > fine.max_error_m
+        assert decode_mesh(store.get(level.address)).triangles == level.triangles
+    assert np.allclose((note.low, note.high), [(-1, -1, -1), (1, 1, 1)])
+
+
+@pytest.mark.parametrize("encoding", ["arrays", "png", "jpeg"])
+def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store, EncodeOptions(texture_encoding=encoding))
+    pixels = picture(512, 1024)
+    (note,) = builder.run([builder.texture(pixels, "2d")])
+    assert [(level.width, level.height) for level in note.levels] == [(1024, 512), (512, 256)]
+    for level in note.levels:
+        assert level.encoding == encoding
+        assert decode_image(store.get(level.address), encoding).shape == (level.height, level.width, 3)
+    error = np.abs(decode_image(store.get(note.levels[0].address), encoding).astype(int) - pixels).max()
+    assert error == note.levels[0].max_error
+    assert (error > 0) == (encoding == "jpeg")
+
+
+def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store)
+    faces = np.repeat(np.arange(6, dtype=np.uint8) * 40, 512)[:, None, None] * np.ones((1, 512, 3), np.uint8)
+    (note,) = builder.run([builder.texture(faces, "cube")])
+    half = decode_image(store.get(note.levels[1].address), "arrays")
+    assert half.shape == (6 * 256, 256, 3)
+    assert np.array_equal(half[::256, 0, 0], np.arange(6) * 40)
+    assert np.array_equal(half[255::256, 0, 0], np.arange(6) * 40)
+
+
+def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store)
+    blob = np.random.default_rng(0).integers(0, 255, (3, 100, 2), np.uint8)
+    (note,) = builder.run([builder.texture(blob, "2d")])
+    assert note.levels[0].encoding == "opaque"
+    assert store.get(note.levels[0].address) == blob.tobytes()

@@ -1,0 +1,54 @@
+"""A model built back from the decoded scene, drawn by MuJoCo, against MuJoCo's picture of the original."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.protocol.scene import encode_scene
+from iris_session.scene import AssetStore, EncodeOptions
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.models import robot_models
+from tests.scene.models import every_shape
+from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
+from tests.scene.rebuild import rebuild
+
+__all__ = ["robot_models"]
+
+#: Of 255. Edges of textures may fall onto the neighbouring pixel, so few may differ by more than `VISIBLE`.
+MEAN_DIFFERENCE, VISIBLE, VISIBLE_SHARE = 0.5, 24, 0.002
+PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+
+def check(model: mujoco.MjModel, store: AssetStore, views: slice) -> None:
+    parsed = parse_mujoco(model, store, options=EncodeOptions(levels=False))
+    assert parsed.skipped == ()
+    copy = rebuild(encode_scene(parsed.spec), store)
+    pictures = []
+    with graphics():
+        for one in (model, copy):
+            artist = Artist(one)
+            pictures.append([(artist.segments(c), artist.colour(c)) for c in cameras(one)[views]])
+            artist.close()
+    assert pictures[0]
+    solid = np.append(model.geom_type != PLANE, False)  # a floor without end fills every silhouette
+    for (shown, colour), (shown_copy, colour_copy) in zip(*pictures, strict=True):
+        assert silhouette_iou(solid[shown], solid[shown_copy]) >= 0.99
+        assert np.mean(shown == shown_copy) >= 0.99
+        assert colour.std() > 5  # there is something to see
+        difference = np.abs(colour.astype(np.int16) - colour_copy)
+        assert difference.mean() <= MEAN_DIFFERENCE
+        assert np.mean(difference.max(axis=2) > VISIBLE) <= VISIBLE_SHARE
+
+
+@pytest.mark.parametrize(("name", "views"), [("aloha", slice(2, 5)), ("kuka_iiwa_14", slice(0, 3))])
+def test_real_robots_look_the_same(robot_models: Path, tmp_path: Path, name: str, views: slice) -> None:
+    model = mujoco.MjModel.from_xml_path(str(robot_models / "models" / name / "scene.xml"))
+    check(model, AssetStore(tmp_path), views)
+
+
+def test_every_shape_look_and_light_is_the_same(tmp_path: Path) -> None:
+    check(every_shape(), AssetStore(tmp_path), slice(None))

@@ -1,0 +1,79 @@
+"""Textures: exact or within the stated error, and damaged files in every encoding get a typed error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from iris_session.scene import AssetError, decode_image, encode_image
+from iris_session.scene.images import halved
+
+ENCODINGS = ("arrays", "png", "jpeg")
+
+
+def picture(height: int = 60, width: int = 80, channels: int = 3) -> NDArray[np.uint8]:
+    """A soft pattern with noise."""
+    y, x, c = np.meshgrid(np.arange(height), np.arange(width), np.arange(channels), indexing="ij")
+    noise = np.random.default_rng(0).integers(0, 5, y.shape)
+    return (120 + 60 * np.sin(x / 9 + c) + 50 * np.cos(y / 7) + noise).astype(np.uint8)
+
+
+@given(st.integers(1, 20), st.integers(1, 20), st.sampled_from([1, 3, 4]), st.sampled_from(["arrays", "png"]))
+def test_lossless_encodings(height: int, width: int, channels: int, encoding: str) -> None:
+    pixels = picture(height, width, channels)
+    image = encode_image(pixels, encoding)
+    assert image.max_error == 0
+    assert np.array_equal(decode_image(image.data, encoding), pixels)
+
+
+def test_jpeg_states_its_error_and_is_small() -> None:
+    pixels = picture(300, 400)
+    image = encode_image(pixels, "jpeg")
+    error = np.abs(decode_image(image.data, "jpeg").astype(int) - pixels).max()
+    assert 0 < error == image.max_error < 40
+    assert len(image.data) < len(encode_image(pixels).data) / 3
+    with pytest.raises(AssetError, match="use PNG"):
+        encode_image(picture(channels=4), "jpeg")
+
+
+def test_flat_drawings_and_pictures_both_shrink() -> None:
+    checker = (np.indices((256, 256)).sum(axis=0) // 32 % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+    assert len(encode_image(checker).data) < 2_000
+    assert len(encode_image(picture(256, 256)).data) < 0.75 * picture(256, 256).nbytes
+
+
+def test_half_the_size() -> None:
+    assert np.array_equal(halved(np.arange(16, dtype=np.uint8).reshape(4, 4, 1))[..., 0], [[3, 5], [11, 13]])
+    assert halved(picture(5, 1)).shape == (2, 1, 3)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_damaged_images(encoding: str) -> None:
+    good = encode_image(picture(), encoding).data
+    for length in (0, 3, 20, 40):
+        with pytest.raises(AssetError):
+            decode_image(good[:length], encoding)
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        bad = bytearray(good)
+        bad[int(rng.integers(len(bad)))] = int(rng.integers(256))
+        try:
+            decode_image(bad, encoding)
+        except AssetError:
+            continue
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_too_large_is_refused_by_what_the_file_says(encoding: str) -> None:
+    with pytest.raises(AssetError, match="at most 1000"):
+        decode_image(encode_image(picture(), encoding).data, encoding, max_bytes=1_000)
+
+
+def test_unknown_encodings() -> None:
+    with pytest.raises(AssetError, match="unknown encoding"):
+        decode_image(b"", "webp")
+    with pytest.raises(AssetError, match="unknown encoding"):
+        encode_image(picture(), "webp")

@@ -1,0 +1,214 @@
+"""What the parser says of a model: the tree, shapes, looks, names, lights, cameras, deformables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from iris_session.physics import World
+from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
+from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
+from iris_session.scene.mujoco_scene import Parsed, parse_mujoco
+from tests.scene.models import every_shape, flexes
+
+
+def parse(xml: str, folder: Path, **options: Any) -> Parsed:
+    return parse_mujoco(mujoco.MjModel.from_xml_string(xml), AssetStore(folder), **options)
+
+
+def check_tree(model: mujoco.MjModel, spec: SceneSpec) -> None:
+    """The specification says what the stream says, and poses that multiply up to MuJoCo's."""
+    streamed = {info.id: info for info in World(model, (), ()).bodies}
+    by_id = {body.id: body for body in spec.bodies}
+    assert set(streamed) == set(by_id) - {0}
+    assert all(by_id[i].moving == info.moving for i, info in streamed.items())
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for body in spec.bodies:
+        assert body.T_world_body.p == pytest.approx(data.xpos[body.id])
+        assert body.parent < body.id
+    at, rotation, local = np.zeros(3), np.zeros(9), np.zeros(4)
+    for visual in spec.visuals:
+        pose, own = by_id[visual.body].T_world_body, visual.T_body_visual
+        mujoco.mju_rotVecQuat(at, np.array(own.p), np.array(pose.q))
+        assert at + pose.p == pytest.approx(data.geom_xpos[visual.id], abs=1e-9)
+        mujoco.mju_mulQuat(local, np.array(pose.q), np.array(own.q))
+        mujoco.mju_quat2Mat(rotation, local)
+        assert rotation == pytest.approx(data.geom_xmat[visual.id], abs=1e-9)
+
+
+numbers = st.floats(-2, 2, allow_nan=False).map(lambda v: round(v, 4))
+names = st.sampled_from(["", "a", "b", "ü", "x y", "n" * 70])
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+
+
+@st.composite
+def geoms(draw: st.DrawFn, used: set[str]) -> str:
+    kind = draw(st.sampled_from(sorted(SIZES)))
+    size = " ".join(str(draw(st.floats(0.01, 1))) for _ in range(SIZES[kind]))
+    look = draw(
+        st.sampled_from(["", 'material="m"', 'material="m" rgba="1 0 0 .5"', 'rgba=".5 .5 .5 1"', 'rgba="0 0 0 0"'])
+    )
+    place = " ".join(str(draw(numbers)) for _ in range(3))
+    turn = " ".join(str(draw(numbers)) for _ in range(3))
+    group = draw(st.integers(0, 5))
+    shape = f'type="{kind}" size="{size}" pos="{place}" euler="{turn}"'
+    return f'<geom {_name(draw, used, "g")} {shape} group="{group}" {look}/>'
+
+
+def _name(draw: st.DrawFn, used: set[str], kind: str) -> str:
+    """A name that MuJoCo takes: none, or one that nothing else of this kind has."""
+    name = draw(names)
+    if not name or kind + name in used:
+        return ""
+    used.add(kind + name)
+    return f'name="{name}"'
+
+
+@st.composite
+def trees(draw: st.DrawFn, used: set[str], depth: int = 0) -> str:
+    joint = draw(st.sampled_from(["", "<joint/>", "<joint type='slide'/>"] + (["<freejoint/>"] if depth == 0 else [])))
+    mocap = ' mocap="true"' if depth == 0 and not joint and draw(st.booleans()) else ""
+    inside = [draw(geoms(used)) for _ in range(draw(st.integers(1, 2)))]
+    if depth < 3:
+        inside += [draw(trees(used, depth + 1)) for _ in range(draw(st.integers(0, 2)))]
+    place = " ".join(str(draw(numbers)) for _ in range(3))
+    return f'<body {_name(draw, used, "b")} pos="{place}" euler="{place}"{mocap}>{joint}{"".join(inside)}</body>'
+
+
+@st.composite
+def models(draw: st.DrawFn) -> str:
+    used: set[str] = set()
+    bodies = "".join(draw(trees(used)) for _ in range(draw(st.integers(0, 3))))
+    lights = "".join(
+        f'<light type="{draw(st.sampled_from(["spot", "directional", "point"]))}" pos="0 0 {k}"/>'
+        for k in range(draw(st.integers(0, 2)))
+    )
+    return (
+        f'<mujoco><asset><material name="m" rgba=".2 .4 .6 1"/></asset><worldbody>{lights}{bodies}</worldbody></mujoco>'
+    )
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@given(models())
+def test_generated_models(tmp_path: Path, xml: str) -> None:
+    model = mujoco.MjModel.from_xml_string(xml)
+    spec = parse_mujoco(model, AssetStore(tmp_path)).spec
+    assert decode_scene(encode_scene(spec)) == spec
+    check_tree(model, spec)
+    scene = mujoco.MjvScene(model, 500)
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = 1
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mujoco.mjv_updateScene(model, data, option, None, mujoco.MjvCamera(), 7, scene)
+    drawn = {geom.objid: geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)}
+    assert {visual.id for visual in spec.visuals if visual.rgba[3] > 0} == set(drawn)
+    for visual in spec.visuals:
+        if visual.id in drawn:
+            assert visual.rgba == pytest.approx(drawn[visual.id].rgba)
+            assert visual.geometry.size == pytest.approx(drawn[visual.id].size)
+
+
+def test_every_shape_and_its_costs(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(every_shape(), store, name="all").spec
+    assert {visual.geometry.kind for visual in spec.visuals} == {
+        "plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"
+    }  # fmt: skip
+    assert [texture.kind for texture in spec.textures] == ["skybox", "2d", "cube"]
+    assert spec.environment.skybox == 0
+    assert [light.kind for light in spec.lights] == ["directional", "spot", "point"]
+    real = spec.cameras[2]
+    assert (real.focal, real.principal) == (pytest.approx((200, 210)), pytest.approx((9, -7)))
+    assert spec.cameras[1].orthographic
+    addresses = asset_addresses(spec)
+    assert all(store.size(address) == size for address, size in addresses.items())
+    assert spec.totals.asset_bytes == sum(addresses.values())
+    assert spec.totals.objects == sum(visual.rgba[3] > 0 for visual in spec.visuals) == len(spec.visuals) - 1
+    grid = decode_arrays(store.get(spec.hfields[0].address), "grid")["elevation"]
+    assert grid.shape == (5, 6)
+    assert (grid.min(), grid.max()) == (0, 1)
+
+
+def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    model = flexes()
+    spec = parse_mujoco(model, store).spec
+    assert [(d.name, d.dim, d.vertices, d.stream) for d in spec.deformables] == [
+        ("cloth", 2, 20, "flex-0"),
+        ("rope", 1, 6, "flex-1"),
+        ("soft", 3, 64, "flex-2"),
+    ]
+    assert {info.id for info in World(model, (), ()).bodies} | {0} == {body.id for body in spec.bodies}
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for index, deformable in enumerate(spec.deformables):
+        arrays = decode_arrays(store.get(deformable.address), "deformable")
+        start = int(model.flex_vertadr[index])
+        expected = data.flexvert_xpos[start : start + deformable.vertices]
+        assert arrays["position"] == pytest.approx(expected, abs=1e-6)
+        assert arrays["elements"].shape == (deformable.elements, 2 if deformable.dim == 1 else 3)
+        assert arrays["elements"].max() < deformable.vertices
+    assert decode_arrays(store.get(spec.deformables[0].address), "deformable")["uv"].shape == (24, 3, 2)
+
+
+def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
+    xml = """<mujoco><worldbody><body><joint/><geom size=".1"/><site name="a" size=".01"/></body>
+    <site name="b" pos="1 0 0" type="box" size=".01 .02 .03"/><site name="c"/></worldbody>
+    <tendon><spatial name="t" width=".02" rgba="1 0 0 1"><site site="a"/><site site="b"/></spatial></tendon></mujoco>"""
+    plain, tendons, both = (
+        parse(xml, tmp_path, **wanted).spec for wanted in ({}, {"tendons": True}, {"sites": True, "tendons": True})
+    )
+    assert (plain.sites, plain.tendons) == ((), ())
+    assert [site.name for site in tendons.sites] == ["b", "a"]
+    assert [site.name for site in both.sites] == ["b", "c", "a"]
+    assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
+
+
+def test_skins_are_named_as_left_out(tmp_path: Path) -> None:
+    xml = """<mujoco><asset/><deformable><skin name="s" vertex="0 0 0 1 0 0 0 1 0" face="0 1 2">
+    <bone body="b" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/></skin></deformable>
+    <worldbody><body name="b"><geom size=".1"/></body></worldbody></mujoco>"""
+    assert "1 skins" in parse(xml, tmp_path).skipped[0]
+
+
+def test_an_sdf_comes_as_its_mesh(tmp_path: Path) -> None:
+    xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+    <worldbody><geom type="sdf" mesh="m"/></worldbody></mujoco>"""
+    geometry = parse(xml, tmp_path).spec.visuals[0].geometry
+    assert (geometry.kind, geometry.mesh) == ("sdf", 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"version": 2}, "update"),
+        ({"bodies": ()}, "no such body"),
+        ({"materials": ()}, "reference to material"),
+        ({"meshes": ()}, "reference to mesh"),
+        ({"textures": ()}, "reference to texture"),
+        ({"hfields": ()}, "reference to height field"),
+    ],
+)
+def test_dangling_references_are_refused(tmp_path: Path, change: dict[str, Any], text: str) -> None:
+    import msgspec
+
+    spec = parse_mujoco(every_shape(), AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
+    with pytest.raises(SceneError, match=text):
+        decode_scene(encode_scene(msgspec.structs.replace(spec, **change)))
+
+
+@given(st.binary(max_size=100))
+def test_specifications_of_anybody(data: bytes) -> None:
+    for candidate in (data, b"\x80" + data, encode_scene(SceneSpec())[:-1] + data):
+        try:
+            decode_scene(candidate)
+        except SceneError:
+            continue
