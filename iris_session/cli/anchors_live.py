@@ -182,10 +182,11 @@ def run_move(arguments: argparse.Namespace) -> int:
                 "(poses are in metres)"
             )
         client.move_anchor(arguments.anchor, arguments.pose)
-    stay = {one.id: f"{one.name} ({one.id}): {why}" for one in headsets(report) if (why := stays(one))}
-    follow = [one for one in headsets(report) if one.id not in stay]
+    aligned = [p for p in headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
+    stay = {p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := stays(p, arguments.anchor))}
+    follow = [p for p in aligned if p.id not in stay]
     if arguments.json:
-        ids = {"follow": [one.id for one in follow], "stay": list(stay)}
+        ids = {"follow": [p.id for p in follow], "stay": list(stay)}
         print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
         return 0
     by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
@@ -195,12 +196,15 @@ def run_move(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def stays(p: ParticipantReport) -> str:
-    """Why an alignment does not follow an anchor that is moved; empty: it does, as far as it rests on that anchor."""
-    if p.alignment_report is not None and not p.alignment_report.running:
+def stays(p: ParticipantReport, anchor: str) -> str:
+    """Why an alignment does not follow an anchor that is moved; empty: it does."""
+    r = p.alignment_report
+    if r is not None and not r.running:
         return f"its run is stopped; `iris-session anchors align start {p.id}`"
     if p.alignment == AlignmentKind.PLACED:
         return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
+    if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
+        return f"it has not looked at '{anchor}' since it came; it follows when it does"
     return ""
 
 

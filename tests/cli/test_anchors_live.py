@@ -137,6 +137,7 @@ class Session:
         self.mirror = self
         self.asked: list[tuple[Any, ...]] = []
         self.denies: set[str] = set()
+        self.report = REPORT
 
     def align(self, action: str, participant: str) -> None:
         if participant in self.denies:
@@ -150,7 +151,7 @@ class Session:
         self.asked.append((anchor_id, pose))
 
     def status(self) -> StatusReport:
-        return REPORT
+        return self.report
 
 
 @pytest.fixture
@@ -226,14 +227,27 @@ def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: pytest.
     ]
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
-    assert told == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": ["p2"]}
+    assert told == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": []}, "bob is not aligned at all"
 
 
 def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    stopped = msgspec.structs.replace(ANN.alignment_report, running=False)
+    others = [
+        msgspec.structs.replace(ANN, id="p4", name="cay", alignment_report=stopped),
+        msgspec.structs.replace(ANN, id="p5", name="dan", alignment="placed"),
+        msgspec.structs.replace(ANN, id="p6", name="eve", connected=False),
+        msgspec.structs.replace(ANN, id="p7", name="fay", alignment_report=AlignmentReport(3)),
+    ]
+    session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, DESK, *others))
     assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
-    first, *others = capsys.readouterr().out.splitlines()
+    first, *stay = capsys.readouterr().out.splitlines()
     assert first == "anchor 'table' moved by 50 mm: alignments that are measured to it follow (1)"
-    assert others == ["    not that of bob (p2): its run is stopped; `iris-session anchors align start p2`"]
+    assert [line.strip() for line in stay] == [
+        "not that of cay (p4): its run is stopped; `iris-session anchors align start p4`",
+        "not that of dan (p5): a director placed it; `iris-session anchors align start p5` measures it",
+        "not that of eve (p6): it has not looked at 'table' since it came; it follows when it does",
+        "not that of fay (p7): it has not looked at 'table' since it came; it follows when it does",
+    ]
 
 
 def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
