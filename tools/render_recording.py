@@ -41,7 +41,7 @@ def moment_ns(recording: Recording) -> int:
 
 def simulate(recording: Recording, until_ns: int) -> ReplayCore:
     """The session at `until_ns`, from the last keyframe before."""
-    core = ReplayCore(recording.header)
+    core = ReplayCore(recording.header, recording.model)
     rows = {row.step: row for row in takewhile(lambda row: row.now_ns <= until_ns, recording.rows())}
     newest = max((k for k in recording.keyframes() if k.step in rows), key=lambda k: k.step, default=None)
     if newest is not None:

@@ -47,7 +47,8 @@ def _own(ctx: Context, p: Participant) -> tuple[str, ...]:
     """
     plain = not p.name.startswith(KEY_PREFIX) and not _name_taken(ctx, p)
     named = ctx.config.assignments.get(p.name, ()) if plain else ()
-    return tuple(dict.fromkeys((*ctx.config.assignments.get(KEY_PREFIX + p.key_id, ()), *named)))
+    given = (*ctx.config.assignments.get(KEY_PREFIX + p.key_id, ()), *named)
+    return tuple(dict.fromkeys(robot for robot in given if robot in ctx.robots))  # another scene may have others
 
 
 def _name_taken(ctx: Context, p: Participant) -> Denial | None:

@@ -25,24 +25,23 @@ from iris_session.authority import (
     roster,
     samples,
     scaling,
+    scenes,
     stops,
 )
 from iris_session.authority.config import AuthorityConfig, check_config
 from iris_session.authority.context import Context
-from iris_session.authority.state import HOST_ID, LeaseState, Participant, State
+from iris_session.authority.state import HOST_ID, Participant, State
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.entries import HOST, URGENT, Entry
 from iris_session.protocol.names import (
     DenialReason,
-    LeaseMode,
     RejectReason,
     Role,
-    TargetKind,
 )
 from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply, Snapshot
+from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
@@ -65,6 +64,7 @@ HOST_ONLY: Final = (
     em.RecordingGap,
     em.Audit,
     em.SessionResumed,
+    em.SceneLoaded,
 )
 #: Entries that the front makes of its own, for the participant of a connection: no envelope, quota or sign of life.
 FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
@@ -81,10 +81,10 @@ class Authority:
     def __init__(self, config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
         """Raises `ValueError` for names that occur twice, unknown modes, policies, or robots in `assignments`."""
         check_config(config, robots, objects)
-        modes = {r.name: config.default_mode or r.mode for r in robots}
+        self._first = (tuple(robots), tuple(objects))
         state = State(
-            robots={r.name: LeaseState(r.name, TargetKind.ROBOT, modes[r.name]) for r in robots},
-            objects={o.name: LeaseState(o.name, TargetKind.OBJECT, LeaseMode.SHARED) for o in objects},
+            robots=scenes.robot_leases(self._first[0], config.default_mode),
+            objects=scenes.object_leases(self._first[1]),
             participants={HOST_ID: roster.host()},
             anchors={name: corrections.clean(T) for name, T in config.anchors.items()},
         )
@@ -122,7 +122,7 @@ class Authority:
         feedback.report(ctx, commands)
         for connection, request_id in ctx.snapshots:
             if connection in ctx.by_connection:
-                ctx.outgoing.append(Outgoing(connection, self._snapshot(request_id)))
+                ctx.outgoing.append(Outgoing(connection, roster.snapshot(ctx, request_id)))
         state = ctx.state
         return Decision(
             commands,
@@ -146,16 +146,19 @@ class Authority:
         return _encoder.encode(self._ctx.state)
 
     def restore(self, data: bytes) -> None:
-        """Continues from a snapshot of a session with the same robots and objects, else `ValueError`.
+        """Continues from a snapshot of a session that began with the same robots and objects, else `ValueError`.
 
         Raises `msgspec.DecodeError` for bytes that are no snapshot.
         """
         state = _decoder.decode(data)
-        if tuple(state.robots) != tuple(self._ctx.robots) or tuple(state.objects) != tuple(self._ctx.objects):
+        robots, objects = self._first if state.scene is None else (state.scene.robots, state.scene.objects)
+        had, have = [r.name for r in robots], [o.name for o in objects]
+        if list(state.robots) != had or list(state.objects) != have:
             raise ValueError(
                 f"the snapshot has robots {list(state.robots)} and objects {list(state.objects)}, "
-                f"this session has {list(self._ctx.robots)} and {list(self._ctx.objects)}"
+                f"this session has {had} and {have}"
             )
+        self._ctx.use(robots, objects)
         self._ctx.adopt(state)
         self._commands = arbitration.Commands()
 
@@ -168,6 +171,11 @@ class Authority:
     def now_ns(self) -> int:
         """Session time of the newest step, 0 before the first."""
         return self._ctx.state.now_ns or 0
+
+    @property
+    def scene(self) -> em.SceneLoaded | None:
+        """The scene that was loaded last, None while it is the one that the session began with."""
+        return self._ctx.state.scene
 
     @property
     def anchors(self) -> dict[str, Pose]:
@@ -323,28 +331,12 @@ class Authority:
             anchoring.give_anew(ctx, m.anchors)
             stops.gap(ctx, m.gap_ns, "resumed")
             roster.begin_grace_anew(ctx)
+        elif isinstance(m, em.SceneLoaded):
+            scenes.load(ctx, m)
+            self._commands = arbitration.Commands()
         elif isinstance(m, em.StalledGap) and not self._gap_seen:
             self._gap_seen = True
             stops.gap(ctx, m.duration_ns)
-
-    def _snapshot(self, request_id: int) -> Snapshot:
-        """What a late joiner needs; the front adds robots, bodies, scene hash and poses."""
-        ctx, state = self._ctx, self._ctx.state
-        return Snapshot(
-            request_id=request_id,
-            event_seq=state.event_seq,
-            scene_epoch=state.scene_epoch,
-            scene_revision=state.scene_revision,
-            scene_hash="",
-            tick=ctx.view.tick,
-            sim_time=ctx.view.sim_time,
-            session_time=ctx.now_ns,
-            participants=tuple(ctx.info(p) for p in state.participants.values() if p.id != HOST_ID),
-            leases=tuple(ctx.lease_info(lease) for lease in (*state.robots.values(), *state.objects.values())),
-            paused=state.paused,
-            estop=state.estop,
-            episode=state.episode,
-        )
 
 
 def _resumes(entry: Entry) -> bool:

@@ -37,8 +37,7 @@ class Context:
         self, config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec], state: State
     ) -> None:
         self.config = config
-        self.robots = {r.name: r for r in robots}
-        self.objects = {o.name: o for o in objects}
+        self.use(robots, objects)
         #: Scale of a robot that nobody has set another for.
         self.plain_scale = min(max(1.0, config.min_scale), config.max_scale)
         self.view: WorldView = FixedView()
@@ -48,6 +47,11 @@ class Context:
         self.entry_ns = 0
         self.adopt(state)
         self.clear_effects()
+
+    def use(self, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
+        """The robots and objects that there are from now on."""
+        self.robots = {r.name: r for r in robots}
+        self.objects = {o.name: o for o in objects}
 
     def adopt(self, state: State) -> None:
         """Takes over `state` and rebuilds everything derived from it."""

@@ -11,7 +11,7 @@ from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
 from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import AlignmentRun, ParticipantJoined, ParticipantLeft
+from iris_session.protocol.server_messages import AlignmentRun, ParticipantJoined, ParticipantLeft, Snapshot
 from iris_session.protocol.steps import Admitted, Dropped
 
 NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)
@@ -228,3 +228,23 @@ def expire(ctx: Context) -> None:
             lose(ctx, p, "heartbeat")
         elif p.expires_ns and ctx.now_ns >= p.expires_ns:
             remove(ctx, p, "expired")
+
+
+def snapshot(ctx: Context, request_id: int) -> Snapshot:
+    """What a late joiner needs; the front adds robots, bodies, scene hash and poses."""
+    state = ctx.state
+    return Snapshot(
+        request_id=request_id,
+        event_seq=state.event_seq,
+        scene_epoch=state.scene_epoch,
+        scene_revision=state.scene_revision,
+        scene_hash="",
+        tick=ctx.view.tick,
+        sim_time=ctx.view.sim_time,
+        session_time=ctx.now_ns,
+        participants=tuple(ctx.info(p) for p in state.participants.values() if p.id != HOST_ID),
+        leases=tuple(ctx.lease_info(lease) for lease in (*state.robots.values(), *state.objects.values())),
+        paused=state.paused,
+        estop=state.estop,
+        episode=state.episode,
+    )

@@ -36,6 +36,7 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
 from iris_session.protocol.decoding import decoder
 from iris_session.protocol.security import RemoveParticipant
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 #: Connection number of the process that owns the session (its Python API). It acts with the rights of a director.
 HOST: Final = 0
@@ -153,6 +154,20 @@ class SessionResumed(Message, frozen=True, tag="session_resumed"):
     anchors: dict[Name, Pose] = msgspec.field(default_factory=dict)
 
 
+class SceneLoaded(Message, frozen=True, tag="scene_loaded"):
+    """Another scene takes the place of the present one before the ticks of this step (host only).
+
+    `model_hash`: BLAKE2b of the MuJoCo model's binary form, which the recording holds beside the journal. `robots`,
+    `objects`: what is in it. `initial_state`: `mjSTATE_INTEGRATION` to begin with and to reset to; empty: the model's
+    own.
+    """
+
+    model_hash: Name
+    robots: tuple[RobotSpec, ...] = ()
+    objects: tuple[ObjectSpec, ...] = ()
+    initial_state: bytes = b""
+
+
 EntryMessage = (
     Join
     | Lost
@@ -187,6 +202,7 @@ EntryMessage = (
     | RemoveParticipant
     | Audit
     | SessionResumed
+    | SceneLoaded
 )
 
 

@@ -169,7 +169,8 @@ class ParticipantLeft(EventBody, frozen=True, tag="participant_left"):
 
 
 class LeaseChanged(EventBody, frozen=True, tag="lease_changed"):
-    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue."""
+    """`cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
+    scene_changed (another scene was loaded that has no such robot or object)."""
 
     lease: Lease
     cause: Name

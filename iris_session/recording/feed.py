@@ -20,11 +20,11 @@ import zmq
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import Applied
-from iris_session.protocol.server_messages import PresenceItem, Reply
+from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision
 from iris_session.recording import messages
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal
-from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, RecorderStatus, StateFrame
+from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, RecorderStatus, SceneModel, StateFrame
 from iris_session.recording.spill import SpillFile
 
 _T = TypeVar("_T")
@@ -86,6 +86,7 @@ class RecorderFeed:
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.connect(endpoint)
         self._header = b""
+        self._scene: tuple[bytes, ...] = ()  # of the newest `SceneModel`
         self._next = 0
         self._window: deque[tuple[int, bytes]] = deque()
         self._instance = 0
@@ -108,6 +109,14 @@ class RecorderFeed:
         """Names the session: once, before the first row."""
         self._header = messages.encode_header(header)
         self._exchange()
+
+    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None:
+        """The model of a scene, before the row that loads it. States from then on are of its `bodies`."""
+        self.flush()
+        scene = SceneModel(*self._now, model_hash, packed_model, bodies)
+        self._scene = (messages.encode_scene(scene),)
+        self._batch.scenes.append(scene)
+        self.flush()
 
     def row(self, row: JournalRow) -> None:
         """One step. Flushes after 10 rows or 20 ms of session time."""
@@ -164,9 +173,10 @@ class RecorderFeed:
     def flush(self) -> None:
         """Numbers the pending batch and hands over what the window allows. Never blocks."""
         batch = self._batch
-        if batch.rows or batch.states or batch.events or batch.denials or batch.metrics or batch.keyframes:
+        lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
+        lists += (batch.scenes,)
+        if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
-            lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
             self._enqueue(messages.encode_batch(batch), len(batch.rows), sum(len(items) for items in lists))
         self._exchange()
         self.silence_ns = self._now[1] - self._heard_ns if self._window else 0
@@ -256,6 +266,7 @@ class RecorderFeed:
         if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
             self._header_sent_to = self._instance
             first = self._window[0][0] if self._window else self._next
-            self._socket.send_multipart((messages.FRAME.pack(messages.HEADER, first), self._header), zmq.NOBLOCK)
+            head = (messages.FRAME.pack(messages.HEADER, first), self._header, *self._scene)
+            self._socket.send_multipart(head, zmq.NOBLOCK)
             for number, body in self._window:
                 self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)

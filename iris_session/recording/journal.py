@@ -21,7 +21,7 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 #: Of recordings. It changes with what rows, snapshots or their simulation mean: others could only be misread.
-FORMAT: Final = 2
+FORMAT: Final = 3
 CLOSED: Final = "closed"  # all code ours: re-simulated bit for bit
 OPEN: Final = "open"  # a user's loop or a real robot: the plant's state comes from the rows
 HASH_BYTES: Final = 16

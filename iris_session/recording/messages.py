@@ -1,8 +1,9 @@
 """What travels between the authority's feed and the recorder process. Pure.
 
-Authority -> recorder, two frames each: `HEADER` with the number of the batch that follows it, or `BATCH` with its own
-number, then the body. Recorder -> authority: `RecorderStatus`. The feed keeps every batch until a status says that it
-is in the file; a new recorder process asks for the header (`expecting` -1) and gets everything since.
+Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and the scene that was loaded
+last if there is one; or `BATCH` with its own number, and the body. Recorder -> authority: `RecorderStatus`. The feed
+keeps every batch until a status says that it is in the file; a new recorder process asks for the header (`expecting`
+-1) and gets everything since.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import msgspec
 
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
 from iris_session.protocol.decoding import decoder
-from iris_session.protocol.server_messages import Event, PresenceItem
+from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 
 #: Begins the line on standard error that says why the recorder ended; other lines are Rerun's.
@@ -79,8 +80,23 @@ class MetricRecord(msgspec.Struct, frozen=True, array_like=True):
     value: float
 
 
+class SceneModel(msgspec.Struct, frozen=True, array_like=True):
+    """The model of a scene that was loaded in a session; it comes before the row that loads it.
+
+    `step`, `session_time`: of the newest row before that one. `model_hash`: as in `SceneLoaded`. `model`: `pack_model`
+    of its binary form (mjb). `bodies`: the streamed bodies from then on.
+    """
+
+    step: int
+    session_time: Nanoseconds
+    model_hash: Name
+    model: bytes
+    bodies: tuple[BodyInfo, ...] = ()
+
+
 class Batch(msgspec.Struct, array_like=True):
-    """Everything of about 20 ms. `dropped_rows`: rows lost before this batch since the feed began."""
+    """Everything of about 20 ms. `dropped_rows`: rows lost before this batch since the feed began. `scenes` come before
+    everything else in it."""
 
     rows: list[JournalRow] = []
     states: list[StateFrame] = []
@@ -89,6 +105,7 @@ class Batch(msgspec.Struct, array_like=True):
     metrics: list[MetricRecord] = []
     keyframes: list[Keyframe] = []
     dropped_rows: Count = 0
+    scenes: list[SceneModel] = []
 
 
 class _Essence(msgspec.Struct, array_like=True):
@@ -100,6 +117,8 @@ class _Essence(msgspec.Struct, array_like=True):
     denials: msgspec.Raw
     metrics: msgspec.Raw
     keyframes: list[Keyframe]
+    dropped_rows: Count = 0
+    scenes: list[SceneModel] = []
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
@@ -127,6 +146,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
 encode_batch = msgspec.msgpack.Encoder().encode
 decode_batch = decoder(Batch)
 _decode_essence = decoder(_Essence)
+encode_scene = msgspec.msgpack.Encoder().encode
+decode_scene = decoder(SceneModel)
 encode_header = msgspec.msgpack.Encoder().encode
 decode_header = decoder(SessionHeader)
 encode_status = msgspec.msgpack.Encoder().encode
@@ -134,6 +155,6 @@ decode_status = decoder(RecorderStatus)
 
 
 def decode_journal(data: bytes) -> Batch:
-    """Rows and keyframes of a batch of which `decode_batch` cannot read everything. Raises `msgspec.DecodeError`."""
+    """What verification needs of a batch that `decode_batch` cannot read as a whole. Raises `msgspec.DecodeError`."""
     essence = _decode_essence(data)
-    return Batch(rows=essence.rows, keyframes=essence.keyframes)
+    return Batch(rows=essence.rows, keyframes=essence.keyframes, scenes=essence.scenes)

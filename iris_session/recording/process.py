@@ -34,6 +34,7 @@ from iris_session.recording.messages import (
     decode_batch,
     decode_header,
     decode_journal,
+    decode_scene,
     encode_status,
 )
 from iris_session.recording.paths import part_path
@@ -192,12 +193,14 @@ class Recorder:
 
     def _take(self, frames: list[bytes]) -> None:
         """Batches are taken in order only: what a new process gets before its header comes again after it."""
-        if len(frames) != 2 or len(frames[0]) != FRAME.size:
+        if len(frames) not in (2, 3) or len(frames[0]) != FRAME.size:
             return
         kind, number = FRAME.unpack(frames[0])
         if kind == HEADER and self._expecting < 0:
             self._header = decode_header(frames[1])
             self._writer.header(self._header)
+            for scene in frames[2:]:
+                self._writer.add(Batch(scenes=[decode_scene(scene)]))
             self._expecting = number
             self._received = number - 1
         elif kind == BATCH and number == self._expecting:

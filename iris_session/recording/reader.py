@@ -24,8 +24,8 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import Event, PresenceItem
 from iris_session.recording import paths, rrd_file
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.journal import FORMAT, JournalRow, Keyframe, SessionHeader, open_blob, root_of
-from iris_session.recording.messages import DenialRecord, EndMark, decode_header
+from iris_session.recording.journal import FORMAT, JournalRow, Keyframe, SessionHeader, open_blob, root_of, unpack_model
+from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_header, decode_scene
 from iris_session.recording.probe import Prober
 
 _decode_event = msgspec.msgpack.Decoder(Event).decode
@@ -143,9 +143,16 @@ class Recording:
         )
 
     def states(self) -> Iterator[State]:
-        """Poses of all bodies at the state rate, with presence and the applied samples."""
-        n = len(self.header.bodies)
-        return self._unique(paths.STATE, lambda batch: _states(batch, n), lambda state: state.session_time)
+        """Poses of all bodies at the state rate, with presence and the applied samples. Bodies: those of the header, or
+        of the scene that was loaded last."""
+        return self._unique(paths.STATE, _states, lambda state: state.session_time)
+
+    def model(self, model_hash: str) -> bytes:
+        """Binary form (mjb) of the model of a scene that was loaded in the session, else `LookupError`."""
+        for _, scene in self._items(paths.MODELS, _models):
+            if scene.model_hash == model_hash:
+                return unpack_model(scene.model)
+        raise LookupError(f"the recording does not hold the model {model_hash[:12]} of a scene that was loaded")
 
     def events(self) -> Iterator[Event]:
         """The shared history in order of `event_seq`."""
@@ -301,12 +308,22 @@ def _rows(batch: Any) -> Iterator[JournalRow]:
     return (JournalRow(*values) for values in columns)
 
 
-def _states(batch: Any, n_bodies: int) -> Iterator[State]:
+def _models(batch: Any) -> Iterator[SceneModel]:
+    for sealed in _values(batch, "scene"):
+        blob, intact = open_blob(sealed)
+        if not intact:
+            raise ValueError("a model was changed (checksum)")
+        yield decode_scene(blob)
+
+
+def _states(batch: Any) -> Iterator[State]:
     decoders: tuple[tuple[str, Callable[[bytes], Any]], ...] = (
         ("presence", _decode_presence),
         ("applied", _decode_applied),
     )
-    poses = np.asarray(batch.column("poses").flatten(), np.float64).reshape(batch.num_rows, n_bodies, 7)
+    lists = batch.column("poses")
+    ends = np.cumsum(np.asarray(lists.value_lengths(), np.intp))  # another scene has other bodies
+    poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
     columns = zip(
         _index(batch, paths.STEP),
         _index(batch, paths.TICK),

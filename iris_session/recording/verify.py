@@ -42,7 +42,7 @@ PROGRESS_ROWS: Final = 500
 
 
 class Core(Protocol):
-    """The session as a function, made by `make_core(header)` in its initial state."""
+    """The session as a function, made by `make_core(header, models)` in its initial state."""
 
     def step(self, now_ns: int, entries: list[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
         """Takes one step and returns its digest. `plant`: of the row, in class `open`."""
@@ -55,6 +55,10 @@ class Core(Protocol):
     def keyframe(self, step: int) -> Keyframe:
         """The present state, after `step`."""
         ...
+
+
+#: Binary form (mjb) of a scene's model by `SceneLoaded.model_hash`; raises `LookupError` for one that is not there.
+Models = Callable[[str], bytes]
 
 
 class Problem(msgspec.Struct, frozen=True):
@@ -143,7 +147,7 @@ class VerifyReport(msgspec.Struct):
 
 def verify(
     path: str | Path,
-    make_core: Callable[[SessionHeader], Core] | None,
+    make_core: Callable[[SessionHeader, Models], Core] | None,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerifyReport:
     """Verifies the recording `path`; `progress(done, total)` is called with row counts, about every 500 rows.
@@ -158,7 +162,7 @@ def verify(
         report.version_differences = versions.differences(header.versions)
         total = recording.count_rows() if progress else 0
         try:
-            core = make_core(header) if make_core else None
+            core = make_core(header, recording.model) if make_core else None
         except Exception as error:  # a changed header, or another version of the rooms: said in the report
             text = f"the session cannot be built from the header: {_one_line(error)}"
             report.problems.append(Problem(-1, "divergence", "header", text))

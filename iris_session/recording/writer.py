@@ -6,7 +6,6 @@ static in those frames. Exact float64 poses, raw samples and the journal lie bes
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,18 @@ from iris_session.protocol.server_messages import BodyInfo, Event
 from iris_session.recording import paths, scene
 from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
 from iris_session.recording.errors import WriteError
-from iris_session.recording.journal import SessionHeader, seal_blob, unpack_model
-from iris_session.recording.messages import Batch, DenialRecord, EndMark, MetricRecord, StateFrame, encode_header
+from iris_session.recording.journal import SessionHeader, seal_blob
+from iris_session.recording.messages import (
+    Batch,
+    DenialRecord,
+    EndMark,
+    MetricRecord,
+    SceneModel,
+    StateFrame,
+    encode_header,
+    encode_scene,
+)
+from iris_session.recording.pictures import ScenePicture, entity_part
 from iris_session.recording.rrd_stream import RrdStream
 from iris_session.recording.text import describe_denial, describe_event, describe_session
 
@@ -44,6 +53,7 @@ class RrdWriter:
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
         self._rec.send_blueprint(_blueprint())
+        self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
         self._bodies: tuple[BodyInfo, ...] = ()
@@ -63,28 +73,24 @@ class RrdWriter:
         self._rec.send_recording_name(header.session_name)
         self._static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
         self._static(paths.INFO, rr.TextDocument(describe_session(header), media_type="text/markdown"))
-        self._bodies = header.bodies
-        self._moving = np.array([i for i, body in enumerate(header.bodies) if body.moving], np.intp)
-        self._frames = [header.bodies[i].name for i in self._moving]
+        self._use(header.bodies)
         root = rr.Transform3D(parent_frame="tf#/", child_frame=scene.WORLD)  # tf#/: frame of the root entity
         self._static(paths.TRANSFORMS + "_static", root)
         self._static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if header.model:
-            self._scene(header)
+            self._picture.begin(header.model, header.bodies)
 
-    def _scene(self, header: SessionHeader) -> None:
-        try:
-            model = scene.load_model(unpack_model(header.model))
-        except (ValueError, zlib.error) as error:
-            # The journal is worth more than its picture: go on, and say it where the viewer shows it.
-            text = f"the scene is not drawn, MuJoCo does not take the model: {error}"
-            self._static(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"))
-            return
-        for shape in scene.shapes(model, header.bodies):
-            self._static(f"{paths.SCENE}/{_part(shape.body)}/{_part(shape.name)}", *_drawing(shape))
+    def _use(self, bodies: tuple[BodyInfo, ...]) -> None:
+        self._bodies = bodies
+        self._moving = np.array([i for i, body in enumerate(bodies) if body.moving], np.intp)
+        self._frames = [bodies[i].name for i in self._moving]
+        self._last_poses = None
 
     def add(self, batch: Batch) -> None:
-        """Collects one batch of the authority."""
+        """Collects one batch of the authority. States of one flush are of one scene."""
+        if batch.scenes:
+            self.flush()
+            self._scenes(batch.scenes)
         pending = self._pending
         for name in ("rows", "states", "events", "denials", "metrics", "keyframes"):
             getattr(pending, name).extend(getattr(batch, name))
@@ -163,6 +169,14 @@ class RrdWriter:
         ]
         self._send(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
+
+    def _scenes(self, scenes: list[SceneModel]) -> None:
+        """Models for verification, and the picture from here on."""
+        times = [sequence(paths.STEP, [s.step for s in scenes])]
+        self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
+        for loaded in scenes:
+            self._use(loaded.bodies)
+            self._picture.change(loaded.model, loaded.bodies, (loaded.step, *self._clock, loaded.session_time))
 
     def _keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
@@ -248,7 +262,7 @@ class RrdWriter:
         """Static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
         color = self._people.setdefault(participant, PALETTE[len(self._people) % len(PALETTE)])
         frame = rr.CoordinateFrame(_presence_frame(participant, device))
-        entity = f"{paths.PRESENCE}/{_part(participant)}/{_part(device)}"
+        entity = f"{paths.PRESENCE}/{entity_part(participant)}/{entity_part(device)}"
         solid = rr.components.FillMode.Solid
         if device == Device.HEAD:
             shape = rr.Boxes3D(half_sizes=[(0.06, 0.09, 0.05)], colors=[color], labels=[participant], fill_mode=solid)
@@ -306,42 +320,6 @@ def _times(times: NDArray[np.int64]) -> list[Any]:
         nanoseconds(paths.SIM_TIME, sim_ns),
         nanoseconds(paths.SESSION_TIME, session_ns),
     ]
-
-
-def _drawing(shape: scene.Shape) -> list[Any]:
-    """Rerun components of one geom: its frame, its pose in that frame, and its form."""
-    frame = rr.CoordinateFrame(shape.frame)
-    w, x, y, z = shape.q
-    p = shape.p
-    color = shape.rgba
-    solid = rr.components.FillMode.Solid
-    drawn: Any
-    if shape.kind == scene.BOX:
-        drawn = rr.Boxes3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.ELLIPSOID:
-        drawn = rr.Ellipsoids3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.CYLINDER:
-        radius, half = shape.size
-        drawn = rr.Cylinders3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.CAPSULE:
-        radius, half = shape.size
-        drawn = rr.Capsules3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
-        # Rerun's capsule begins at the origin and MuJoCo's is centred there: back by half a length along its axis.
-        axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
-        p = (p[0] - half * axis[0], p[1] - half * axis[1], p[2] - half * axis[2])
-    else:
-        drawn = rr.Mesh3D(
-            vertex_positions=shape.vertices,
-            vertex_normals=shape.normals,
-            triangle_indices=shape.faces,
-            albedo_factor=color,
-        )
-    return [frame, rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])]), drawn]
-
-
-def _part(name: str) -> str:
-    """`name` as one part of an entity path (names may hold slashes and spaces)."""
-    return str(rr.escape_entity_path_part(name))
 
 
 def _presence_frame(participant: str, device: str) -> str:

@@ -49,6 +49,7 @@ from iris_session.recording import (
 from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
+from iris_session.recording.verify import Models
 from iris_session.recording.versions import boot_id
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.config_checks import check_arguments
@@ -120,7 +121,7 @@ class Continuation:
         if model is not None:
             self._check(model)
         core = self.core
-        return self._config(given), (core.world.model, core.config.robots, core.config.objects)
+        return self._config(given), (core.world.model, core.scene.robots, core.scene.objects)
 
     def _config(self, given: SessionConfig) -> SessionConfig:
         plain, core = SessionConfig(), self.core.config
@@ -147,10 +148,10 @@ class Continuation:
         return dataclasses.replace(given, control=core.control, **changes)
 
     def _check(self, model: mujoco.MjModel) -> None:
-        here = scene_hash(model_bytes(model))
-        if here != self.header.scene_hash:
+        here, had = scene_hash(model_bytes(model)), self.core.world.scene_hash
+        if here != had:
             raise ResumeError(
-                f"the scene is not that of {self.file}: hash {here[:12]}, recorded {self.header.scene_hash[:12]}; "
+                f"the scene is not that of {self.file}: hash {here[:12]}, recorded {had[:12]}; "
                 "leave it out, the recording has it"
             )
 
@@ -180,7 +181,7 @@ class Continuation:
         blas.use_one_thread()  # as in the run that is taken again
         for keyframe in starts(recording):
             try:
-                self.core = core_at(header, keyframe)
+                self.core = core_at(header, keyframe, recording.model)
             except ResumeError:
                 raise
             except Exception as error:  # a snapshot of another version may mean anything
@@ -191,7 +192,7 @@ class Continuation:
             raise _UnusableError("; ".join([*problems, "it holds no state to go on from"]))
         self.step, self.chain, stopped = run(self.core, keyframe, recording.rows(after=keyframe.step))
         if stopped.taken:
-            self.core = core_at(header, keyframe)
+            self.core = core_at(header, keyframe, recording.model)
             rows = recording.rows(after=keyframe.step)
             self.step, self.chain, _ = run(self.core, keyframe, (row for row in rows if row.step < stopped.step))
         if stopped.text:
@@ -303,18 +304,19 @@ def recordings(first: Path) -> Iterator[tuple[int, Path]]:
             yield number, folder / name
 
 
-def make_core(header: SessionHeader) -> SessionCore:
+def make_core(header: SessionHeader, models: Models) -> SessionCore:
     """The session as its header describes it, in its initial state. Raises `ResumeError`."""
     try:
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        return SessionCore(model_from_bytes(unpack_model(header.model)), config)
+        model = model_from_bytes(unpack_model(header.model))
+        return SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
     except (msgspec.DecodeError, zlib.error, PhysicsError, ControlError, ValueError) as error:
         raise ResumeError(f"the session cannot be built from the header of its recording: {error}") from error
 
 
-def core_at(header: SessionHeader, keyframe: Keyframe) -> SessionCore:
+def core_at(header: SessionHeader, keyframe: Keyframe, models: Models) -> SessionCore:
     """The session in the state of `keyframe`. Raises whatever damaged snapshots lead to."""
-    core = make_core(header)
+    core = make_core(header, models)
     if keyframe.plant:
         core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
     return core

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import mujoco
@@ -19,7 +19,7 @@ from iris_session.authority import Authority, AuthorityConfig
 from iris_session.control import ControlConfig, ControlError, Controller
 from iris_session.physics import SimulationDivergedError, World
 from iris_session.physics.world import STATE
-from iris_session.protocol.entries import HOST, Entry, ExternalReset
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, SceneLoaded
 from iris_session.protocol.names import LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import ControlStatus, Decision
@@ -71,21 +71,51 @@ class CoreState(msgspec.Struct, frozen=True):
     status: bytes
 
 
-class SessionCore:
-    """One session: robots and objects of one model, their authority and their control.
+class Plant(NamedTuple):
+    """A scene that can be stepped: its world in the initial state, its controller, and what it was made of."""
+
+    world: World
+    controller: Controller
+    scene: SceneLoaded
+
+
+def make_plant(model: mujoco.MjModel, scene: SceneLoaded, control: ControlConfig) -> Plant:
+    """Takes what the scene of a session needs to be stepped, without touching any session.
 
     Raises the typed errors of `physics` and `control` when the model cannot be driven (for example a torque actuator
-    without a hold law).
+    without a hold law), `SnapshotError` for an initial state of another model.
+    """
+    world = World(model, scene.robots, scene.objects)
+    if scene.initial_state:
+        world.set_state_bytes(scene.initial_state)
+    return Plant(world, Controller(model, scene.robots, scene.objects, control), scene)
+
+
+def no_models(model_hash: str) -> mujoco.MjModel:
+    """Of a session whose scene never changed."""
+    raise KeyError(f"the recording does not hold the model {model_hash}")
+
+
+class SessionCore:
+    """One session: robots and objects of one model, their authority and their control. Raises as `make_plant`.
+
+    `models`: the model of a scene that was loaded later, by `SceneLoaded.model_hash`, unless it was `prepared`.
     """
 
-    def __init__(self, model: mujoco.MjModel, config: CoreConfig) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        config: CoreConfig,
+        models: Callable[[str], mujoco.MjModel] = no_models,
+    ) -> None:
         #: As a recording gives it back: a whole number in a float field would change `round(x / step)` and the digest.
         self.config = config = _decode_config(_encoder.encode(config))
-        self.world = World(model, config.robots, config.objects)
-        self._reset_world()
+        self._models = models
+        #: Plants that were made off the loop, for the `SceneLoaded` to come, by `model_hash`.
+        self.prepared: dict[str, Plant] = {}
+        self._model = model
+        self._use(self._first_plant())
         self.authority = Authority(_within_control(config), config.robots, config.objects)
-        self.controller = Controller(model, config.robots, config.objects, config.control)
-        self.controller.reset(self.world.data)
         self._status: tuple[ControlStatus, ...] = ()
 
     def step(
@@ -106,6 +136,9 @@ class SessionCore:
         `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
         write `world.data.ctrl` for the caller to apply, and do not advance physics.
         """
+        for entry in entries:
+            if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
+                self._load(entry.message)
         world = self.world
         if plant:
             world.set_state_bytes(plant)
@@ -145,8 +178,32 @@ class SessionCore:
 
     def _reset_world(self) -> None:
         self.world.reset()
-        if self.config.initial_state:
-            self.world.set_state_bytes(self.config.initial_state)
+        if self.scene.initial_state:
+            self.world.set_state_bytes(self.scene.initial_state)
+
+    def _first_plant(self) -> Plant:
+        config = self.config
+        scene = SceneLoaded("", config.robots, config.objects, config.initial_state)
+        return make_plant(self._model, scene, config.control)
+
+    def _load(self, scene: SceneLoaded) -> None:
+        """Another scene, from the beginning of this step on."""
+        plant = self.prepared.pop(scene.model_hash, None)
+        if plant is None or plant.scene != scene:
+            plant = make_plant(self._models(scene.model_hash), scene, self.config.control)
+        self._use(plant)
+        self._status = ()
+
+    def _use(self, plant: Plant) -> None:
+        self.world, self.controller, self.scene = plant
+        self.controller.reset(self.world.data)
+
+    def as_it_is(self) -> CoreConfig:
+        """The configuration of a session that begins with the present scene."""
+        scene = self.scene
+        return msgspec.structs.replace(
+            self.config, robots=scene.robots, objects=scene.objects, initial_state=scene.initial_state
+        )
 
     def _digest(self, decision: Decision) -> bytes:
         h = hashlib.blake2b(digest_size=16)
@@ -165,9 +222,17 @@ class SessionCore:
         )
 
     def restore(self, state: CoreState) -> None:
-        """Inverse of `snapshot`, into a core built with the same model and configuration."""
-        self.world.restore(state.plant)
+        """Inverse of `snapshot`, into a core built with the same model and configuration.
+
+        A scene that was loaded since then is left for the one of the snapshot.
+        """
         self.authority.restore(state.authority)
+        scene = self.authority.scene
+        if scene is None and self.scene.model_hash:
+            self._use(self._first_plant())
+        elif scene is not None and scene != msgspec.structs.replace(self.scene, model_hash=self.world.scene_hash):
+            self._load(scene)
+        self.world.restore(state.plant)
         self.controller.restore(state.controller)
         self._status = _decode_status(state.status)
 

@@ -36,7 +36,7 @@ from iris_session.recording.feed import SILENCE_S
 from iris_session.recording.versions import boot_id, environment
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import Continuation, wait_until_free
-from iris_session.runtime.core import SessionCore
+from iris_session.runtime.core import Plant, SessionCore
 from iris_session.runtime.errors import StartError
 from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
@@ -195,7 +195,14 @@ class SessionProcesses:
         keyframe_ns = round(self._config.keyframe_s * 1e9)
         past = self._past
         after = None if past is None else ResumedFrom(past.step, past.now_ns, past.anchors)
-        return Stepper(core, self.front.link, self.feed, clock, self.state_period_ns, keyframe_ns, chain, after)
+        front, feed = self.front.link, self.feed
+        stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
+        stepper.on_scene.append(self._scene_changed)
+        return stepper
+
+    def _scene_changed(self, plant: Plant) -> None:
+        if self.front is not None:
+            self.front.set_scene(_scene_info(plant.world))
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(
@@ -203,11 +210,11 @@ class SessionProcesses:
             session_name=self.name,
             recording_class=recording_class,
             tick_period_ns=self._tick_period_ns,
-            config=msgspec.msgpack.encode(core.config),
+            config=msgspec.msgpack.encode(core.as_it_is()),
             model=pack_model(core.world.model_bytes()),
             scene_hash=core.world.scene_hash,
-            robots=core.config.robots,
-            objects=core.config.objects,
+            robots=core.scene.robots,
+            objects=core.scene.objects,
             bodies=core.world.bodies,
             versions=environment(),
             created_utc=datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),

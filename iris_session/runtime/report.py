@@ -106,7 +106,7 @@ def robots(stepper: Stepper) -> tuple[RobotReport, ...]:
     names = ledger.names()
     commands = {c.robot: c for c in stepper.last.decision.commands} if stepper.last is not None else {}
     rows = []
-    for spec in stepper.core.config.robots:
+    for spec in stepper.core.scene.robots:
         lease, command = ledger.mirror.leases.get(spec.name), commands.get(spec.name)
         holder = "" if lease is None else lease.holder
         rows.append(

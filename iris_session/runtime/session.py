@@ -42,6 +42,7 @@ from iris_session.runtime.core import SessionCore, core_of
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.publishing import Publishing
+from iris_session.runtime.scene_change import SceneChanges
 from iris_session.runtime.scheduling import quiet_collector, stop_signals, tick_priority
 from iris_session.runtime.status import SessionStatus, make_status
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
@@ -54,7 +55,7 @@ PAUSED_STEP_S: Final = 0.01
 PAUSED_STEP_TICKS: Final = 10
 
 
-class Session(Publishing):
+class Session(Publishing, SceneChanges):
     """A shared session over one MuJoCo model.
 
     `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,
@@ -376,6 +377,7 @@ class Session(Publishing):
             self._stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
             if not user_owned:
                 self.data = core.world.data
+                self._stepper.on_scene.append(self._take_scene)
             for message in self._early:
                 # The data of a user's loop is taken as it is now: there is nothing to go back from.
                 if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):

@@ -23,15 +23,16 @@ from iris_session.protocol.entries import (
     Entry,
     EntryMessage,
     RecordingGap,
+    SceneLoaded,
     SessionResumed,
     decode_entry,
     encode_entry,
 )
 from iris_session.protocol.names import LateCause
-from iris_session.protocol.server_messages import StateHeader
+from iris_session.protocol.server_messages import BodyInfo, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
-from iris_session.runtime.core import SessionCore, StepOutcome, unmeasured
+from iris_session.runtime.core import Plant, SessionCore, StepOutcome, unmeasured
 from iris_session.runtime.status import SessionLedger
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
@@ -54,6 +55,8 @@ class RecorderPort(Protocol):
     @property
     def wants_keyframe(self) -> bool: ...
 
+    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None: ...
+
     def row(self, row: JournalRow) -> None: ...
 
     def flush(self) -> None: ...
@@ -75,6 +78,14 @@ class RecorderPort(Protocol):
     def metric(self, name: str, value: float) -> None: ...
 
     def take_gap(self) -> int: ...
+
+
+class NextScene(NamedTuple):
+    """A scene that is to take the place of the present one. `packed_model`: for the recording."""
+
+    plant: Plant
+    model_hash: str
+    packed_model: bytes
 
 
 class ResumedFrom(NamedTuple):
@@ -113,6 +124,9 @@ class Stepper:
         self._newest_step = 0
         self.last: StepOutcome | None = None
         self._host: deque[EntryMessage] = deque()
+        self._scenes: deque[NextScene] = deque()
+        #: Called with another scene before the step that loads it.
+        self.on_scene: list[Callable[[Plant], None]] = []
         self._state_period_ns = state_period_ns
         self._keyframe_period_ns = keyframe_period_ns
         self._next_state_ns = 0
@@ -142,6 +156,10 @@ class Stepper:
         if len(self._host) >= MAX_HOST_ENTRIES:
             raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
         self._host.append(_checked(message))
+
+    def change_scene(self, scene: NextScene) -> None:
+        """Another scene from the next step on. From any thread; of several that wait each gets a step of its own."""
+        self._scenes.append(scene)
 
     def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:
         """Takes one step now. `plant`: see `SessionCore.step` (open sessions).
@@ -193,9 +211,24 @@ class Stepper:
             past = self._resumed_from
             begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
+        if self._scenes:
+            # The ledger gets the new leases as a client would.
+            host += [Entry(HOST, HOST, now_ns, message) for message in (self._announce_scene(), GetSnapshot())]
         while self._host:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
         return host + entries if host else entries
+
+    def _announce_scene(self) -> SceneLoaded:
+        """Hands the next scene to everybody who must have it before the step."""
+        scene = self._scenes.popleft()
+        self.core.prepared[scene.model_hash] = scene.plant
+        world = scene.plant.world
+        self._poses = np.zeros((len(world.bodies), 7))
+        if self.recorder is not None:
+            self.recorder.scene(scene.model_hash, scene.packed_model, world.bodies)
+        for follow in self.on_scene:
+            follow(scene.plant)
+        return scene.plant.scene
 
     def publish(self, end_ns: int) -> None:
         """Sends the rigid state when it is due. `end_ns`: session time of the end of the tick it belongs to."""

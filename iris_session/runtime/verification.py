@@ -10,16 +10,18 @@ import msgspec
 from iris_session.physics import model_from_bytes
 from iris_session.protocol.entries import Entry
 from iris_session.recording import Keyframe, SessionHeader, VerifyReport, blas, unpack_model, verify
+from iris_session.recording.verify import Models
 from iris_session.runtime.core import CoreConfig, CoreState, SessionCore
 
 
 class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
-    def __init__(self, header: SessionHeader) -> None:
+    def __init__(self, header: SessionHeader, models: Models) -> None:
         blas.use_one_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        self.core = SessionCore(model_from_bytes(unpack_model(header.model)), config)
+        model = model_from_bytes(unpack_model(header.model))
+        self.core = SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
 
     def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
         """Digest of one step."""

@@ -30,6 +30,7 @@ from iris_session.recording import (
 )
 from iris_session.recording.journal import seal
 from iris_session.recording.messages import Batch
+from iris_session.recording.verify import Models
 from iris_session.recording.writer import RrdWriter
 
 TICK_NS = 2_000_000
@@ -46,7 +47,7 @@ XML = """<mujoco><option timestep="0.002"/><worldbody><light pos="0 0 3"/>
 class SmallCore:
     """A session in a few lines: real physics, and a hash that every entry enters. Bit-exact, with snapshots."""
 
-    def __init__(self, header: SessionHeader | None = None) -> None:
+    def __init__(self, header: SessionHeader | None = None, models: Models | None = None) -> None:
         self.model = mujoco.MjModel.from_xml_string(XML)
         self.data = mujoco.MjData(self.model)
         self.memory = b"\0" * 16

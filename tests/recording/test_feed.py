@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 from iris_session.protocol.common import Denial, Pose
-from iris_session.protocol.server_messages import PresenceItem, Reply
+from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision, Outgoing
 from iris_session.recording import Keyframe, RecorderFeed, make_row
 from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS
@@ -22,8 +22,10 @@ from iris_session.recording.messages import (
     HEADER,
     Batch,
     RecorderStatus,
+    SceneModel,
     decode_batch,
     decode_header,
+    decode_scene,
     encode_status,
 )
 from tests.recording.support import make_header
@@ -50,7 +52,7 @@ class PlayedRecorder:
         out = []
         for _ in range(n):
             assert self.socket.poll(5000), f"only {len(out)} of {n} messages came"
-            head, body = self.socket.recv_multipart()
+            head, body, *self.more = self.socket.recv_multipart()
             out.append((*FRAME.unpack(head), body))
         return out
 
@@ -226,3 +228,24 @@ def test_lists_are_bounded_when_no_step_is_taken(feed: RecorderFeed) -> None:
     for i in range(BATCH_ITEMS + 10):
         feed.metric("m", i)
     assert feed.stats.dropped_items == 10
+
+
+def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_recorder(
+    played: tuple[PlayedRecorder, str, Path], feed: RecorderFeed
+) -> None:
+    recorder, *_ = played
+    recorder.say(feed, 1, -1, -1)
+    recorder.take(1)
+    assert recorder.more == []
+    steps(feed, 0, 3)
+    bodies = (BodyInfo(1, "cup", moving=True),)
+    feed.scene("hash", b"packed", bodies)
+    steps(feed, 3, BATCH_ROWS)
+    before, scene, after = (decode_batch(body) for _, _, body in recorder.take(3))
+    assert [row.step for row in before.rows] == [0, 1, 2]
+    assert (scene.scenes, scene.rows) == ([SceneModel(2, 4_000_000, "hash", b"packed", bodies)], [])
+    assert after.rows[0].step == 3
+    recorder.say(feed, 1, 3, 2)
+    recorder.say(feed, 2, -1, -1)  # everything is in the file of the one before
+    recorder.take(1)
+    assert [decode_scene(frame) for frame in recorder.more] == scene.scenes

@@ -7,15 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 
 from anchors.pose import apply
+from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.protocol.common import Applied, Denial, Pose
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
-from iris_session.recording import SessionHeader, scene
-from iris_session.recording.messages import Batch, DenialRecord, StateFrame
-from iris_session.recording.writer import RrdWriter, _drawing
+from iris_session.recording import Recording, SessionHeader, pack_model, scene
+from iris_session.recording.messages import Batch, DenialRecord, SceneModel, StateFrame
+from iris_session.recording.pictures import drawing
+from iris_session.recording.writer import RrdWriter
 from tests.recording.support import make_header
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
@@ -87,7 +90,7 @@ def test_the_scene_is_static_in_the_frames_that_move(tmp_path: Path) -> None:
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     q = (0.8, 0.2, -0.4, 0.4)
     shape = scene.Shape("c", "b", "b", scene.CAPSULE, (1.0, 2.0, 3.0), q, (1, 2, 3, 4), (0.1, 0.25))
-    poses = _drawing(shape)[1]
+    poses = drawing(shape)[1]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
@@ -159,3 +162,61 @@ def test_a_blueprint_is_in_the_file(tmp_path: Path) -> None:
         reader = RrdReader(str(path))
     assert len(reader.blueprints()) == 1
     assert reader.recordings()[0].recording_id == "id"
+
+
+OTHER = """
+<mujoco><worldbody><body name="cup" pos="0 0 1"><freejoint/><geom name="g" type="box" size="0.1 0.2 0.3"/></body>
+</worldbody></mujoco>"""
+
+
+def other_scene(step: int) -> tuple[SceneModel, bytes]:
+    """A scene with one body, and the binary form of its model."""
+    model = mujoco.MjModel.from_xml_string(OTHER)
+    mjb = bytes(model_bytes(model))
+    return SceneModel(step, 20_000_000, scene_hash(mjb), pack_model(mjb), (BodyInfo(1, "cup", moving=True),)), mjb
+
+
+def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.header(header)
+    cup, mjb = other_scene(8)
+    first, second = np.zeros((len(header.bodies), 7)), np.array([[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
+    writer.add(Batch(states=[frame(0, first), frame(8, first)]))
+    writer.add(Batch(scenes=[cup], states=[frame(16, second)]))
+    writer.close()
+    found = read(path)
+    assert column(found["/scene/ball/g\\/ball"], "InstancePoses3D:translations")[-1] == [], "no longer at all times"
+    was = found["/scene/1/ball/g\\/ball"][0]
+    assert column([was], "step") == [-1]
+    assert column([was], "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
+    assert column(found["/scene/1"], "step") == [8]
+    assert column(found["/scene/1"], "Clear:is_recursive") == [[True]]
+    box = found["/scene/2/cup/g"][0]
+    assert column([box], "step") == [8]
+    assert column([box], "CoordinateFrame:frame") == [["cup"]]
+    assert column(found["/tf"], "Transform3D:child_frame")[-1] == ["cup"]
+    with Recording.open(path, warn=False) as recording:
+        assert [state.poses.shape for state in recording.states()] == [first.shape, first.shape, (1, 7)]
+        assert recording.model(cup.model_hash) == mjb
+        with pytest.raises(LookupError, match="does not hold the model feed"):
+            recording.model("feed" * 8)
+
+
+def test_a_model_that_was_changed_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    writer.header(make_header())
+    cup, _ = other_scene(8)
+    writer.add(Batch(scenes=[cup]))
+    writer.close()
+    data = bytearray(path.read_bytes())
+    at = data.find(cup.model_hash.encode())
+    assert at > 0, "the journal is not compressed"
+    data[at] ^= 1
+    path.write_bytes(data)
+    with Recording.open(path, warn=False) as recording:
+        with pytest.raises(LookupError):
+            recording.model(cup.model_hash)
+        assert any("a model was changed (checksum)" in line for line in recording.damage)

@@ -49,6 +49,7 @@ _ENDING: Final = (
     cm.EStop,
     em.ExternalReset,
     em.StalledGap,
+    em.SceneLoaded,
 )
 _decision = msgspec.msgpack.Decoder(Decision)
 
@@ -64,7 +65,10 @@ class Fuzz:
             config.authority, quota=32, anchors={"table": Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))}
         )
         assert config.robots[0].name in WORDS
-        self.core = SessionCore(model, CoreConfig(authority, config.control, config.robots, config.objects))
+        settled = CoreConfig(authority, config.control, config.robots, config.objects)
+        self.core = SessionCore(model, settled, lambda _: model)
+        self.model_hash = self.core.world.scene_hash
+        self.scenes = 0
         self.now_ns = 1000 * MS
         self.connections = 0
         self.seq = 0
@@ -82,18 +86,21 @@ class Fuzz:
         entries = [self.entry() for _ in range(n_entries)]
         if rng.random() < 0.3:
             entries += [Entry(HOST, HOST, self.now_ns, m) for m in (cm.ClearEStop(1), cm.Control(1, "resume"))]
+        if rng.random() < 0.04:
+            entries.insert(0, Entry(HOST, HOST, self.now_ns, self.scene()))
         entries = decode_entries(encode_entries(entries))
-        before = self.core.controller._joints.q.copy()
+        before, scene = self.core.controller._joints.q.copy(), self.core.scene
         outcome = self.core.step(self.now_ns, entries, rng.choice([0, 1, 1]))
         encoded = msgspec.msgpack.encode(outcome.decision)
         _decision.decode(encoded)  # a client's schema takes it
-        joints, n = self.core.controller._joints, len(self.core.config.robots)
+        joints, n = self.core.controller._joints, len(self.core.scene.robots)
+        self.scenes += self.core.scene is not scene
         assert len(outcome.decision.commands) == n
         assert np.isfinite(joints.q).all()
         # When its owner has moved the robots, they hold where they stand now.
         moved = any(e.connection == HOST and isinstance(e.message, em.ExternalReset) for e in entries)
-        slow = np.abs(joints.q - before) <= joints.velocity * joints.dt + 1e-9
-        assert outcome.decision.reset or moved or slow.all()
+        if self.core.scene is scene and not outcome.decision.reset and not moved:
+            assert (np.abs(joints.q - before) <= joints.velocity * joints.dt + 1e-9).all()
         assert not outcome.diverged
         self.moved += sum(c.kind != "hold" for c in outcome.decision.commands)
         for p in self.state.participants.values():
@@ -121,10 +128,20 @@ class Fuzz:
         kind = rng.choice(_MESSAGES) if rng.random() < 0.3 else rng.choice([cm.Sample, cm.Sample, cm.Acquire, cm.Grasp])
         if issubclass(kind, _ENDING) and rng.random() < 0.97:
             kind = cm.Sample
-        message = self.sample(connection) if kind is cm.Sample else self.message(kind)
+        if kind is em.SceneLoaded:
+            message: Any = self.scene()
+        else:
+            message = self.sample(connection) if kind is cm.Sample else self.message(kind)
         claimed = connection if rng.random() < 0.95 else rng.choice(COUNTS)
         received = self.now_ns if rng.random() < 0.97 else rng.choice(TIMES)
         return Entry(connection, claimed, received, message)
+
+    def scene(self) -> em.SceneLoaded:
+        """The same model with some of its robots and objects, in any order."""
+        rng, config = self.rng, self.core.config
+        robots = rng.sample(config.robots, rng.randrange(1, len(config.robots) + 1))
+        objects = rng.sample(config.objects, rng.randrange(len(config.objects) + 1))
+        return em.SceneLoaded(self.model_hash, tuple(robots), tuple(objects))
 
     def message(self, kind: type) -> Any:
         return kind(**{f.name: self.value(f.name, str(f.type)) for f in msgspec.structs.fields(kind)})
@@ -136,7 +153,7 @@ class Fuzz:
         if name in ("tracking_epoch", "ticks", "request_id"):
             return 0 if rng.random() < 0.95 else rng.choice((1, 2**63 - 1))
         if name in ("robots", "objects", "devices", "capabilities", "beside"):
-            known = [r.name for r in self.core.config.robots] if name == "robots" else WORDS
+            known = [r.name for r in self.core.scene.robots] if name == "robots" else WORDS
             return tuple(rng.choice(known if rng.random() < 0.9 else WORDS) for _ in range(rng.randrange(4)))
         if name == "targets":
             return self.targets()
@@ -200,7 +217,7 @@ class Fuzz:
             "gripper": rng.choice([None, 0.0, 1.0]),
             "pose": Pose((0.5, rng.uniform(-0.005, 0.005), 1.0), (1.0, 0.0, 0.0, 0.0)),
             "twist": (0.1, 0.0, 0.0, 0.0, 0.0, 0.1),
-            "q": tuple(self.core.world.view().joints("arm1")) if kind == "joints" else (),
+            "q": tuple(self.core.world.view().joints(self.core.scene.robots[0].name)) if kind == "joints" else (),
         }
         for f in rng.sample(msgspec.structs.fields(cm.Sample), rng.choice([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 2])):
             good[f.name] = (

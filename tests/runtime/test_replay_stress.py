@@ -70,6 +70,7 @@ class Quiet:
 def test_no_entry_raises_or_jumps(seed: int) -> None:
     """Random schema-valid entries, most of them nonsense (see `fuzz_core`)."""
     fuzz = run(seed, 6000)
+    assert fuzz.scenes > 0
     assert fuzz.moved > 10
     assert fuzz.rejected >= {"not_finite", "not_holder", "quota", "seq", "stale", "unknown_value"}
     assert fuzz.largest < 200_000

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.client_messages import Assign, Control, EStop, Marker
 from iris_session.protocol.common import Applied
 from iris_session.protocol.entries import HOST, Entry, RecordingGap, decode_entries
-from iris_session.protocol.server_messages import Gap, StateHeader
+from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
@@ -30,6 +30,7 @@ class Front:
         self.waiting: list[Entry] = []
         self.decisions: list[Decision] = []
         self.states: list[StateHeader] = []
+        self.n_bodies = 0
 
     def poll(self) -> list[Entry]:
         entries, self.waiting = self.waiting, []
@@ -41,6 +42,7 @@ class Front:
 
     def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
         assert poses.shape[1] == 7
+        self.n_bodies = len(poses)
         self.states.append(header)
 
 
@@ -54,6 +56,12 @@ class Recorder:
         self.keyframes: list[Keyframe] = []
         self.states = 0
         self.metrics: list[tuple[str, float]] = []
+        self.scenes: list[tuple[int, str]] = []  # rows before it, hash
+
+    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None:
+        assert packed_model
+        assert bodies
+        self.scenes.append((len(self.rows), model_hash))
 
     def row(self, row: JournalRow) -> None:
         self.rows.append(row)

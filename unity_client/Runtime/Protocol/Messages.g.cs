@@ -4150,7 +4150,8 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
-    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue.
+    /// cause: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
+    /// scene_changed (another scene was loaded that has no such robot or object).
     /// </summary>
     public sealed class LeaseChanged : EventKind
     {

@@ -1057,7 +1057,10 @@ export interface ParticipantLeft {
   grace?: boolean;
 }
 
-/** `cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue. */
+/**
+ * `cause`: acquired, released, expired, takeover, assigned, resumed, consent, priority, left, mode, queue,
+ * scene_changed (another scene was loaded that has no such robot or object).
+ */
 export interface LeaseChanged {
   event: "lease_changed";
   lease: Lease;

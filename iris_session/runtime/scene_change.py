@@ -1,0 +1,112 @@
+"""Another scene in a running session: made off the loop, swapped between two steps, journaled with its model."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future
+from pathlib import Path
+
+import msgspec
+import mujoco
+
+from iris_session.authority.config import check_config
+from iris_session.physics import find_objects, find_robots
+from iris_session.physics.load import load_model, model_bytes, scene_hash
+from iris_session.protocol.entries import HOST, Entry, SceneLoaded, decode_entry, encode_entry
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.recording import pack_model
+from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.core import Plant, SessionCore, make_plant, plant_state
+from iris_session.runtime.errors import ConfigError, OwnershipError
+from iris_session.runtime.stepper import NextScene, Stepper
+from iris_session.runtime.user_loop import UserLoop
+
+
+class SceneChanges:
+    """Part of `Session`."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData | None
+    robots: tuple[RobotSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    config: SessionConfig
+    _stepper: Stepper | None
+    _user_loop: UserLoop | None
+
+    def load_scene(
+        self,
+        model: mujoco.MjModel | str | Path,
+        data: mujoco.MjData | None = None,
+        *,
+        robots: Sequence[RobotSpec] | None = None,
+        objects: Sequence[ObjectSpec] | None = None,
+    ) -> Future[None]:
+        """Loads another scene into the running session: a new `scene_epoch`, in which everybody stays.
+
+        Arguments as of `Session`. Who holds a robot whose name the new scene has too keeps it and must clutch again;
+        other leases end. The model is compiled and prepared in a thread while the session goes on with the old scene;
+        the future is done when the new one waits for the next step, and raises what would be wrong with it:
+        `ModelNotFoundError`, `ModelInvalidError`, `AmbiguousModelError`, `ControlError`, `ConfigError` for another
+        timestep than the session's.
+
+        Raises `OwnershipError` at once in a user's loop, whose model is not ours, and before `run()`.
+        """
+        if self._user_loop is not None:
+            raise OwnershipError("load_scene: your own loop owns the model; end this session and begin another with it")
+        stepper = self._stepper
+        if stepper is None:
+            raise OwnershipError("load_scene needs a session that runs: call it while run() is under way")
+        done: Future[None] = Future()
+        known = None if robots is None else tuple(robots), None if objects is None else tuple(objects)
+        state = b"" if data is None or isinstance(model, str | Path) else plant_state(model, data)
+
+        def work() -> None:
+            try:
+                stepper.change_scene(prepare(stepper.core, load_model_of(model), state, *known))
+            except BaseException as error:  # of whoever asks for the result
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+        done.set_running_or_notify_cancel()
+        threading.Thread(target=work, name="iris-scene", daemon=True).start()
+        return done
+
+    def _take_scene(self, plant: Plant) -> None:
+        self.model, self.data = plant.world.model, plant.world.data
+        self.robots, self.objects = plant.scene.robots, plant.scene.objects
+
+
+def load_model_of(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
+    """A compiled model of either."""
+    return load_model(model) if isinstance(model, str | Path) else model
+
+
+def prepare(
+    core: SessionCore,
+    model: mujoco.MjModel,
+    state: bytes,
+    robots: tuple[RobotSpec, ...] | None,
+    objects: tuple[ObjectSpec, ...] | None,
+) -> NextScene:
+    """Everything that takes long, without touching the session that `core` is of. None: found in the model."""
+    binary = model_bytes(model)
+    found = tuple(find_robots(model) if robots is None else robots)
+    things = tuple(find_objects(model) if objects is None else objects)
+    message = SceneLoaded(scene_hash(binary), found, things, state)
+    # What is journaled is what is used: whole numbers in float fields become floats, lists tuples.
+    scene = decode_entry(encode_entry(Entry(HOST, HOST, 0, message))).message
+    assert isinstance(scene, SceneLoaded)
+    try:
+        check_config(msgspec.structs.replace(core.config.authority, assignments={}), found, things)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    plant = make_plant(model, scene, core.config.control)
+    now_ns, then_ns = core.world.tick_period_ns, plant.world.tick_period_ns
+    if now_ns != then_ns:
+        raise ConfigError(
+            f"the scene has a timestep of {then_ns * 1e-6:g} ms, the session one of {now_ns * 1e-6:g} ms: "
+            f'set <option timestep="{now_ns * 1e-9:g}"/>'
+        )
+    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)))

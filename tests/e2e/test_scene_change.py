@@ -1,0 +1,122 @@
+"""Another scene in a running session, with real processes: everybody stays, late joiners see the same, it replays."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from anchors.pose import distance
+from iris_session.protocol.entries import SceneLoaded, decode_entries
+from iris_session.recording import Recording
+from tests.e2e.conftest import COMMAND, Server, Stage, end_all
+
+pytestmark = pytest.mark.e2e
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    folder = tmp_path / "server"
+    folder.mkdir()
+    recording = folder / "session.rrd"
+    command = [sys.executable, str(Path(__file__).with_name("scene_server.py")), str(recording), str(folder)]
+    server = Server(folder, recording, command)
+    stage = Stage(server)
+    yield stage
+    stage.close()
+    end_all([server])
+
+
+def order(stage: Stage, scene: str, answer: str = "loaded") -> None:
+    """Has the session load one of the scenes of `scene_server`, and waits for what it says."""
+    said = stage.server.output.count(answer)
+    (stage.server.folder / scene).touch()
+    stage.run(lambda: stage.server.output.count(answer) > said, f"the session answers {answer!r}")
+
+
+def in_epoch(stage: Stage, epoch: int) -> None:
+    def there() -> bool:
+        states = [client.state for client in stage.clients]
+        return all(s is not None and s.header.scene_epoch == epoch for s in states) and all(
+            client.mirror.synced for client in stage.clients
+        )
+
+    stage.run(there, f"everybody sees scene epoch {epoch}")
+
+
+def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
+    ann, bob = stage.join("ann"), stage.join("bob")
+    ann.acquire(["left"])
+    bob.acquire(["right"])
+    hand = stage.hand(ann, "left")
+    stage.engage(hand)
+    hand.velocity = (0.0, 0.03, 0.0)
+    stage.seconds(0.5)
+
+    order(stage, "table")
+    in_epoch(stage, 2)
+    assert ann.mirror.leases["left"].holder == ann.participant_id, "she keeps her robot"
+    assert "object3" in bob.mirror.body_index
+    assert "hammer" not in bob.mirror.leases
+    hand.velocity = (0.0, 0.0, 0.0)
+    stage.seconds(0.3)
+    still = hand.tip[0]
+    stage.seconds(0.3)
+    assert distance(hand.tip[0], still) < 1e-3, "a clutch that is still closed moves nothing"
+    stage.engage(hand)
+    hand.velocity = (0.0, 0.05, 0.0)
+    stage.run(lambda: distance(hand.tip[0], still) > 0.02, "she drives on")
+
+    order(stage, "slow", "ConfigError: the scene has a timestep of 4 ms")
+    order(stage, "missing", "does not exist")
+    hand.sending = False  # her robot is about to be gone
+    order(stage, "three")
+    in_epoch(stage, 3)
+    late = stage.join("late", role="observer")
+    in_epoch(stage, 3)
+    assert sorted(late.mirror.robots) == ["arm1", "arm2", "arm3"]
+    stage.run(lambda: len({c.mirror.event_seq for c in stage.clients}) == 1, "all know the same")
+    assert len({c.mirror.mirror_hash() for c in stage.clients}) == 1
+    assert not ann.mirror.leases["arm1"].holder
+
+    before = [client.connection.generation for client in stage.clients]
+    stage.server.children()["transport.front"].kill()
+
+    stage.run(lambda: before != [c.connection.generation for c in stage.clients], "the connections are lost")
+    stage.run(lambda: all(client.ready for client in stage.clients), "everybody is back at the front that replaced it")
+    bob.acquire(["arm2"])
+    in_epoch(stage, 3)
+    assert len(stage.clients[0].mirror.bodies) == len(late.mirror.bodies)
+    report = stage.server.finish()
+    assert (report["ok"], report["unverified_steps"]) == (True, 0)
+    with Recording.open(stage.server.recording) as recording:
+        loads = [e.message for row in recording.rows() for e in decode_entries(row.entries)]
+        assert [len(m.robots) for m in loads if isinstance(m, SceneLoaded)] == [2, 3]
+
+
+def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stage, tmp_path: Path) -> None:
+    ann = stage.join("ann")
+    order(stage, "three")
+    in_epoch(stage, 2)
+    ann.acquire(["arm3"])
+    stage.server.children()["recording.process"].kill()  # what follows is in a part of its own
+    hand = stage.hand(ann, "arm3")
+    stage.engage(hand)
+    stage.run((stage.server.folder / "session.part2.rrd").exists, "the recording goes on")
+    stage.seconds(1.0)
+    stage.server.process.kill()
+    stage.server.process.wait()
+    resumed_file = stage.server.folder / "session.resume2.rrd"
+    resumed = Server(
+        stage.server.folder, resumed_file, [*COMMAND, "serve", "--resume", str(stage.server.folder / "session.rrd")]
+    )
+    try:
+        in_epoch(stage, 2)
+        stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
+        stage.engage(hand)
+        assert ann.mirror.leases["arm3"].holder == ann.participant_id
+        assert resumed.finish()["ok"]
+    finally:
+        end_all([resumed])

@@ -1,0 +1,147 @@
+"""Another scene in a running core and in a live stepper: the same bits again, restored across the change."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import pytest
+
+from iris_session import Session
+from iris_session.physics import PhysicsError, find_objects, find_robots
+from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
+from iris_session.physics.scenes import n_arms_scene, scene_path
+from iris_session.protocol.client_messages import Control
+from iris_session.protocol.entries import SceneLoaded, decode_entries
+from iris_session.protocol.server_messages import SceneChanged
+from iris_session.runtime.core import SessionCore, make_plant, plant_state
+from iris_session.runtime.errors import ConfigError, OwnershipError
+from iris_session.runtime.scene_change import prepare
+from tests.runtime.play import TICK_NS, entries, host, make_core
+from tests.runtime.test_stepper import Rig
+
+AT = 90  # step of the change: Ann's clutch is closed since step 50
+
+
+def bench_scene() -> mujoco.MjModel:
+    return n_arms_scene(2, objects=3).compile()
+
+
+def loaded(model: mujoco.MjModel, state: bytes = b"") -> SceneLoaded:
+    return SceneLoaded(scene_hash(model_bytes(model)), find_robots(model), find_objects(model), state)
+
+
+def with_models(*models: mujoco.MjModel) -> SessionCore:
+    """A core that can build the scenes that are loaded later, as a replay does."""
+    first = make_core()
+    known = {scene_hash(model_bytes(m)): bytes(model_bytes(m)) for m in models}
+    return SessionCore(first.world.model, first.config, lambda model_hash: model_from_bytes(known[model_hash]))
+
+
+def play(core: SessionCore, first: int, last: int, change: SceneLoaded) -> list[bytes]:
+    digests = []
+    for i in range(first, last):
+        now_ns = (i + 1) * TICK_NS
+        begin = [host(now_ns, change)] if i == AT else []
+        digests.append(core.step(now_ns, begin + entries(i, 1 if i < AT else 2), 1).digest)
+    return digests
+
+
+def test_the_same_journal_gives_the_same_digests_across_a_change() -> None:
+    model = bench_scene()
+    scene = loaded(model)
+    live, replayed = make_core(), with_models(model)
+    live.prepared[scene.model_hash] = make_plant(model, scene, live.config.control)
+    assert play(live, 0, 150, scene) == play(replayed, 0, 150, scene)
+    assert live.world.model is model, "made off the loop"
+    assert not live.prepared
+    assert [o.name for o in live.scene.objects] == ["object1", "object2", "object3"]
+    assert live.world.view().tick == 150 - AT, "a new world begins at tick 0"
+
+
+@pytest.mark.parametrize("at", [40, AT + 1, 130])
+def test_restoring_a_snapshot_is_invisible_from_either_side_of_the_change(at: int) -> None:
+    model = bench_scene()
+    scene = loaded(model)
+    straight = with_models(model)
+    play(straight, 0, at, scene)
+    state = straight.snapshot()
+    expected = play(straight, at, 150, scene)
+    fresh, later = with_models(model), with_models(model)
+    fresh.restore(state)
+    play(later, 0, 140, scene)
+    later.restore(state)  # back over the change, or within the new scene
+    assert play(fresh, at, 150, scene) == expected
+    assert play(later, at, 150, scene) == expected
+    straight.restore(straight.snapshot())
+    assert straight.snapshot() == fresh.snapshot()
+
+
+def test_a_reset_goes_back_to_the_state_that_the_scene_came_with() -> None:
+    model = bench_scene()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data.qpos[0] += 0.2
+    scene = loaded(model, plant_state(model, data))
+    core = with_models(model)
+    core.step(TICK_NS, [host(TICK_NS, scene)], 0)
+    begun = core.world.data.qpos[0]
+    assert begun == data.qpos[0]
+    for i in range(2, 20):
+        core.step(i * TICK_NS, [], 1)
+    core.step(21 * TICK_NS, [host(21 * TICK_NS, Control(0, "reset"))], 0)
+    assert core.world.data.qpos[0] == begun
+    assert core.as_it_is().initial_state == scene.initial_state
+
+
+def test_a_session_that_goes_on_from_the_new_scene_needs_no_other_model() -> None:
+    """As `serve --resume` does: its recording begins with the scene as it is."""
+    model = bench_scene()
+    scene = loaded(model)
+    before = with_models(model)
+    play(before, 0, 120, scene)
+    resumed = SessionCore(before.world.model, before.as_it_is())
+    resumed.restore(before.snapshot())
+    assert play(resumed, 120, 150, scene) == play(before, 120, 150, scene)
+
+
+def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
+    rig = Rig()
+    rig.steps(60)
+    seen: list[int] = []
+    rig.stepper.on_scene.append(lambda plant: seen.append(len(rig.front.decisions)))
+    scene = prepare(rig.stepper.core, bench_scene(), b"", None, None)
+    rows = len(rig.recorder.rows)
+    rig.stepper.change_scene(scene)
+    rig.steps(30)
+    assert rig.recorder.scenes == [(rows, scene.model_hash)]
+    assert seen == [rows]
+    first = decode_entries(rig.recorder.rows[rows].entries)[0].message
+    assert first == scene.plant.scene
+    events = [e.body for e in rig.stepper.ledger.recent if isinstance(e.body, SceneChanged)]
+    assert events == [SceneChanged(2, 0, "new_scene")]
+    assert rig.stepper.ledger.mirror.synced
+    assert set(rig.stepper.ledger.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
+    assert rig.front.n_bodies == len(scene.plant.world.bodies)
+
+
+def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
+    core = make_core()
+    spec = n_arms_scene(2)
+    spec.option.timestep = 0.004
+    with pytest.raises(ConfigError, match=r'timestep of 4 ms, the session one of 2 ms: set <option timestep="0.002"/>'):
+        prepare(core, spec.compile(), b"", None, None)
+    with pytest.raises(PhysicsError):
+        prepare(core, bench_scene(), b"too short", None, None)
+
+
+def test_only_a_session_that_runs_takes_another_scene() -> None:
+    session = Session(str(scene_path("handover")))
+    with pytest.raises(OwnershipError, match="while run\\(\\) is under way"):
+        session.load_scene(bench_scene())
+    model: Any = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    with Session(model, mujoco.MjData(model)) as mine:
+        mine.begin_tick()
+        with pytest.raises(OwnershipError, match="your own loop owns the model"):
+            mine.load_scene(bench_scene())
+        mine.end_tick()
