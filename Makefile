@@ -61,10 +61,15 @@ if [ $$status -eq 1 ]; then \
 fi
 endef
 
-# Unit tests that start nothing and read no clock: `make test` runs them on what the processes of the tests end to end
-# leave of the machine, which wait for each other a third of the time. `IDLE` takes nothing from who wants to run.
+# Unit tests that start no session and wait for no clock, those that take long: `make test` runs them on what the
+# processes of the tests end to end leave of the machine, which wait for each other a third of the time. `IDLE` takes
+# nothing from who wants to run.
 PURE := $(wildcard $(addprefix tests/,anchors authority control physics protocol scene streams \
-  $(addprefix emulator/test_,behaviours.py behaviours_parts.py demo_casts.py)))
+  bench/test_alignment.py cli/test_anchors.py cli/test_anchors_solve.py \
+  $(addprefix emulator/test_,behaviours.py behaviours_parts.py demo_casts.py soft_demos.py) \
+  $(addprefix recording/test_,looks.py reader.py verify.py writer.py) \
+  $(addprefix runtime/test_,continuation.py core.py goals.py plays.py replay_stress.py) \
+  $(addprefix transport/test_,alignment_desk.py anchoring.py)))
 IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 
 test: check
