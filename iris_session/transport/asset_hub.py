@@ -168,6 +168,13 @@ class AssetHub:
         if reader is not None and reader.queue:
             self._ring.remove(reader)
 
+    def begin_anew(self) -> list[int]:
+        """Forgets every reader. Their descriptors."""
+        descriptors = [reader.descriptor for reader in self._readers.values()]
+        self._readers.clear()
+        self._ring.clear()
+        return descriptors
+
     def left(self, descriptor: int) -> None:
         """A TCP connection has ended, or its descriptor is another's."""
         for route in [route for route, one in self._readers.items() if one.descriptor == descriptor]:

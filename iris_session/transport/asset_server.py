@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
+import time
+import traceback
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -35,6 +38,8 @@ CHUNKS: Final = 4
 YIELD_MS: Final = 5
 #: Nice value of the I/O thread, as far above that of the front: a tenth of the weight of the others.
 NICER: Final = 10
+#: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
+FAULT_S: Final = 0.25
 #: Of one reader, that wait to be read: far more than all its requests.
 REQUEST_BYTES: Final = 65_536
 
@@ -117,13 +122,10 @@ class AssetServer:
         self._reasons: dict[str, int] = {}
         self._lock = threading.Lock()  # of the counters
         self._stopping = False
+        self._said = ""
         self._thread = threading.Thread(target=self._run, name="iris-assets", daemon=True)
         #: Session time until which the front's loop wants to be left alone.
         self.late_until_ns = 0
-
-    @property
-    def alive(self) -> bool:
-        return self._thread.is_alive()
 
     def start(self) -> None:
         self._thread.start()
@@ -149,6 +151,24 @@ class AssetServer:
     # --- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        while not self._stopping:
+            try:
+                self._serve()
+            except Exception as error:  # a fault of ours: it costs what was under way, and assets alone
+                self._begin_anew(error)
+
+    def _begin_anew(self, error: Exception) -> None:
+        """Counts every fault, and tells each the first time in a row. Readers ask again by new connections."""
+        for descriptor in self._hub.begin_anew():
+            self._doors.close_one(descriptor, "")
+        self._count(["assets_fault"])
+        if repr(error) != self._said:
+            self._said = repr(error)
+            text = f"iris-session: a fault in the thread of assets, which goes on: {self._said}\n"
+            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+        time.sleep(FAULT_S)
+
+    def _serve(self) -> None:
         poller = zmq.Poller()
         for one in (self._socket, self._sockets.zap):
             if one is not None:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import threading
+import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
+import zmq
 
 from iris_session.keys import KeyPair
-from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, AssetRequest
 from iris_session.protocol.client_messages import Heartbeat
+from iris_session.protocol.codec import encode_asset_request
 from iris_session.protocol.names import AssetRefusal
 from iris_session.protocol.status import GetStatus, StatusReport
-from iris_session.transport import FrontLimits
+from iris_session.transport import FrontConfig, FrontLimits
+from iris_session.transport.asset_files import AssetFiles
+from iris_session.transport.asset_server import NICER, AssetServer, AssetSockets, Table, open_below
+from iris_session.transport.media_doors import MediaDoors
+from iris_session.transport.sockets import bound_port
 from tests.transport.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.transport.harness import FrontSession, RawClient
 from tests.transport.lab import Lab, Open
@@ -235,3 +246,72 @@ def test_only_the_own_key_fetches_and_a_revoked_one_does_not(lab: Lab, tmp_path:
     assert bobs.answer(bobs.ask(shop.addresses[1])) == shop.data[1]
     assert (anns.take(), again.take(), eve.take()) == (before, 0, 0)
     shop.close()
+
+
+# --- the thread ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Iterator[tuple[AssetServer, AssetSockets, str]]:
+    """The thread without a front; it serves one asset to connection 1."""
+    sockets = open_below(FrontConfig(), None)
+    doors = MediaDoors(sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
+    server = AssetServer(sockets, doors, time.monotonic_ns)
+    address = put(tmp_path, b"asset")
+    server.publish(Table({1: ""}, frozenset(), ((str(tmp_path), (address,)),)))
+    server.start()
+    yield server, sockets, address
+    server.close()
+
+
+def _fetched(sockets: AssetSockets, address: str) -> bytes | None:
+    """One asset by a connection of its own; `None` when that was ended instead."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        dealer.linger = 0
+        dealer.setsockopt(zmq.RECONNECT_IVL, -1)
+        ended = dealer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        dealer.connect(f"tcp://127.0.0.1:{bound_port(sockets.socket)}")
+        dealer.send(encode_asset_request(AssetRequest(1, 1, 1, address, 0, 100)))
+        poller = zmq.Poller()
+        poller.register(dealer, zmq.POLLIN)
+        poller.register(ended, zmq.POLLIN)
+        came = dict(poller.poll(30_000))
+        dealer.disable_monitor()
+        ended.close(linger=0)
+        assert came
+        return dealer.recv_multipart()[-1] if dealer in came else None
+
+
+def test_a_fault_costs_what_was_under_way_and_is_told_once(
+    alone: tuple[AssetServer, AssetSockets, str],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    server, sockets, address = alone
+    assert _fetched(sockets, address) == b"asset"
+    with monkeypatch.context() as broken:
+
+        def fail(*_: object) -> None:
+            raise ZeroDivisionError("planted")
+
+        broken.setattr(AssetFiles, "chunk", fail)
+        assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
+    assert _fetched(sockets, address) == b"asset"
+    assert server.tallied().reasons["assets_fault"] == 2
+    assert capfd.readouterr().err.count("a fault in the thread of assets, which goes on: ZeroDivisionError") == 1
+
+
+def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
+    ours = os.getpriority(os.PRIO_PROCESS, 0)
+    if ours + NICER > 19:
+        pytest.skip("these tests run at the lowest priority already")
+    found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
+    assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
+    python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
+    assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
+
+
+def test_while_the_loop_is_late_chunks_go_out_one_by_one(alone: tuple[AssetServer, AssetSockets, str]) -> None:
+    server, sockets, address = alone
+    server.late_until_ns = time.monotonic_ns() + 10**12
+    assert _fetched(sockets, address) == b"asset"  # slowly, but it goes on
