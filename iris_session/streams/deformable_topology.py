@@ -81,6 +81,13 @@ class DeformableTopology:
         sizes = (self.n_vertices, self.rows, self.cols, len(self.faces), len(self.edges))
         return _HEADER.pack(FORMAT, self.plan, flags, *sizes) + b"".join(t.astype("<u4").tobytes() for t in tables)
 
+    def bare(self) -> DeformableTopology:
+        """The same plan without triangles and lines, for clients that have those from elsewhere. Another identity."""
+        made = DeformableTopology.__new__(DeformableTopology)
+        plan = _Plan(self.order, self.rows, self.cols, self.parents)
+        made._settle(self.n_vertices, self.faces[:0], self.edges[:0], plan)
+        return made
+
     @classmethod
     def from_bytes(cls, data: bytes | memoryview) -> DeformableTopology:
         """Inverse of `to_bytes`. Raises `StreamError` for bytes that it does not make."""

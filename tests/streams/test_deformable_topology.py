@@ -141,6 +141,18 @@ def test_bytes_come_back_the_same_and_tables_cannot_be_written(made: tuple[Defor
         assert table is None or not table.flags.writeable
 
 
+def test_a_bare_topology_has_the_plan_only() -> None:
+    grid, tree = cloth(100, 100)[0], shell(5)[0]
+    assert len(grid.bare().to_bytes()) == 24
+    assert len(tree.bare().to_bytes()) == 24 + 16 * tree.n_vertices
+    assert tree.bare().identity != tree.identity
+    vertices = shell(5)[1]
+    frames = DeformableEncoder(tree.bare()).encode(vertices)
+    assert frames is not None
+    client = DeformableTopology.from_bytes(tree.bare().to_bytes())
+    assert np.linalg.norm(DeformableDecoder(client).decode(frames["full"]) - vertices, axis=1).max() <= 0.0005
+
+
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from([shell(3)[0].to_bytes(), rope(6)[0].to_bytes(), cloth(3, 3)[0].to_bytes()]), st.data())
 def test_damaged_topologies_are_refused_or_of_use(good: bytes, data: st.DataObject) -> None:
