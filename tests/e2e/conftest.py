@@ -42,7 +42,8 @@ ENDS_WITH_US: Final = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpri
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
 LONGEST: Final = (
     "test_demos_paper.py", "test_demo_link.py", "test_soak.py", "test_handover.py", "test_people.py",
-    "test_anchors_live.py", "test_recovery.py", "test_resume.py", "test_user_loop.py",
+    "test_anchors_live.py", "test_recovery.py", "test_resume.py", "test_user_loop.py", "test_docs.py",
+    "test_joining.py", "test_process.py", "test_doctor.py",
 )  # fmt: skip
 
 
