@@ -8,7 +8,21 @@ import signal
 import sys
 from importlib.metadata import version
 
-from iris_session.cli import anchors, bench, demo, doctor, emulate, keys, pair, robots, serve, sessions, status, verify
+from iris_session.cli import (
+    anchors,
+    bench,
+    demo,
+    doctor,
+    emulate,
+    keys,
+    pair,
+    robots,
+    scene,
+    serve,
+    sessions,
+    status,
+    verify,
+)
 from iris_session.cli.common import CommandError, expected_errors
 from iris_session.cli.poses import joined
 
@@ -19,6 +33,7 @@ _EPILOG = """examples:
   iris-session keys list                     who may join
   iris-session sessions                      what can be joined on this network
   iris-session robots scene.xml              the robots found in a model, as TOML to edit
+  iris-session scene inspect scene.xml       what headsets are given of it, and what is heavy
   iris-session anchors print --size 160mm    a sheet for headsets and cameras, as PDF
   iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
   iris-session status --watch                people, robots, ages, late ticks, recorder of a session
@@ -38,7 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, serve, pair, keys, sessions, status, doctor, verify, emulate, robots, anchors, bench):
+    for module in (demo, serve, pair, keys, sessions, status, doctor, verify, emulate, robots, scene, anchors, bench):
         module.register(commands)
     return parser
 

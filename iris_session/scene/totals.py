@@ -25,10 +25,10 @@ def with_totals(spec: SceneSpec) -> SceneSpec:
     """`spec` with its `totals`."""
     level_bytes = {level.address: level.bytes for mesh in spec.meshes for level in mesh.levels[:1]}
     image_bytes = {level.address: level.bytes for texture in spec.textures for level in texture.levels[:1]}
-    drawn = [v for v in spec.visuals if v.rgba[3] > 0]
+    drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
     totals = Totals(
         objects=len(drawn) + len(spec.deformables),
-        triangles=sum(triangles(spec, i) for i, v in enumerate(spec.visuals) if v.rgba[3] > 0),
+        triangles=sum(triangles(spec, i) for i in drawn),
         mesh_bytes=sum(level_bytes.values()),
         texture_bytes=sum(image_bytes.values()),
         texture_memory=sum(texture_memory(texture, texture.levels[0]) for texture in spec.textures),

@@ -1,0 +1,119 @@
+"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from iris_session.cli.common import CommandError, add_json, open_scene, print_json
+
+if TYPE_CHECKING:
+    from iris_session.scene import AssetStore
+    from iris_session.scene.mujoco_scene import Parsed
+
+
+def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "scene",
+        help="what clients are given of a scene, what is heavy in it; export to GLB",
+        epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene export handover handover.glb",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    inspect = actions.add_parser(
+        "inspect",
+        help="tree, sizes, what is heavy and why, what a headset will struggle with",
+        description="Shows what clients are given of a scene, what is heavy in it, what a Quest 3 will struggle with.",
+    )
+    _add_scene(inspect)
+    add_json(inspect)
+    inspect.set_defaults(run=run_inspect)
+    export = actions.add_parser(
+        "export",
+        help="write the scene as a GLB file",
+        description="Writes the scene as it stands at first as GLB (glTF 2.0): meshes, 2d textures and colours, y up.",
+    )
+    _add_scene(export)
+    export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
+    export.set_defaults(run=run_export)
+
+
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scene", metavar="FILE", help="MJCF, URDF or MJB file, or the name of a scene (see `iris-session serve --help`)"
+    )
+    parser.add_argument(
+        "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
+    )
+
+
+def run_inspect(arguments: argparse.Namespace) -> int:
+    """Prints the report; status 0 whatever it says."""
+    import hashlib
+
+    import msgspec
+
+    from iris_session.protocol.scene import encode_scene
+    from iris_session.scene.report import report, tree
+
+    parsed, _ = _parse(arguments)
+    found = report(parsed.spec, hashlib.sha256(encode_scene(parsed.spec)).hexdigest(), parsed.skipped)
+    if arguments.json:
+        print_json(msgspec.to_builtins(found))
+        return 0
+    for line in tree(parsed.spec):
+        print(line)
+    totals = found.totals
+    print(
+        f"\n{found.bodies} bodies ({found.moving} move), {totals.objects} objects, {totals.triangles:,} triangles, "
+        f"{len(parsed.spec.lights)} lights, {len(parsed.spec.deformables)} deformables"
+    )
+    print(
+        f"{_size(totals.asset_bytes)} of assets: {_size(totals.mesh_bytes)} meshes and {_size(totals.texture_bytes)} "
+        f"textures, the rest coarser levels; {_size(totals.texture_memory)} of textures on a graphics card"
+    )
+    print("\nheaviest:")
+    for heavy in found.heavy:
+        print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_size(heavy.bytes)}, {heavy.levels} levels")
+    for text in found.skipped:
+        print(f"left out: {text}")
+    for text in found.struggles:
+        print(f"headset: {text}")
+    if not found.struggles:
+        print("headset: nothing here that a Quest 3 would struggle with")
+    return 0
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    """Writes the file and says how large it is."""
+    from iris_session.scene.glb import write_glb
+
+    if arguments.out.suffix.lower() != ".glb":
+        raise CommandError(f"{arguments.out} does not end in .glb: GLB is the only format of `scene export`")
+    parsed, store = _parse(arguments)
+    try:
+        size = write_glb(parsed.spec, store, arguments.out)
+    except OSError as error:
+        raise CommandError(f"{arguments.out} cannot be written: {error.strerror or error}") from None
+    for text in parsed.skipped:
+        print(f"left out: {text}", file=sys.stderr)
+    print(f"{arguments.out}: {_size(size)}")
+    return 0
+
+
+def _parse(arguments: argparse.Namespace) -> tuple[Parsed, AssetStore]:
+    from iris_session.scene import AssetStore
+    from iris_session.scene.mujoco_scene import parse_mujoco
+
+    model = open_scene(arguments.scene).model
+    try:
+        store = AssetStore(arguments.assets)
+        return parse_mujoco(model, store, name=Path(arguments.scene).stem), store
+    except OSError as error:
+        raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 100_000 else f"{n_bytes / 1e3:.1f} kB"

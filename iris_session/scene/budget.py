@@ -1,0 +1,121 @@
+"""Which levels of detail a client takes for its stated budget, and what it does not draw at all."""
+
+from __future__ import annotations
+
+import heapq
+from typing import Final, NamedTuple
+
+import msgspec
+
+from iris_session.protocol.scene import SceneSpec
+from iris_session.protocol.scene_looks import Mesh
+from iris_session.protocol.scene_names import GeometryKind
+from iris_session.scene.totals import texture_memory, triangles
+
+#: Where a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
+QUEST_OBJECTS: Final = 200
+QUEST_TRIANGLES: Final = 750_000
+QUEST_TEXTURE_BYTES: Final = 700 << 20
+
+
+class Budget(msgspec.Struct, frozen=True):
+    """What a client can draw. 0: no bound. `texture_bytes`: in the memory of its graphics card."""
+
+    triangles: int = 0
+    texture_bytes: int = 0
+    objects: int = 0
+
+
+QUEST_3: Final = Budget(QUEST_TRIANGLES, QUEST_TEXTURE_BYTES, QUEST_OBJECTS)
+
+
+class Choice(NamedTuple):
+    """`mesh_levels`, `texture_levels`: one per mesh and texture. `hidden`: ids of visuals to leave out, the smallest.
+
+    `triangles`, `texture_bytes`, `objects`: what remains. `fits`: false when even the coarsest levels exceed it.
+    """
+
+    mesh_levels: tuple[int, ...]
+    texture_levels: tuple[int, ...]
+    hidden: frozenset[int]
+    triangles: int
+    texture_bytes: int
+    objects: int
+    fits: bool
+
+
+def choose_levels(spec: SceneSpec, budget: Budget) -> Choice:
+    """Finest levels that fit: coarsened first is what loses least detail, relative to its size, per triangle saved."""
+    drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
+    hidden = _hidden(spec, drawn, budget.objects)
+    kept = [i for i in drawn if spec.visuals[i].id not in hidden]
+    meshes, n_triangles = _mesh_levels(spec, kept, budget.triangles)
+    textures, memory = _texture_levels(spec, budget.texture_bytes)
+    fits = (not budget.triangles or n_triangles <= budget.triangles) and (
+        not budget.texture_bytes or memory <= budget.texture_bytes
+    )
+    return Choice(meshes, textures, hidden, n_triangles, memory, len(kept), fits)
+
+
+def _hidden(spec: SceneSpec, drawn: list[int], objects: int) -> frozenset[int]:
+    if not objects or len(drawn) <= objects:
+        return frozenset()
+    smallest = sorted(drawn, key=lambda i: _extent(spec, i))[: len(drawn) - objects]
+    return frozenset(spec.visuals[i].id for i in smallest)
+
+
+def _extent(spec: SceneSpec, visual: int) -> float:
+    """Largest side [m]; planes are never too small."""
+    geometry = spec.visuals[visual].geometry
+    if geometry.kind == GeometryKind.PLANE:
+        return float("inf")
+    if geometry.mesh >= 0:
+        return _side(spec.meshes[geometry.mesh])
+    caps = geometry.size[0] if geometry.kind == GeometryKind.CAPSULE else 0.0
+    return 2 * (max(geometry.size) + caps)
+
+
+def _side(mesh: Mesh) -> float:
+    return max(high - low for low, high in zip(mesh.low, mesh.high, strict=True))
+
+
+def _mesh_levels(spec: SceneSpec, kept: list[int], limit: int) -> tuple[tuple[int, ...], int]:
+    levels = [0] * len(spec.meshes)
+    uses = [0] * len(spec.meshes)
+    for i in kept:
+        if spec.visuals[i].geometry.mesh >= 0:
+            uses[spec.visuals[i].geometry.mesh] += 1
+    total = sum(triangles(spec, i) for i in kept)
+    queue = [(_loss(spec.meshes[m], 1, uses[m]), m) for m in range(len(levels)) if _loss(spec.meshes[m], 1, uses[m])]
+    heapq.heapify(queue)
+    while limit and total > limit and queue:
+        _, m = heapq.heappop(queue)
+        mesh, level = spec.meshes[m], levels[m]
+        total -= uses[m] * (mesh.levels[level].triangles - mesh.levels[level + 1].triangles)
+        levels[m] += 1
+        if loss := _loss(mesh, level + 2, uses[m]):
+            heapq.heappush(queue, (loss, m))
+    return tuple(levels), total
+
+
+def _loss(mesh: Mesh, level: int, uses: int) -> float:
+    """Error relative to the size, per triangle that going to `level` saves; 0 where there is nothing to save."""
+    if level >= len(mesh.levels) or not uses:
+        return 0.0
+    saved = mesh.levels[level - 1].triangles - mesh.levels[level].triangles
+    return (mesh.levels[level].max_error_m + 1e-9) / max(_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
+
+
+def _texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:
+    levels = [0] * len(spec.textures)
+    sizes = [[texture_memory(texture, level) for level in texture.levels] for texture in spec.textures]
+    total = sum(size[0] for size in sizes)
+    queue = [(-size[0], t) for t, size in enumerate(sizes) if len(size) > 1]
+    heapq.heapify(queue)
+    while limit and total > limit and queue:
+        _, t = heapq.heappop(queue)
+        levels[t] += 1
+        total -= sizes[t][levels[t] - 1] - sizes[t][levels[t]]
+        if levels[t] + 1 < len(sizes[t]):
+            heapq.heappush(queue, (-sizes[t][levels[t]], t))
+    return tuple(levels), total

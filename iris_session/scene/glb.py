@@ -1,0 +1,241 @@
+"""A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors open anywhere.
+
+Y is up there, so a root node turns the scene. Every mesh and texture is in the file once, however many bodies wear
+it. 2d textures are kept; cubes and skies have no form in glTF and leave their colour. Groups that are hidden stay out.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene import SceneSpec, Visual
+from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind
+from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.images import decode_image, encode_image
+from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
+from iris_session.scene.shapes import generated_uv, height_field, primitive
+from iris_session.scene.simplify import unit
+from iris_session.scene.store import AssetStore
+
+_FLOAT, _UINT = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963
+_REPEAT, _LINEAR, _MIPMAPS = 10497, 9729, 9987
+#: Turns z up into y up: -90 degrees around x, `[x, y, z, w]` as glTF has quaternions.
+_Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+
+
+def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
+    """Writes the file; returns its size. Raises `AssetMissingError` when the store lacks an asset of the scene."""
+    data = _Glb(spec, store).finish()
+    path.write_bytes(data)
+    return len(data)
+
+
+class _Glb:
+    def __init__(self, spec: SceneSpec, store: AssetStore) -> None:
+        self._spec = spec
+        self._store = store
+        self._blob = bytearray()
+        self._json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "iris-session"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"name": spec.name or "scene", "rotation": _Y_UP, "children": []}],
+            **{name: [] for name in ("meshes", "materials", "accessors", "bufferViews", "textures", "images")},
+        }
+        self._meshes: dict[tuple[object, ...], int | None] = {}
+        self._materials: dict[tuple[object, ...], int] = {}
+        self._textures: dict[int, int] = {}
+        self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
+
+    def finish(self) -> bytes:
+        nodes = {body.id: self._node(body.name or f"body_{body.id}", body.T_parent_body) for body in self._spec.bodies}
+        for body in self._spec.bodies:
+            self._children(nodes.get(body.parent, 0)).append(nodes[body.id])
+        for visual in self._spec.visuals:
+            if visual.rgba[3] > 0 and visual.group in self._spec.groups_shown:
+                mesh = self._mesh_of(visual)
+                if mesh is not None:
+                    node = self._node(visual.name or f"visual_{visual.id}", visual.T_body_visual)
+                    self._json["nodes"][node]["mesh"] = mesh
+                    self._children(nodes[visual.body]).append(node)
+        for index, deformable in enumerate(self._spec.deformables):
+            if deformable.dim > 1 and deformable.group in self._spec.groups_shown:
+                node = self._node(deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+                self._json["nodes"][node]["mesh"] = self._deformable(index)
+                self._children(0).append(node)
+        return self._packed()
+
+    def _packed(self) -> bytes:
+        self._json["buffers"] = [{"byteLength": len(self._blob)}]
+        self._json["samplers"] = [{"wrapS": _REPEAT, "wrapT": _REPEAT, "magFilter": _LINEAR, "minFilter": _MIPMAPS}]
+        document = {key: value for key, value in self._json.items() if value != []}
+        if not self._blob:
+            del document["buffers"]
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        body = bytes(self._blob) + b"\0" * (-len(self._blob) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        if body:
+            chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def _children(self, node: int) -> list[int]:
+        children: list[int] = self._json["nodes"][node].setdefault("children", [])
+        return children
+
+    def _node(self, name: str, pose: Pose) -> int:
+        w, x, y, z = pose.q
+        length = float(np.linalg.norm(pose.q)) or 1.0
+        turn = [x / length, y / length, z / length, w / length]
+        return self._add("nodes", {"name": name, "translation": list(pose.p), "rotation": turn})
+
+    def _add(self, kind: str, item: dict[str, Any]) -> int:
+        self._json[kind].append(item)
+        return len(self._json[kind]) - 1
+
+    # --- geometry -----------------------------------------------------------------------------------------------------
+
+    def _mesh_of(self, visual: Visual) -> int | None:
+        """One glTF mesh per shape and look, however many visuals have it."""
+        key = (visual.geometry, visual.material, visual.rgba)
+        if key not in self._meshes:
+            primitives = self._primitive(visual)
+            self._meshes[key] = None if primitives is None else self._add("meshes", {"primitives": [primitives]})
+        return self._meshes[key]
+
+    def _primitive(self, visual: Visual) -> dict[str, Any] | None:
+        geometry = visual.geometry
+        mapped = self._mapping(visual)
+        key = (geometry, mapped)
+        if key not in self._shared:
+            arrays = self._arrays(visual)
+            if arrays is None or not arrays.triangles:
+                return None
+            uv = arrays.uv
+            if uv is None and mapped is not None:
+                uv = generated_uv(arrays.position, geometry, self._spec.materials[visual.material])
+            self._shared[key] = self._attributes(arrays, uv)
+        return {**self._shared[key], "material": self._material(visual.material, visual.rgba)}
+
+    def _mapping(self, visual: Visual) -> tuple[object, ...] | None:
+        """What generated texture coordinates depend on, `None` where there is no 2d texture."""
+        if visual.material < 0:
+            return None
+        material = self._spec.materials[visual.material]
+        worn = material.texture()
+        if worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
+            return None
+        return (material.repeat, material.uniform)
+
+    def _arrays(self, visual: Visual) -> MeshArrays | None:
+        geometry = visual.geometry
+        if geometry.mesh >= 0:
+            return decode_mesh(self._store.get(self._spec.meshes[geometry.mesh].levels[0].address))
+        if geometry.hfield >= 0:
+            field = self._spec.hfields[geometry.hfield]
+            return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+        return primitive(geometry)
+
+    def _deformable(self, index: int) -> int:
+        """The rest shape, from both sides."""
+        deformable = self._spec.deformables[index]
+        arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
+        corners = arrays["position"][arrays["elements"]]
+        normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), arrays.get("uv"))
+        material = self._material(deformable.material, deformable.rgba, both_sides=deformable.dim == 2)
+        return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": material}]})
+
+    def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
+        attributes = {
+            "POSITION": self._accessor(mesh.position, "VEC3", bounds=True),
+            "NORMAL": self._accessor(unit(mesh.normal).astype(np.float32), "VEC3"),
+        }
+        if uv is not None:
+            attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2")
+        index = self._add(
+            "accessors",
+            {
+                "bufferView": self._view(mesh.index.tobytes(), _INDICES),
+                "componentType": _UINT,
+                "count": mesh.index.size,
+                "type": "SCALAR",
+            },
+        )
+        return {"attributes": attributes, "indices": index}
+
+    def _accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
+        accessor: dict[str, Any] = {
+            "bufferView": self._view(values.astype("<f4").tobytes(), _VERTICES),
+            "componentType": _FLOAT,
+            "count": len(values),
+            "type": kind,
+        }
+        if bounds:
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        return self._add("accessors", accessor)
+
+    def _view(self, data: bytes, target: int = 0) -> int:
+        self._blob += b"\0" * (-len(self._blob) % 4)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
+        if target:
+            view["target"] = target
+        self._blob += data
+        return self._add("bufferViews", view)
+
+    # --- looks --------------------------------------------------------------------------------------------------------
+
+    def _material(self, index: int, rgba: Sequence[float], *, both_sides: bool = False) -> int:
+        key = (index, tuple(rgba), both_sides)
+        if key not in self._materials:
+            self._materials[key] = self._add("materials", self._look(index, rgba, both_sides=both_sides))
+        return self._materials[key]
+
+    def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool) -> dict[str, Any]:
+        colour = [_linear(v) for v in rgba[:3]]
+        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        found: dict[str, Any] = {"pbrMetallicRoughness": look, "doubleSided": both_sides}
+        if index >= 0:
+            material = self._spec.materials[index]
+            look["metallicFactor"] = min(max(material.metallic, 0.0), 1.0)
+            shine = 1.0 - material.shininess if material.roughness < 0 else material.roughness
+            look["roughnessFactor"] = min(max(shine, 0.05), 1.0)
+            if material.emission > 0:
+                found["emissiveFactor"] = [min(1.0, material.emission * v) for v in colour]
+            found["name"] = material.name or f"material_{index}"
+            texture = self._texture(material.texture())
+            if texture is not None:
+                look["baseColorTexture"] = {"index": texture}
+        look["baseColorFactor"] = [*colour, min(max(float(rgba[3]), 0.0), 1.0)]
+        if rgba[3] < 1:
+            found["alphaMode"] = "BLEND"
+        return found
+
+    def _texture(self, index: int) -> int | None:
+        if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:
+            return None
+        level = self._spec.textures[index].levels[0]
+        if level.encoding == AssetEncoding.OPAQUE:
+            return None
+        if index not in self._textures:
+            data, encoding = self._store.get(level.address), level.encoding
+            if encoding == AssetEncoding.ARRAYS:
+                data, encoding, _ = encode_image(decode_image(data, encoding), AssetEncoding.PNG)
+            image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
+            self._textures[index] = self._add("textures", {"source": image, "sampler": 0})
+        return self._textures[index]
+
+
+def _linear(value: float) -> float:
+    """A colour as it is seen (sRGB) to glTF's linear factor."""
+    v = min(max(float(value), 0.0), 1.0)
+    return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4

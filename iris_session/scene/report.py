@@ -1,0 +1,132 @@
+"""What a scene is made of, what is heavy in it and why, and what a headset will struggle with."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Final
+
+import msgspec
+
+from iris_session.protocol.scene import Body, SceneSpec, Totals
+from iris_session.scene.budget import QUEST_3, Choice, choose_levels
+from iris_session.scene.totals import texture_memory, triangles
+
+#: How many heavy things are listed.
+HEAVIEST: Final = 8
+_MIB: Final = 1 << 20
+
+
+class Heavy(msgspec.Struct, frozen=True):
+    """One mesh or texture that costs much. `uses`: visuals that draw it. `why`: in words."""
+
+    kind: str
+    name: str
+    uses: int
+    bytes: int
+    triangles: int
+    memory: int
+    levels: int
+    why: str
+
+
+class SceneReport(msgspec.Struct, frozen=True):
+    """`struggles`: what a Quest 3 will, in words; empty when nothing. `for_headset`: what the levels of detail make of
+    it (triangles, texture bytes, objects drawn, visuals left out)."""
+
+    scene_hash: str
+    totals: Totals
+    bodies: int
+    moving: int
+    kinds: dict[str, int]
+    heavy: tuple[Heavy, ...]
+    struggles: tuple[str, ...]
+    for_headset: dict[str, int]
+    skipped: tuple[str, ...]
+
+
+def report(spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = ()) -> SceneReport:
+    """The report of a scene."""
+    choice = choose_levels(spec, QUEST_3)
+    heavy = sorted((*_meshes(spec), *_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses))
+    return SceneReport(
+        scene_hash=scene_hash,
+        totals=spec.totals,
+        bodies=len(spec.bodies) - 1,
+        moving=sum(body.moving for body in spec.bodies),
+        kinds=dict(Counter(visual.geometry.kind for visual in spec.visuals if visual.rgba[3] > 0)),
+        heavy=tuple(heavy[:HEAVIEST]),
+        struggles=tuple(_struggles(spec, choice)),
+        for_headset={
+            "triangles": choice.triangles,
+            "texture_bytes": choice.texture_bytes,
+            "objects": choice.objects,
+            "hidden": len(choice.hidden),
+        },
+        skipped=skipped,
+    )
+
+
+def tree(spec: SceneSpec) -> Iterator[str]:
+    """One line per body, indented by depth: what it draws."""
+    children: dict[int, list[Body]] = {}
+    for body in spec.bodies:
+        children.setdefault(body.parent, []).append(body)
+    drawn: dict[int, list[int]] = {}
+    for index, visual in enumerate(spec.visuals):
+        drawn.setdefault(visual.body, []).append(index)
+    stack = [(body, 0) for body in reversed(children.get(-1, []))]
+    while stack:
+        body, depth = stack.pop()
+        shapes = drawn.get(body.id, [])
+        kinds = Counter(spec.visuals[i].geometry.kind for i in shapes if spec.visuals[i].rgba[3] > 0)
+        what = ", ".join(f"{n} {kind}" if n > 1 else kind for kind, n in kinds.items()) or "-"
+        count = sum(triangles(spec, i) for i in shapes if spec.visuals[i].rgba[3] > 0)
+        name = body.name or f"(body {body.id})"
+        mark = "" if body.moving or not body.id else "  static"
+        yield f"{'  ' * depth}{name}: {what}{f', {count:,} triangles' if count else ''}{mark}"
+        stack += [(child, depth + 1) for child in reversed(children.get(body.id, []))]
+
+
+def _meshes(spec: SceneSpec) -> Iterator[Heavy]:
+    uses = Counter(visual.geometry.mesh for visual in spec.visuals if visual.rgba[3] > 0)
+    for i, mesh in enumerate(spec.meshes):
+        level = mesh.levels[0]
+        why = f"{level.triangles:,} triangles"
+        if uses[i] != 1:
+            why += f", drawn {uses[i]} times"
+        if len(mesh.levels) == 1 and level.triangles > 5_000:
+            why += ", no coarser level: it has texture coordinates"
+        yield Heavy("mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why)
+
+
+def _textures(spec: SceneSpec) -> Iterator[Heavy]:
+    uses: Counter[int] = Counter()
+    for visual in spec.visuals:
+        if visual.material >= 0:
+            uses.update(use.texture for use in spec.materials[visual.material].textures)
+    for i, texture in enumerate(spec.textures):
+        level, memory = texture.levels[0], texture_memory(texture, texture.levels[0])
+        why = f"{level.width} x {level.height} {texture.kind}: {memory / _MIB:.1f} MiB on a graphics card"
+        yield Heavy(
+            "texture", texture.name or f"texture {i}", uses[i], level.bytes, 0, memory, len(texture.levels), why
+        )
+
+
+def _struggles(spec: SceneSpec, choice: Choice) -> Iterator[str]:
+    totals = spec.totals
+    if totals.objects > QUEST_3.objects:
+        yield (
+            f"{totals.objects} objects, about {QUEST_3.objects} is what a Quest 3 draws: join static shapes into one "
+            "mesh, or hide collision shapes (groups 3 to 5)"
+        )
+    if totals.triangles > QUEST_3.triangles:
+        yield (
+            f"{totals.triangles:,} triangles, about {QUEST_3.triangles:,} is what a Quest 3 draws: coarser levels "
+            f"bring it to {choice.triangles:,}"
+        )
+    if totals.texture_memory > QUEST_3.texture_bytes:
+        yield (
+            f"{totals.texture_memory / _MIB:.0f} MiB of textures, about {QUEST_3.texture_bytes / _MIB:.0f} is what a "
+            f"Quest 3 holds: smaller levels bring it to {choice.texture_bytes / _MIB:.0f}"
+        )

@@ -1,0 +1,102 @@
+"""Triangles of shapes lie on MuJoCo's surfaces, and a GLB of a scene is that scene."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from iris_session.cli.main import main
+from iris_session.scene import AssetStore
+from iris_session.scene.glb import write_glb
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.scene.models import every_shape, flexes
+
+#: How far a face's centre lies below the round surface it stands for, and how far above it a ray begins [m].
+SAG, ABOVE = 0.008, 0.02
+GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+
+
+def document(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    found: dict[str, Any] = json.loads(data[20 : 20 + size])
+    return found
+
+
+def hit(model: mujoco.MjModel, data: mujoco.MjData, point: np.ndarray, direction: np.ndarray) -> float:
+    geom = np.zeros(1, np.int32)
+    return float(mujoco.mj_ray(model, data, point, direction, GROUPS, 1, -1, geom))
+
+
+def test_faces_of_a_glb_lie_on_the_surfaces_that_mujoco_has(tmp_path: Path) -> None:
+    model = every_shape()
+    store = AssetStore(tmp_path)
+    path = tmp_path / "scene.glb"
+    assert write_glb(parse_mujoco(model, store).spec, store, path) == path.stat().st_size
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    whole = trimesh.load(path).to_geometry()
+    z_up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # back from glTF
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(np.flatnonzero(whole.area_faces > 1e-6), 600, replace=False)
+    centres, normals = whole.triangles_center[chosen] @ z_up.T, whole.face_normals[chosen] @ z_up.T
+    gaps = np.array([hit(model, data, c + ABOVE * n, -n) for c, n in zip(centres, normals, strict=True)]) - ABOVE
+    assert np.mean((gaps > -SAG) & (gaps < 1e-3)) > 0.98  # a ray may slip through where two shapes' edges meet
+
+
+def test_a_glb_has_every_mesh_and_picture_once(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(every_shape(), store).spec
+    write_glb(spec, store, tmp_path / "a.glb")
+    found = document(tmp_path / "a.glb")
+    assert len(found["images"]) == 1
+    shown = [v for v in spec.visuals if v.rgba[3] > 0 and v.group in spec.groups_shown]
+    assert sum("mesh" in node for node in found["nodes"]) == len(shown)
+    assert len(found["meshes"]) == len({(v.geometry, v.material, v.rgba) for v in shown})
+    assert any(material.get("alphaMode") == "BLEND" for material in found["materials"])
+
+
+def test_deformables_are_in_a_glb_as_they_lie(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    write_glb(parse_mujoco(flexes(), store).spec, store, tmp_path / "a.glb")
+    whole = trimesh.load(tmp_path / "a.glb").to_geometry()
+    assert whole.bounds[1][1] >= 1.0
+    assert {node["name"] for node in document(tmp_path / "a.glb")["nodes"]} >= {"cloth", "soft", "box"}
+
+
+@pytest.mark.parametrize("json_too", [False, True])
+def test_inspect(tmp_path: Path, capsys: pytest.CaptureFixture[str], *, json_too: bool) -> None:
+    options = ["--assets", str(tmp_path), *(["--json"] if json_too else [])]
+    assert main(["scene", "inspect", "handover", *options]) == 0
+    shown = capsys.readouterr().out
+    if json_too:
+        found = json.loads(shown)
+        assert len(found["scene_hash"]) == 64
+        assert found["totals"]["objects"] > 50
+        assert found["struggles"] == []
+    else:
+        assert "  hammer: 3 box, cylinder, 164 triangles" in shown.splitlines()
+        assert "headset: nothing here" in shown
+
+
+def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "handover.glb"
+    assert main(["scene", "export", "handover", str(out), "--assets", str(tmp_path / "assets")]) == 0
+    assert document(out)["asset"]["version"] == "2.0"
+    assert main(["scene", "export", "handover", "handover.obj", "--assets", str(tmp_path / "assets")]) == 2
+    assert main(["scene", "export", "handover", "/nowhere/a.glb", "--assets", str(tmp_path / "assets")]) == 2
+    assert main(["scene", "inspect", "handover", "--assets", str(out)]) == 2
+    errors = capsys.readouterr().err
+    assert ".glb" in errors
+    assert "cannot be written" in errors
+    assert "another place" in errors
