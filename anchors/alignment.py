@@ -36,7 +36,7 @@ from anchors.pose import (
     quat_rotate,
 )
 from anchors.robust import Merged
-from anchors.solve import Prior, Problem, Solution, agreeing_anchors, in_world, inverted, problem, solve
+from anchors.solve import Prior, Problem, Solution, agreeing_anchors, common_tilt, in_world, inverted, problem, solve
 from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
 
 __all__ = [
@@ -256,7 +256,8 @@ class AlignmentEstimator:
         prior = self.config.prior
         b = self._problem(keys, merged, prior)
         s = solve(b, prior, self._near)
-        if prior.gravity and not self._is_majority(b, s, len(groups)):  # do they contradict each other, or gravity?
+        against = prior.gravity and not self._is_majority(b, s, len(groups))
+        if against and common_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
             free = solve(b, replace(prior, tilt_sigma_rad=math.inf))
             s = free if self._is_majority(b, free, len(groups)) else s
         if not s.inside.any():

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, turned
+from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, swing, turned
 from anchors.pose import PoseTuple, quat_normalize
 from anchors.robust import Merged, circular_median
 from anchors.uncertainty import Z999, chi2_quantile
@@ -27,7 +27,8 @@ _CHI2_3_999: Final = 16.266
 _ITERATIONS: Final = 6
 _STEADY_S: Final = 60.0  # for so long the drift is taken as steady, later the frame also wanders
 _CONVERGED: Final = 2e-4  # [m], [rad]; with residuals of milliradians the step after would be below 1e-6
-_LEFT_OUT: Final = 8  # sheets, at most, that are left out in turn
+_LEFT_OUT: Final = 4  # sheets, at most, that are left out in turn
+_SURE: Final = 2  # more sheets than these agree by no chance
 _EYE: Final = np.eye(6)
 Mask = NDArray[np.bool_]
 
@@ -115,6 +116,8 @@ def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> 
     if not inside.any():  # each is tilted so far that it contradicts gravity
         return _without(solution)
     found = _settled(b, inside, start, prior)
+    if agreeing_anchors(b.anchor, found.inside) > _SURE and _is_likely(found):
+        return found
     others = [one for one in _with_one_sheet_less(b, solution, prior) if _is_likely(one)]
     return max([found, *others], key=lambda one: _rank(b, one))
 
@@ -153,6 +156,12 @@ def _settled(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior)
 def _rank(b: Problem, s: Solution) -> tuple[int, int, float]:
     """The better the larger: agreeing sheets, agreeing looks, and how well they agree."""
     return agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
+
+
+def common_tilt(b: Problem) -> float:
+    """Tilt [rad] that most groups show, each by itself and gravity left out."""
+    middle = np.median(swing(b.q), axis=0)
+    return math.hypot(float(middle[0]), float(middle[1]))
 
 
 def _without(s: Solution) -> Solution:
