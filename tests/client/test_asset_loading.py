@@ -119,6 +119,16 @@ def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
     assert loader.whole("a")
 
 
+def test_a_chunk_that_is_shorter_than_asked_leaves_no_gap() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    answer(loader, ask, 3 * CHUNK_BYTES)
+    first, second = loader.requests(0)
+    assert answer(loader, first, 3 * CHUNK_BYTES, 10) is True
+    assert answer(loader, second, 3 * CHUNK_BYTES) is False
+    assert next(iter(loader.requests(0))).offset == CHUNK_BYTES + 10
+
+
 @pytest.mark.parametrize("reason", [AssetRefusal.UNKNOWN, AssetRefusal.VERSION, "of a later version"])
 def test_refusals_that_do_not_pass_end_it(reason: str) -> None:
     loader = started("a", "b")

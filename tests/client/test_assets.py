@@ -9,7 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.client import AssetCache, AssetError, AssetFetch, Client, InvalidMessageError, NotConnectedError
+from iris_session.client import (
+    AssetCache,
+    AssetError,
+    AssetFetch,
+    Client,
+    InvalidMessageError,
+    NotConnectedError,
+    asset_loading,
+)
 from iris_session.client.waiting import ClientGroup
 from iris_session.protocol.names import AssetRefusal
 from tests.client.harness import LiveSession
@@ -98,8 +106,9 @@ def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable
 
 
 def test_a_front_that_is_killed_costs_no_byte_twice(
-    store: Store, live: LiveSession, join: Callable[..., Client]
+    store: Store, live: LiveSession, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # the connection to control tells that it is gone
     client = join()
     killed: list[int] = []
 
