@@ -58,6 +58,7 @@ def _home_of_keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keys of the tests, and of every process that they start, are not those of whoever runs them."""
     before = os.environ.get("IRIS_HOME")
     os.environ["IRIS_HOME"] = str(tmp_path_factory.mktemp("keys") / "home")
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))  # assets of one run, shared by its tests
     yield
     if before is None:
         del os.environ["IRIS_HOME"]

@@ -303,6 +303,7 @@ class MediaEncoding:
     """What the bytes of a media frame are."""
 
     BYTES: Final = "bytes"  # only source and receiver know
+    DEFORMABLE: Final = "deformable"  # vertices of a mesh of the scene, docs/deformables.md
 
 
 class LateCause:

@@ -36,6 +36,7 @@ class SessionConfig:
     default one: 0.16). Off loopback everything is encrypted, with `curve` on loopback too: with the key and the
     allow-list of the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates
     `curve_clients`.
+    `assets`: meshes and textures for clients, kept in the user's cache of assets or in that folder; False: none.
     `adapt_media`: clients on slow links get fewer media streams, so that their state stays fresh.
     `keyframe_s`: distance of the recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes
     on without when refused. `resume`: a recording (or its folder) of our loop to go on from; scene, robots, name,
@@ -57,6 +58,7 @@ class SessionConfig:
     curve_key: str = ""
     curve_clients: str = ""
     keyframe_s: float = 5.0
+    assets: bool | str | Path = True
     adapt_media: bool = True
     realtime: bool = True
     resume: str | Path | None = None

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from iris_session.physics import World
 from iris_session.protocol.client_messages import Marker
@@ -36,14 +35,16 @@ from iris_session.recording.feed import SILENCE_S
 from iris_session.recording.versions import boot_id, environment
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import Continuation, wait_until_free
-from iris_session.runtime.core import Plant, SessionCore
+from iris_session.runtime.core import SessionCore
+from iris_session.runtime.deformables import DeformableStreams
 from iris_session.runtime.errors import StartError
 from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path
-from iris_session.runtime.stepper import ResumedFrom, Stepper
+from iris_session.runtime.shared_scene import SharedScenes
+from iris_session.runtime.stepper import NextScene, ResumedFrom, Stepper
 from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replaced
-from iris_session.transport import FrontConfig, FrontError, FrontProcess, SceneInfo, addresses_of
+from iris_session.transport import FrontConfig, FrontError, FrontProcess, addresses_of
 from iris_session.transport.sockets import host_in_address
 
 #: Ports of media and assets, from the port of state: 7723, 7726 and 7724 by default.
@@ -82,11 +83,13 @@ class SessionProcesses:
         self.recording = config.recording_path() if past is None else past.recording
         self._in_use: RecordingLock | None = None
         self._keeper: NoteKeeper | None = None
-        self._scene, self._tick_period_ns = _scene_info(world), world.tick_period_ns
+        self._world, self._tick_period_ns = world, world.tick_period_ns
+        self.scenes = SharedScenes(config.assets, config.name)
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
         self.front: FrontProcess | None = None
+        self._deformables: DeformableStreams | None = None
         self._front_backoff = Backoff()
         #: Of the recorder, None when nothing is recorded.
         self.supervisor: RecorderSupervisor | None = None
@@ -112,7 +115,8 @@ class SessionProcesses:
                 self._keeper = NoteKeeper(note_path(self.recording))
             self.name = others.free_name(self._config.name, self.session_id)
             self.notes += others.notes
-            self.front = FrontProcess(self._front_config(), self._scene)
+            self.front = FrontProcess(self._front_config(), self.scenes.info(self._world))
+            self.notes += self.scenes.notes
             if self._past is not None:
                 self.notes += self._past.notes
                 self.front.link.handback = self._past.handback
@@ -198,11 +202,15 @@ class SessionProcesses:
         front, feed = self.front.link, self.feed
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.on_scene.append(self._scene_changed)
+        self._deformables = DeformableStreams(core.world, self.front.publish_media)
+        stepper.beside_state.append(self._deformables.send)
         return stepper
 
-    def _scene_changed(self, plant: Plant) -> None:
+    def _scene_changed(self, scene: NextScene) -> None:
         if self.front is not None:
-            self.front.set_scene(_scene_info(plant.world))
+            self.front.set_scene(scene.info)
+        if self._deformables is not None:
+            self._deformables.use(scene.plant.world)
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(
@@ -295,6 +303,7 @@ class SessionProcesses:
             self._note()
             self.front.close(FAREWELL_S)
             self.front = None
+        self.scenes.close()
         if self.supervisor is not None:
             self.supervisor.close()
         feed, self.feed = self.feed, None
@@ -327,9 +336,3 @@ def settings_of(config: SessionConfig) -> Settings:
     return Settings(
         config.state_hz, config.keyframe_s, config.realtime, config.adapt_media, anchor_sizes=config.sheet_sizes()
     )
-
-
-def _scene_info(world: World) -> SceneInfo:
-    poses = np.zeros((len(world.bodies), 7))
-    world.poses(poses)
-    return SceneInfo(world.scene_hash, world.robot_infos, world.bodies, poses.tobytes())

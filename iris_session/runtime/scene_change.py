@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,8 +18,10 @@ from iris_session.protocol.entries import HOST, Entry, SceneLoaded, decode_entry
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.core import Plant, SessionCore, make_plant, plant_state
+from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
+from iris_session.runtime.processes import SessionProcesses
+from iris_session.runtime.shared_scene import SharedScenes
 from iris_session.runtime.stepper import NextScene, Stepper
 from iris_session.runtime.user_loop import UserLoop
 
@@ -58,12 +61,13 @@ class SceneChanges:
         if stepper is None:
             raise OwnershipError("load_scene needs a session that runs: call it while run() is under way")
         done: Future[None] = Future()
+        scenes = self._live().scenes
         known = None if robots is None else tuple(robots), None if objects is None else tuple(objects)
         state = b"" if data is None or isinstance(model, str | Path) else plant_state(model, data)
 
         def work() -> None:
             try:
-                stepper.change_scene(prepare(stepper.core, load_model_of(model), state, *known))
+                stepper.change_scene(prepare(stepper.core, scenes, load_model_of(model), state, *known))
             except BaseException as error:  # of whoever asks for the result
                 done.set_exception(error)
             else:
@@ -73,7 +77,11 @@ class SceneChanges:
         threading.Thread(target=work, name="iris-scene", daemon=True).start()
         return done
 
-    def _take_scene(self, plant: Plant) -> None:
+    @abstractmethod
+    def _live(self) -> SessionProcesses: ...
+
+    def _take_scene(self, scene: NextScene) -> None:
+        plant = scene.plant
         self.model, self.data = plant.world.model, plant.world.data
         self.robots, self.objects = plant.scene.robots, plant.scene.objects
 
@@ -85,6 +93,7 @@ def load_model_of(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
 
 def prepare(
     core: SessionCore,
+    scenes: SharedScenes,
     model: mujoco.MjModel,
     state: bytes,
     robots: tuple[RobotSpec, ...] | None,
@@ -109,4 +118,4 @@ def prepare(
             f"the scene has a timestep of {then_ns * 1e-6:g} ms, the session one of {now_ns * 1e-6:g} ms: "
             f'set <option timestep="{now_ns * 1e-9:g}"/>'
         )
-    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)))
+    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), scenes.info(plant.world))

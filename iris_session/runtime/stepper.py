@@ -34,6 +34,7 @@ from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.runtime.core import Plant, SessionCore, StepOutcome, unmeasured
 from iris_session.runtime.status import SessionLedger
+from iris_session.transport import SceneInfo
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
 MAX_HOST_ENTRIES: Final = 256
@@ -81,11 +82,12 @@ class RecorderPort(Protocol):
 
 
 class NextScene(NamedTuple):
-    """A scene that is to take the place of the present one. `packed_model`: for the recording."""
+    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `info`: for the front."""
 
     plant: Plant
     model_hash: str
     packed_model: bytes
+    info: SceneInfo
 
 
 class ResumedFrom(NamedTuple):
@@ -126,7 +128,7 @@ class Stepper:
         self._host: deque[EntryMessage] = deque()
         self._scenes: deque[NextScene] = deque()
         #: Called with another scene before the step that loads it.
-        self.on_scene: list[Callable[[Plant], None]] = []
+        self.on_scene: list[Callable[[NextScene], None]] = []
         self._state_period_ns = state_period_ns
         self._keyframe_period_ns = keyframe_period_ns
         self._next_state_ns = 0
@@ -135,6 +137,8 @@ class Stepper:
         self.ledger = SessionLedger()
         #: Worst lateness of a tick since the last published state, for the recording's plots. Set by the pacing loop.
         self.lateness_ns = 0
+        #: Called after a state was published with its scene epoch and the end of its tick: for streams beside it.
+        self.beside_state: list[Callable[[int, int], None]] = []
         #: Called with what was published, and with the entries of every step: for measurements and tests.
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
@@ -227,7 +231,7 @@ class Stepper:
         if self.recorder is not None:
             self.recorder.scene(scene.model_hash, scene.packed_model, world.bodies)
         for follow in self.on_scene:
-            follow(scene.plant)
+            follow(scene)
         return scene.plant.scene
 
     def publish(self, end_ns: int) -> None:
@@ -244,6 +248,8 @@ class Stepper:
             decision.scene_epoch, decision.scene_revision, tick, sim_time, end_ns, 0, 0, 0, applied
         )  # fmt: skip
         self.front.send_state(header, self._poses)
+        for send in self.beside_state:
+            send(decision.scene_epoch, end_ns)
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:

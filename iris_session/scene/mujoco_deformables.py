@@ -6,6 +6,7 @@ Skins are not among them: MuJoCo moves their vertices by bodies with weights, on
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
@@ -18,6 +19,7 @@ from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.scene.build import Builder
 from iris_session.scene.mujoco_looks import drawn_rgba
 from iris_session.scene.mujoco_names import label
+from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
 
 #: Below this many vertices their numbers fit 16 bits.
 _SHORT: Final = 1 << 16
@@ -30,12 +32,12 @@ def stream_name(index: int) -> str:
 
 def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Deformable, ...]:
     """All flexes, by id; `data` has the initial state, with kinematics."""
-    parts = [topology(model, i) for i in range(model.nflex)]
-    rest = [_vertices(model, data, i) for i in range(model.nflex)]
+    parts = [flex_mesh(model, i) for i in range(model.nflex)]
+    rest = [np.array(data.flexvert_xpos[part.vertices], np.float32) for part in parts]
     notes = builder.run(
         [
-            builder.blob([b"flex", vertices, elements, *([] if uv is None else [uv])], _encode(vertices, elements, uv))
-            for vertices, (elements, uv) in zip(rest, parts, strict=True)
+            builder.blob([b"flex", *part.raw, vertices], part.encode(vertices))
+            for part, vertices in zip(parts, rest, strict=True)
         ]
     )
     return tuple(
@@ -44,7 +46,7 @@ def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Def
             dim=int(model.flex_dim[i]),
             group=int(model.flex_group[i]),
             vertices=len(rest[i]),
-            elements=len(parts[i][0]),
+            elements=len(parts[i].elements),
             radius=float(model.flex_radius[i]),
             flat=bool(model.flex_flatskin[i]),
             material=int(model.flex_matid[i]),
@@ -57,9 +59,43 @@ def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Def
     )
 
 
-def topology(model: mujoco.MjModel, index: int) -> tuple[NDArray[np.uint32], NDArray[np.float32] | None]:
-    """What is drawn of a flex: edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a soft body;
-    and texture coordinates of each element's corners, where it has them."""
+@dataclass(frozen=True)
+class FlexMesh:
+    """What is drawn of a flex: `elements`, edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a
+    soft body; `uv`, texture coordinates of each element's corners, where it has them.
+
+    `vertices`: rows of `flexvert_xpos`, without those inside of a solid. `topology`: the plan of the stream.
+    """
+
+    elements: NDArray[np.uint32]
+    uv: NDArray[np.float32] | None
+    vertices: NDArray[np.int64]
+    topology: DeformableTopology
+
+    @property
+    def raw(self) -> list[NDArray[Any]]:
+        """What the asset depends on, besides the vertices at rest."""
+        return [self.elements, *([] if self.uv is None else [self.uv])]
+
+    def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:
+        """The asset, for vertices at rest (n, 3) [m], world frame."""
+
+        def encode() -> bytes:
+            narrow = self.elements.astype(np.uint16) if len(rest) <= _SHORT else self.elements
+            arrays = [
+                Stored("elements", narrow, ArrayFilter.DELTA),
+                Stored("position", rest, ArrayFilter.SHUFFLE),
+                Stored("plan", np.frombuffer(self.topology.to_bytes(), np.uint8)),
+            ]
+            if self.uv is not None:
+                arrays.append(Stored("uv", self.uv, ArrayFilter.SHUFFLE))
+            return encode_arrays(ArrayKind.DEFORMABLE, arrays)
+
+        return encode
+
+
+def flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
+    """The mesh of one flex, by its id."""
     dim = int(model.flex_dim[index])
     if dim == 3:
         start, count = int(model.flex_shelldataadr[index]), int(model.flex_shellnum[index])
@@ -67,34 +103,24 @@ def topology(model: mujoco.MjModel, index: int) -> tuple[NDArray[np.uint32], NDA
     else:
         start, count = int(model.flex_elemdataadr[index]), int(model.flex_elemnum[index])
         corners = model.flex_elem[start : start + (dim + 1) * count].reshape(-1, dim + 1)
-    uv = None
-    at = int(model.flex_texcoordadr[index])
-    if at >= 0 and dim == 2:
-        which = corners
-        if hasattr(model, "flex_elemtexcoord"):
-            which = model.flex_elemtexcoord[start : start + 3 * count].reshape(-1, 3)
-        uv = np.ascontiguousarray(model.flex_texcoord[at + which], np.float32)
-    elif at >= 0 and dim == 3:
-        uv = np.ascontiguousarray(model.flex_texcoord[at + corners], np.float32)
-    return np.ascontiguousarray(corners, np.uint32), uv
+    n = int(model.flex_vertnum[index])
+    used, elements = used_vertices(n, corners) if dim == 3 else (np.arange(n), corners)
+    ends = {"edges": elements} if dim == 1 else {"faces": elements}
+    return FlexMesh(
+        np.ascontiguousarray(elements, np.uint32),
+        _texture_coordinates(model, index, start, corners),
+        int(model.flex_vertadr[index]) + used,
+        DeformableTopology(len(used), **ends).bare(),
+    )
 
 
-def _vertices(model: mujoco.MjModel, data: Any, index: int) -> NDArray[np.float32]:
-    start = int(model.flex_vertadr[index])
-    return np.array(data.flexvert_xpos[start : start + int(model.flex_vertnum[index])], np.float32)
-
-
-def _encode(
-    vertices: NDArray[np.float32], elements: NDArray[np.uint32], uv: NDArray[np.float32] | None
-) -> Callable[[], bytes]:
-    def encode() -> bytes:
-        narrow = elements.astype(np.uint16) if len(vertices) <= _SHORT else elements
-        arrays = [
-            Stored("elements", narrow, ArrayFilter.DELTA),
-            Stored("position", vertices, ArrayFilter.SHUFFLE),
-        ]
-        if uv is not None:
-            arrays.append(Stored("uv", uv, ArrayFilter.SHUFFLE))
-        return encode_arrays(ArrayKind.DEFORMABLE, arrays)
-
-    return encode
+def _texture_coordinates(
+    model: mujoco.MjModel, index: int, start: int, corners: NDArray[np.int32]
+) -> NDArray[np.float32] | None:
+    at, dim = int(model.flex_texcoordadr[index]), int(model.flex_dim[index])
+    if at < 0 or dim == 1:
+        return None
+    which = corners
+    if dim == 2 and hasattr(model, "flex_elemtexcoord"):
+        which = model.flex_elemtexcoord[start : start + 3 * len(corners)].reshape(-1, 3)
+    return np.ascontiguousarray(model.flex_texcoord[at + which], np.float32)

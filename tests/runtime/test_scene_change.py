@@ -17,6 +17,7 @@ from iris_session.protocol.server_messages import SceneChanged
 from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.scene_change import prepare
+from iris_session.runtime.shared_scene import SharedScenes
 from tests.runtime.play import TICK_NS, entries, host, make_core
 from tests.runtime.test_stepper import Rig
 
@@ -109,8 +110,8 @@ def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
     rig = Rig()
     rig.steps(60)
     seen: list[int] = []
-    rig.stepper.on_scene.append(lambda plant: seen.append(len(rig.front.decisions)))
-    scene = prepare(rig.stepper.core, bench_scene(), b"", None, None)
+    rig.stepper.on_scene.append(lambda _: seen.append(len(rig.front.decisions)))
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
     rows = len(rig.recorder.rows)
     rig.stepper.change_scene(scene)
     rig.steps(30)
@@ -130,9 +131,9 @@ def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
     spec = n_arms_scene(2)
     spec.option.timestep = 0.004
     with pytest.raises(ConfigError, match=r'timestep of 4 ms, the session one of 2 ms: set <option timestep="0.002"/>'):
-        prepare(core, spec.compile(), b"", None, None)
+        prepare(core, SharedScenes(False, "test"), spec.compile(), b"", None, None)
     with pytest.raises(PhysicsError):
-        prepare(core, bench_scene(), b"too short", None, None)
+        prepare(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
 
 
 def test_only_a_session_that_runs_takes_another_scene() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
@@ -144,7 +145,7 @@ def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
     assert [(d.name, d.dim, d.vertices, d.stream) for d in spec.deformables] == [
         ("cloth", 2, 20, "flex-0"),
         ("rope", 1, 6, "flex-1"),
-        ("soft", 3, 64, "flex-2"),
+        ("soft", 3, 56, "flex-2"),
     ]
     assert {info.id for info in World(model, (), ()).bodies} | {0} == {body.id for body in spec.bodies}
     data = mujoco.MjData(model)
@@ -198,11 +199,20 @@ def test_an_sdf_comes_as_its_mesh(tmp_path: Path) -> None:
     ],
 )
 def test_dangling_references_are_refused(tmp_path: Path, change: dict[str, Any], text: str) -> None:
-    import msgspec
-
     spec = parse_mujoco(every_shape(), AssetStore(tmp_path), options=EncodeOptions(levels=False)).spec
     with pytest.raises(SceneError, match=text):
         decode_scene(encode_scene(msgspec.structs.replace(spec, **change)))
+
+
+def test_bodies_may_not_go_in_circles(tmp_path: Path) -> None:
+    xml = "<mujoco><worldbody><body><geom size='1'/><body><geom size='1'/></body></body></worldbody></mujoco>"
+    spec = parse(xml, tmp_path).spec
+    world, outer, inner = spec.bodies
+    circle = msgspec.structs.replace(spec, bodies=(world, msgspec.structs.replace(outer, parent=2), inner))
+    twice = msgspec.structs.replace(spec, bodies=(world, outer, outer))
+    for wrong, text in ((circle, "not listed before"), (twice, "same id")):
+        with pytest.raises(SceneError, match=text):
+            decode_scene(encode_scene(wrong))
 
 
 @given(st.binary(max_size=100))

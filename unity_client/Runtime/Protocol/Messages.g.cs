@@ -342,6 +342,7 @@ namespace IrisSession.Protocol
     public static class MediaEncoding
     {
         public const string Bytes = "bytes";
+        public const string Deformable = "deformable";
     }
 
     /// <summary>

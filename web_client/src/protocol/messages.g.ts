@@ -283,6 +283,7 @@ export type AssetRefusal = (typeof AssetRefusal)[keyof typeof AssetRefusal] | (s
 /** What the bytes of a media frame are. */
 export const MediaEncoding = {
   BYTES: "bytes",
+  DEFORMABLE: "deformable",
 } as const;
 export type MediaEncoding = (typeof MediaEncoding)[keyof typeof MediaEncoding] | (string & {});
 
