@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
+from iris_session.scene.mujoco_deformables import flex_mesh
 from iris_session.scene.mujoco_scene import Parsed, parse_mujoco
 from tests.scene.models import every_shape, flexes
 
@@ -152,8 +153,8 @@ def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
     mujoco.mj_forward(model, data)
     for index, deformable in enumerate(spec.deformables):
         arrays = decode_arrays(store.get(deformable.address), "deformable")
-        start = int(model.flex_vertadr[index])
-        expected = data.flexvert_xpos[start : start + deformable.vertices]
+        expected = data.flexvert_xpos[flex_mesh(model, index).vertices]
+        assert np.unique(arrays["elements"]).tolist() == list(range(deformable.vertices)), "nothing but what is drawn"
         assert arrays["position"] == pytest.approx(expected, abs=1e-6)
         assert arrays["elements"].shape == (deformable.elements, 2 if deformable.dim == 1 else 3)
         assert arrays["elements"].max() < deformable.vertices
