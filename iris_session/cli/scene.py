@@ -88,6 +88,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes the file and says how large it is."""
+    from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
 
     if arguments.out.suffix.lower() != ".glb":
@@ -95,6 +96,8 @@ def run_export(arguments: argparse.Namespace) -> int:
     parsed, store = _parse(arguments)
     try:
         size = write_glb(parsed.spec, store, arguments.out)
+    except SceneBuildError as error:
+        raise CommandError(str(error)) from None
     except OSError as error:
         raise CommandError(f"{arguments.out} cannot be written: {error.strerror or error}") from None
     for text in parsed.skipped:

@@ -212,9 +212,9 @@ class Totals(msgspec.Struct, frozen=True):
 
 
 class SceneSpec(msgspec.Struct, frozen=True):
-    """A whole scene. `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
+    """A whole scene. `bodies`: parents before their children. `source`: what it was made from, for people.
 
-    `source`: what it was made from, for people.
+    `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
     """
 
     version: Count = SCENE_VERSION
@@ -293,9 +293,11 @@ def _check(spec: SceneSpec) -> None:
     bodies = {body.id for body in spec.bodies}
     if len(bodies) != len(spec.bodies):
         raise SceneError("two bodies have the same id")
+    before = {-1}
     for body in spec.bodies:
-        if body.parent != -1 and body.parent not in bodies:
-            raise SceneError(f"body {body.id} has the parent {body.parent}, which does not exist")
+        if body.parent not in before:  # so there is no cycle either
+            raise SceneError(f"body {body.id} has the parent {body.parent}, which is not listed before it")
+        before.add(body.id)
     sites = {site.id for site in spec.sites}
     _on_bodies("visual", spec.visuals, bodies)
     _on_bodies("site", spec.sites, bodies)

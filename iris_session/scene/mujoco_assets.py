@@ -84,11 +84,17 @@ def textures(model: mujoco.MjModel, builder: Builder) -> tuple[Texture, ...]:
             width=image.shape[1],
             height=image.shape[0] // (1 if kind == TextureKind.IMAGE else _FACES),
             channels=image.shape[2],
-            colorspace=_SPACES.get(int(model.tex_colorspace[i]), ColorSpace.AUTO),
+            colorspace=_color_space(model, i),
             levels=note.levels,
         )
         for i, (kind, image, note) in enumerate(zip(kinds, images, notes, strict=True))
     )
+
+
+def _color_space(model: mujoco.MjModel, index: int) -> str:
+    if not hasattr(model, "tex_colorspace"):  # before MuJoCo 3.3.1
+        return ColorSpace.AUTO
+    return _SPACES.get(int(model.tex_colorspace[index]), ColorSpace.AUTO)
 
 
 def _pixels(model: mujoco.MjModel, index: int, kind: str) -> NDArray[np.uint8]:

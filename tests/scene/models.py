@@ -7,11 +7,11 @@ import numpy as np
 
 #: A closed solid without symmetry, so that MuJoCo finds the same inertial frame for it again.
 WEDGE = "0 0 0  .5 0 0  0 .35 0  0 0 .2"
-#: A square with texture coordinates, drawn from both sides.
-QUAD = (
-    'vertex="-.3 -.3 0 .3 -.3 0 .3 .3 .1 -.3 .3 0" texcoord="0 0 1 0 1 1 0 1" '
-    'face="0 1 2 0 2 3 0 2 1 0 3 2" inertia="shell"'
-)
+#: A bent square from both sides, whose corners have other texture coordinates in every triangle (seams).
+QUAD = """v -.3 -.3 0\nv .3 -.3 0\nv .3 .3 .1\nv -.3 .3 0
+vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt .2 .4\nvt .9 .3\nvt .5 .6
+f 1/1 2/2 3/3\nf 1/5 3/6 4/7\nf 1/2 3/4 2/6\nf 1/7 4/1 3/3
+"""
 SHAPES = {
     "sphere": "type='sphere' size='.3'",
     "capsule": "type='capsule' size='.15 .25'",
@@ -49,7 +49,7 @@ def every_shape() -> mujoco.MjModel:
         <material name="cube" texture="dice" rgba="1 .9 .8 1"/>
         <material name="cubeuniform" texture="dice" texuniform="true"/>
         <material name="plain" rgba=".9 .4 .1 .6" specular="1" shininess=".1"/>
-        <mesh name="wedge" vertex="{WEDGE}"/><mesh name="quad" {QUAD}/>
+        <mesh name="wedge" vertex="{WEDGE}"/><mesh name="quad" file="quad.obj" inertia="shell"/>
         <hfield name="hills" nrow="5" ncol="6" size=".35 .3 .2 .05" elevation="{hills}"/>
         </asset><worldbody>
         <light type="directional" dir="-.3 .2 -1" diffuse=".4 .4 .3" castshadow="false"/>
@@ -73,7 +73,7 @@ def _pictures(rng: np.random.Generator) -> dict[str, bytes]:
     image[:24, :32] = (200, 30, 30)
     image[24:, 32:] = (30, 200, 60)
     image[:24, 32:, 2] = np.linspace(0, 255, 32).astype(np.uint8)
-    files = {"image.png": png(image)}
+    files = {"image.png": png(image), "quad.obj": QUAD.encode()}
     for face in ("right", "left", "up", "down", "front", "back"):
         side = np.full((32, 32, 3), rng.integers(60, 255, 3), np.uint8)
         side[:8, :16] = 0  # tells up from down, and left from right

@@ -13,9 +13,12 @@ import pytest
 import trimesh
 
 from iris_session.cli.main import main
+from iris_session.protocol.scene import Geometry
+from iris_session.protocol.scene_looks import HeightField
 from iris_session.scene import AssetStore
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.shapes import height_field, primitive
 from tests.scene.models import every_shape, flexes
 
 #: How far a face's centre lies below the round surface it stands for, and how far above it a ray begins [m].
@@ -52,6 +55,30 @@ def test_faces_of_a_glb_lie_on_the_surfaces_that_mujoco_has(tmp_path: Path) -> N
     centres, normals = whole.triangles_center[chosen] @ z_up.T, whole.face_normals[chosen] @ z_up.T
     gaps = np.array([hit(model, data, c + ABOVE * n, -n) for c, n in zip(centres, normals, strict=True)]) - ABOVE
     assert np.mean((gaps > -SAG) & (gaps < 1e-3)) > 0.98  # a ray may slip through where two shapes' edges meet
+
+
+@pytest.mark.parametrize("kind", ["sphere", "ellipsoid", "capsule", "cylinder", "box", "hfield"])
+def test_shapes_are_closed_and_look_outwards(kind: str) -> None:
+    if kind == "hfield":
+        elevation = np.random.default_rng(0).uniform(0.1, 1, (5, 7)).astype(np.float32)
+        mesh = height_field(HeightField("", 5, 7, (1.0, 2.0, 0.5, 0.1), "0" * 64, 0), elevation)
+        cells = (elevation[:-1, :-1] + elevation[1:, :-1] + elevation[:-1, 1:] + elevation[1:, 1:]) / 4
+        exact = 4 * 2 * (0.1 + 0.5 * float(cells.mean()))
+    else:
+        round_ = {"sphere": (0.3, 0.3, 0.3), "capsule": (0.2, 0.2, 0.5), "cylinder": (0.2, 0.2, 0.5)}
+        size = round_.get(kind, (0.1, 0.2, 0.3))
+        made = primitive(Geometry(kind, size))
+        assert made is not None
+        mesh, (x, y, z) = made, size
+        ball, tube = 4 / 3 * np.pi * x * y * (x if kind == "capsule" else z), 2 * np.pi * x * x * z
+        exact = {"capsule": ball + tube, "cylinder": tube, "box": 8 * x * y * z}.get(kind, ball)
+    solid = trimesh.Trimesh(mesh.position.round(6), mesh.index)
+    solid.merge_vertices(merge_norm=True, merge_tex=True)
+    assert solid.is_watertight or kind == "hfield"  # its floor has no vertices where the walls have
+    assert solid.is_winding_consistent
+    assert solid.volume == pytest.approx(exact, rel=0.03)
+    across = np.cross(*(mesh.position[mesh.index[:, k]] - mesh.position[mesh.index[:, 0]] for k in (1, 2)))
+    assert np.einsum("fkc,fc->fk", mesh.normal[mesh.index], across).min() > 0
 
 
 def test_a_glb_has_every_mesh_and_picture_once(tmp_path: Path) -> None:
