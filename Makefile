@@ -75,7 +75,7 @@ IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nic
 test: check
 	COVERAGE_FILE=.coverage-live $(UNIT) $(addprefix --ignore=,$(PURE)) tests
 	@mkdir -p build; echo "beside the next, told after it: $(UNIT) $(PURE)"; \
-	COVERAGE_FILE=.coverage-pure $(IDLE) $(UNIT) -p no:cacheprovider --timeout=1800 $(PURE) >build/pure.log 2>&1 & \
+	COVERAGE_FILE=.coverage-pure $(IDLE) $(UNIT) --dist worksteal -p no:cacheprovider --timeout=1800 $(PURE) >build/pure.log 2>&1 & \
 	pure=$$!; trap 'kill $$pure' INT TERM; \
 	$(E2E); wait $$pure; beside=$$?; cat build/pure.log; exit $$((status + beside))
 	$(BIN)/python -m coverage combine --quiet .coverage-live .coverage-pure
