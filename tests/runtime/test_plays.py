@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from iris_session.emulator.behaviours.arms import arm_kind
+from iris_session.emulator.behaviours.deformables import CORNERS
+from iris_session.emulator.behaviours.stower import BOX, BOX_INSIDE
 from iris_session.emulator.behaviours.things import thing_named
-from iris_session.physics import find_objects, find_robots
+from iris_session.physics import World, find_objects, find_robots
+from iris_session.physics.scenes.deformables import BOX_HIGH, BOX_LOW
 from iris_session.protocol.names import Device
 from iris_session.runtime.errors import ConfigError
 from iris_session.runtime.plays import Play, make_play
@@ -17,7 +20,16 @@ from tests.models import robot_models
 __all__ = ["robot_models"]
 pytestmark = pytest.mark.usefixtures("robot_models")
 
-CASTS = [("handover", 2), ("handover", 5), ("handover", 8), ("iiwa", 2), ("iiwa", 8), ("aloha", 2)]
+CASTS = [
+    ("handover", 2),
+    ("handover", 5),
+    ("handover", 8),
+    ("iiwa", 2),
+    ("iiwa", 8),
+    ("aloha", 2),
+    ("cloth", 2),
+    ("soft", 2),
+]
 
 
 @pytest.fixture(params=CASTS, ids=lambda cast: f"{cast[0]}-{cast[1]}")
@@ -46,6 +58,27 @@ def test_every_object_goes_from_one_person_to_another(play: Play) -> None:
         (receiver,) = [t for _, t in tasks.values() if t.behaviour == "receiver" and t.object == thing]
         assert (giver.partner, receiver.partner) == (receiver.robot, giver.robot)
         assert tasks[giver.robot][0] != tasks[receiver.robot][0]
+
+
+def test_every_goal_is_somebodys_task_and_its_corners_are_those_of_the_scene(play: Play) -> None:
+    world = World(play.model, find_robots(play.model), find_objects(play.model))
+    for goal in play.goals:
+        assert goal.deformable in {task.object for person in play.people for task in person.tasks}
+        vertices = world.flexes.vertices(goal.deformable)
+        corners = vertices[list(CORNERS[goal.deformable])]
+        ends = [corners.min(axis=0), corners.max(axis=0)]
+        np.testing.assert_allclose(ends, [vertices.min(axis=0), vertices.max(axis=0)], atol=1e-9)
+        assert not goal.met(vertices)
+    if play.name == "soft":  # people know the box by its body and its size
+        np.testing.assert_allclose(np.subtract(BOX_HIGH, BOX_LOW)[:2] / 2.0, BOX_INSIDE[:2], atol=1e-9)
+        np.testing.assert_allclose(np.add(BOX_HIGH, BOX_LOW)[:2] / 2.0, world.data.body(BOX).xpos[:2], atol=1e-9)
+
+
+def test_the_first_corners_of_a_soft_body_are_those_of_one_end(play: Play) -> None:
+    world = World(play.model, find_robots(play.model), ())
+    for name in {goal.deformable for goal in play.goals} - {"cloth"}:
+        corners = world.flexes.vertices(name)[list(CORNERS[name])]
+        assert (corners[:4, 0] < corners[4:, 0]).all()
 
 
 def test_what_people_know_of_their_arms_is_true(play: Play) -> None:
@@ -98,7 +131,9 @@ def test_who_is_left_over_moves_freely_and_it_is_said() -> None:
         ("iiwa", 9, 0, "takes 2 to 8 operators, not 9"),
         ("aloha", 4, 0, "two stations with two arms each: 2 operators, not 4"),
         ("handover", 2, 17, "--observers 17 is out of range: 0 to 16"),
-        ("juggle", 2, 0, "there is no demo 'juggle': handover, iiwa, aloha"),
+        ("cloth", 3, 0, "two arms at one table: 2 operators, not 3"),
+        ("soft", 8, 0, "two arms at one table: 2 operators, not 8"),
+        ("juggle", 2, 0, "there is no demo 'juggle': handover, iiwa, aloha, cloth, soft"),
     ],
 )
 def test_people_that_a_demo_cannot_use_are_explained(demo: str, operators: int, observers: int, why: str) -> None:

@@ -16,14 +16,18 @@ from iris_session.protocol.names import Device
 INSET: float = 0.032
 #: Height of the tip above the table at which the finger tips, 12 mm below it, press the cloth of 8 mm onto the table
 #: [m]. The hand is only so steady, so it aims at the table itself; on every new attempt a little deeper.
-PRESS: float = 0.012
+PRESS: float = 0.0115
 DEEPER: float = 0.0015
-#: The half opening with which the fingers come down [m]; the trigger is pulled so far meanwhile.
+#: How far the trigger is pulled when the fingers come down, 60 mm apart then: both must land on the cloth.
 TRIGGER_BEFORE: float = 0.25
+#: Height of the tip above the table at which the corner is let go [m]: much lower, and cloth heaps up around the fingers;
+#: higher, and it swings back as it falls.
+RELEASE: float = 0.036
 #: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
-FALLS_BACK: float = 0.012
-#: How far the trigger stays pulled when the corner is let go: fingers that open wide sweep the cloth along.
-TRIGGER_AFTER: float = 0.5
+FALLS_BACK: float = 0.006
+#: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that open
+#: wide sweep the cloth along.
+TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
 CAREFUL_SPEED: float = 0.12
 CARRY_SPEED: float = 0.22
@@ -31,6 +35,9 @@ CARRY_SPEED: float = 0.22
 FOLDED: float = 0.05
 #: Distance of the finger pads below which a gripper is shut on cloth [m].
 SHUT: float = 0.02
+#: A corner that stays so far above the table hangs on a finger [m]; so often it is laid down again.
+HANGING: float = 0.03
+SHAKES: int = 3
 #: How long a partner is waited for [s].
 PATIENCE_S: float = 60.0
 
@@ -48,6 +55,7 @@ class Folder(Phases):
         self._pinch: Vec3 = (0.0, 0.0, 0.0)
         self._goal: Vec3 = (0.0, 0.0, 0.0)
         self._outward: Vec3 = (0.0, 0.0, 0.0)  # from the partner's corner to mine
+        self._shakes = 0
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
         self._steps |= {
             "wait": self._wait,
@@ -65,6 +73,7 @@ class Folder(Phases):
             "open": self._open,
             "leave": self._leave,
             "judge": self._judge,
+            "shake": self._shake,
             "back_off": self._back_off,
         }
 
@@ -168,7 +177,7 @@ class Folder(Phases):
             ox, oy, _ = self._outward
             x, y = tip[0] + onto[0] - mine[0] + FALLS_BACK * ox, tip[1] + onto[1] - mine[1] + FALLS_BACK * oy
             self._goal = (x, y, 0.0)
-            self.hand.move_to(self._tip_at(self._goal, 0.06), CAREFUL_SPEED)
+            self.hand.move_to(self._tip_at(self._goal, RELEASE + 0.015), CAREFUL_SPEED)
         self._carried("lower", 0.006)
 
     def _carried(self, then: str, within_m: float) -> None:
@@ -179,7 +188,7 @@ class Folder(Phases):
 
     def _lower(self) -> None:
         if self._entering_now:
-            self.hand.move_to(self._tip_at(self._goal, PRESS + 0.018), CAREFUL_SPEED)
+            self.hand.move_to(self._tip_at(self._goal, RELEASE), CAREFUL_SPEED)
         self._carried("open", 0.005)
 
     def _open(self) -> None:
@@ -191,7 +200,7 @@ class Folder(Phases):
 
     def _leave(self) -> None:
         if self._entering_now:
-            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.2, correct=False)
+            self.hand.move_to(above(self.eyes.tip(self.robot), CLEAR_ABOVE), 0.12, correct=False)
         if self.hand.moved():
             self._enter("judge")
 
@@ -199,11 +208,23 @@ class Folder(Phases):
         """Whether the corner stayed where it was laid."""
         if self.eyes.corners_still_s < 0.3 and not self._waited(5.0):
             return
+        if self.eyes.corner(self._mine)[2] > self._table() + HANGING and self._shakes < SHAKES:
+            self._shakes += 1
+            self._enter("shake")
+            return
         missing = distance(self.eyes.corner(self._mine), self.eyes.corner(self._onto))
         if missing > FOLDED:
             self._give_up(f"the corners of the {self.cloth} lie {missing * 100:.0f} cm apart")
         else:
             self._enter("return")
+
+    def _shake(self) -> None:
+        """Down to where it belongs, and the fingers moved, so that it slips off."""
+        if self._entering_now:
+            self.hand.trigger_goal = 0.0 if self._shakes % 2 else TRIGGER_AFTER
+            self.hand.move_to(self._tip_at(self._goal, RELEASE), CAREFUL_SPEED)
+        if self.hand.moved() and self.hand.trigger_done() and self._waited(1.2):
+            self._enter("leave")
 
     def _back_off(self) -> None:
         if self._entering_now:

@@ -5,6 +5,7 @@ The files hold table and flexes, which only MJCF text can describe; the arms of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 
 from iris_session.physics.scenes.generators import ARM_FILE, ARM_HOME, FINGER_OPEN, arm_names, bearing_of, place_arm
@@ -24,7 +25,7 @@ _OPTIONS: Final = ("timestep", "integrator", "cone", "impratio", "solver", "iter
 
 def cloth_scene() -> Any:
     """An `mujoco.MjSpec`: arms `left` and `right`, a `cloth` of 17 x 17 vertices, a sheet, keyframe `home`."""
-    return _with_two_arms("cloth")
+    return _with_two_arms("cloth", _round_tips)
 
 
 def soft_scene() -> Any:
@@ -33,8 +34,22 @@ def soft_scene() -> Any:
     return _with_two_arms("soft")
 
 
-def _with_two_arms(file: str) -> Any:
-    """The packaged `file` with an arm on either side of its table."""
+def _round_tips(arm: Any) -> None:
+    """Finger tips that end in a rubber rod of 12 mm under a flat pad: square ones pierce cloth with their edges. Their
+    faces and ends are where those of the pads were."""
+    import mujoco
+
+    for side in ("left", "right"):
+        pad, tip = arm.geom(f"pad_{side}"), arm.geom(f"finger_{side}_tip")
+        pad.size, pad.pos = [0.011, 0.004, 0.009], [0.0, 0.004, 0.042]
+        tip.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+        tip.size, tip.pos, tip.quat = [0.006, 0.011, 0.0], [0.0, 0.006, 0.051], [0.5**0.5, 0.0, 0.5**0.5, 0.0]
+        for attribute in ("condim", "priority", "friction", "solref", "solimp", "material"):
+            setattr(tip, attribute, getattr(pad, attribute))
+
+
+def _with_two_arms(file: str, change: Callable[[Any], None] | None = None) -> Any:
+    """The packaged `file` with an arm on either side of its table. `change`: what is done to the arm before."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(ARM_FILE.parent / f"{file}.xml"))
@@ -42,6 +57,8 @@ def _with_two_arms(file: str) -> Any:
     for i, name in enumerate(arm_names(2)):
         arm = mujoco.MjSpec.from_file(str(ARM_FILE))
         arm.material("accent").rgba = [*_COLOURS[i], 1.0]
+        if change is not None:
+            change(arm)
         for option in _OPTIONS:  # MuJoCo warns where they differ
             setattr(arm.option, option, getattr(spec.option, option))
         place_arm(spec, RADIUS, bearing_of(i, 2)).attach_body(arm.body("base"), f"{name}/", "")

@@ -1,0 +1,65 @@
+"""The casts of `demo cloth` and `demo soft` on the real physics and control, late and noisy; and what they do when it
+goes wrong."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+
+from iris_session.emulator.behaviours import Folder, Stower, make_behaviour
+from iris_session.emulator.behaviours.phases import SEARCH_S
+from iris_session.runtime.plays import make_play
+from tests.emulator.deformable_rig import SoftRig, soft_demo
+from tests.emulator.handover_rig import LateView
+
+
+@pytest.mark.usefixtures("untraced")
+def test_two_people_fold_a_cloth() -> None:
+    rig = soft_demo(make_play("cloth"), seed=1)
+    rig.run(30.0, until=SoftRig.over)
+    assert rig.verdict() == ""
+    assert rig.world.trouble == {}
+
+
+@pytest.mark.usefixtures("untraced")
+def test_two_people_stow_soft_bodies_and_take_again_what_they_lose() -> None:
+    """The first time, somebody opens a gripper half way."""
+    rig = soft_demo(make_play("soft"), seed=2)
+    left = rig.behaviours["left"]
+    rig.run(20.0, until=lambda rig: left.phase == "carry")
+    assert left.phase == "carry"
+    rig.run(0.4, until=lambda rig: False)
+    left.hand.trigger_goal = 0.0  # type: ignore[attr-defined]
+    rig.run(40.0, until=SoftRig.over)
+    assert rig.verdict() == ""
+    assert left.attempts == 2  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["folder", "stower"])
+def test_a_deformable_that_is_not_to_be_seen_is_named(name: str) -> None:
+    thing = {"folder": "cloth", "stower": "rose"}[name]
+    behaviour = make_behaviour(name, "left", thing)
+    view = LateView(random.Random(1))
+    for k in range(int(SEARCH_S * 72) + 10):
+        view.look(k / 72.0)
+        behaviour.update(view)
+    assert behaviour.done
+    assert thing in behaviour.failed
+
+
+@pytest.mark.parametrize("behaviour", [Folder, Stower])
+def test_nobody_knows_any_other_deformable(behaviour: type) -> None:
+    with pytest.raises(ValueError, match=r"deformable 'jelly'. Known: cloth, rose, mint"):
+        behaviour("left", "jelly", *(["right"] if behaviour is Folder else []))
+
+
+def test_the_rig_moves_deformables_as_a_whole() -> None:
+    """Otherwise it would play with a cloth that is pulled out of shape."""
+    play = make_play("cloth")
+    moved = soft_demo(play, 5).world.flexes.vertices("cloth")
+    still = soft_demo(play, 5, shift=False).world.flexes.vertices("cloth")
+    assert np.linalg.norm(moved - still, axis=1).max() > 0.01
+    for a, b in ((0, 16), (0, 272), (0, 288), (16, 272)):
+        np.testing.assert_allclose(np.linalg.norm(moved[a] - moved[b]), np.linalg.norm(still[a] - still[b]), atol=1e-9)
