@@ -118,6 +118,8 @@ def test_module_keeps_to_its_room(path: Path) -> None:
     outside = {name.split(".")[0] for name in imports(path)}
     forbidden = outside & FORBIDDEN.get(room, set())
     assert not forbidden, f"{room} must not import {sorted(forbidden)}"
+    if room == "scene" and not path.name.startswith("mujoco_"):
+        assert "mujoco" not in outside, "of `scene` only modules named mujoco_* import it"
     if room == "recording" and path.name not in RECORDING_SOCKETS:
         assert "zmq" not in outside, f"sockets of recording live in {sorted(RECORDING_SOCKETS)}"
 

@@ -51,15 +51,12 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Prints the report; status 0 whatever it says."""
-    import hashlib
-
     import msgspec
 
-    from iris_session.protocol.scene import encode_scene
     from iris_session.scene.report import report, tree
 
     parsed, _ = _parse(arguments)
-    found = report(parsed.spec, hashlib.sha256(encode_scene(parsed.spec)).hexdigest(), parsed.skipped)
+    found = report(parsed.spec, parsed.scene_hash, parsed.skipped)
     if arguments.json:
         print_json(msgspec.to_builtins(found))
         return 0

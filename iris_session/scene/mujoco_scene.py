@@ -12,7 +12,16 @@ import mujoco
 import numpy as np
 
 from iris_session.protocol.common import MAX_TEXT, Vec3
-from iris_session.protocol.scene import Body, Geometry, SceneSpec, Site, Tendon, Visual
+from iris_session.protocol.scene import (
+    Body,
+    Geometry,
+    SceneSpec,
+    Site,
+    Tendon,
+    Visual,
+    asset_addresses,
+    encode_scene,
+)
 from iris_session.protocol.scene_names import GeometryKind
 from iris_session.scene.build import Builder, EncodeOptions
 from iris_session.scene.mujoco_assets import hfields, meshes, textures
@@ -32,13 +41,22 @@ _HINGE_OR_SLIDE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.
 
 @dataclass(frozen=True)
 class Parsed:
-    """`skipped`: what the model has and the specification does not, in words for people. `built`, `recalled`: pieces of
-    work that were done, and that were known from before."""
+    """A scene whose assets, the specification among them, are in the store.
+
+    `scene_hash`: address of the specification. `skipped`: what the model has and the specification does not, in words
+    for people. `built`, `recalled`: pieces of work that were done, and that were known from before.
+    """
 
     spec: SceneSpec
+    scene_hash: str
     skipped: tuple[str, ...]
     built: int
     recalled: int
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """All assets in the order in which they show something: to be held in the store, and served."""
+        return (self.scene_hash, *asset_addresses(self.spec))
 
 
 def parse_mujoco(
@@ -83,7 +101,8 @@ def parse_mujoco(
         deformables=deformables(model, data, builder),
         environment=environment(model, found_textures),
     )
-    return Parsed(with_totals(spec), _skipped(model), builder.built, builder.recalled)
+    spec = with_totals(spec)
+    return Parsed(spec, store.put(encode_scene(spec)), _skipped(model), builder.built, builder.recalled)
 
 
 def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:

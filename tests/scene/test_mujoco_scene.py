@@ -120,7 +120,10 @@ def test_generated_models(tmp_path: Path, xml: str) -> None:
 
 def test_every_shape_and_its_costs(tmp_path: Path) -> None:
     store = AssetStore(tmp_path)
-    spec = parse_mujoco(every_shape(), store, name="all").spec
+    parsed = parse_mujoco(every_shape(), store, name="all")
+    spec = parsed.spec
+    assert decode_scene(store.get(parsed.scene_hash)) == spec
+    assert all(address in store for address in parsed.addresses)
     assert {visual.geometry.kind for visual in spec.visuals} == {
         "plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"
     }  # fmt: skip
