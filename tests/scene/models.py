@@ -22,6 +22,7 @@ SHAPES = {
     "wedge": "type='mesh' mesh='wedge'",
     "quad": "type='mesh' mesh='quad'",
     "hills": "type='hfield' hfield='hills'",
+    "field": "type='sdf' mesh='wedge'",
 }
 LOOKS = ("", "image", "uniform", "cube", "cubeuniform", "plain")
 
@@ -57,6 +58,9 @@ def every_shape() -> mujoco.MjModel:
         <light type="point" pos="4 4 3" diffuse=".2 .2 .6"/>
         <geom type="plane" size="0 0 1" material="image"/>
         <geom type="box" size="9 9 9" rgba="1 0 0 0"/><geom type="box" size="9 9 9" group="4"/>
+        <body name="seen" pos="2 3 1"><geom size=".1"/></body>
+        <light mode="targetbody" target="seen" pos="5 5 2" diffuse=".1 .3 .1"/>
+        <camera name="chaser" mode="targetbody" target="seen" pos="6 -3 3"/>
         <camera name="top" pos="2 4 12" xyaxes="1 0 0 0 1 0" fovy="50"/>
         <camera name="flat" pos="2 4 9" xyaxes="1 0 0 0 1 0" fovy="9" projection="orthographic"/>
         <camera name="real" pos="2 -6 5" xyaxes="1 0 0 0 .6 .8" resolution="240 180" sensorsize=".004 .003"

@@ -125,14 +125,17 @@ def test_every_shape_and_its_costs(tmp_path: Path) -> None:
     assert decode_scene(store.get(parsed.scene_hash)) == spec
     assert all(address in store for address in parsed.addresses)
     assert {visual.geometry.kind for visual in spec.visuals} == {
-        "plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"
+        "plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf"
     }  # fmt: skip
     assert [texture.kind for texture in spec.textures] == ["skybox", "2d", "cube"]
     assert spec.environment.skybox == 0
-    assert [light.kind for light in spec.lights] == ["directional", "spot", "point"]
-    real = spec.cameras[2]
+    assert [light.kind for light in spec.lights] == ["directional", "spot", "point", "spot"]
+    seen = next(body.id for body in spec.bodies if body.name == "seen")
+    assert (spec.lights[3].follow, spec.lights[3].target) == ("targetbody", seen)
+    assert (spec.cameras[0].follow, spec.cameras[0].target) == ("targetbody", seen)
+    real = spec.cameras[3]
     assert (real.focal, real.principal) == (pytest.approx((200, 210)), pytest.approx((9, -7)))
-    assert spec.cameras[1].orthographic
+    assert spec.cameras[2].orthographic
     addresses = asset_addresses(spec)
     assert all(store.size(address) == size for address, size in addresses.items())
     assert spec.totals.asset_bytes == sum(addresses.values())
@@ -175,6 +178,13 @@ def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
     assert [site.name for site in tendons.sites] == ["b", "a"]
     assert [site.name for site in both.sites] == ["b", "c", "a"]
     assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
+
+
+def test_an_image_that_lights_the_scene(tmp_path: Path) -> None:
+    xml = """<mujoco><asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="48"/></asset>
+    <worldbody><light type="image" texture="sky" intensity="20"/></worldbody></mujoco>"""
+    light = parse(xml, tmp_path).spec.lights[0]
+    assert (light.kind, light.texture, light.intensity) == ("image", 0, 20)
 
 
 def test_skins_are_named_as_left_out(tmp_path: Path) -> None:
