@@ -1,4 +1,5 @@
 """Encoders of the broadcast streams: bytes in, bytes out, with a stated error bound. No sockets, no clocks, no MuJoCo.
 
-`rigid` (poses of rigid bodies), `quantise` (the number formats it uses), `errors`.
+`rigid` (poses of rigid bodies), `quantise` (the number formats it uses), `deformable` (vertices of meshes that bend),
+`deformable_topology` (their order and prediction), `errors`.
 """
