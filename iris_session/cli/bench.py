@@ -25,12 +25,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session bench slow-client --check\n"
         "  iris-session bench state --profile busy-wifi\n"
         "  iris-session bench alignment --pairs 2000 --seed 1 --check\n"
-        "  iris-session bench deformable --check",
+        "  iris-session bench deformable --check\n"
+        "  iris-session bench join --check",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable"))
+    parser.add_argument("bench", choices=("state", "input", "slow-client", "alignment", "deformable", "join"))
     parser.add_argument(
-        "--clients", type=int, help="state, slow-client, deformable: how many (default: 16; deformable: 4)"
+        "--clients", type=int, help="state, slow-client, deformable, join: how many (default: 16; the last two: 4)"
     )
     parser.add_argument(
         "--bodies", type=int, default=300, help="state, slow-client: moving bodies (default: %(default)s)"
@@ -42,6 +43,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument(
         "--vertices", type=int, default=10_000, help="deformable: of the cloth, a square number (default: %(default)s)"
     )
+    parser.add_argument("--objects", type=int, default=300, help="join: bodies with meshes (default: %(default)s)")
+    parser.add_argument("--assets-mb", type=float, default=200.0, help="join: MB after compression (default: 200)")
     parser.add_argument("--seconds", type=positive_seconds, help="measured part (default: 20; slow-client: 50)")
     parser.add_argument(
         "--profile",
@@ -69,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.contract import BenchError
 
     if arguments.clients is None:
-        arguments.clients = 4 if arguments.bench == "deformable" else 16
+        arguments.clients = 4 if arguments.bench in ("deformable", "join") else 16
     _check(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
         raise CommandError(f"--clients {arguments.clients}: slow-client needs two that are slow and one other, so 3")
@@ -95,10 +98,16 @@ def _check(arguments: argparse.Namespace) -> None:
         limits = {"pairs": (10, 100_000)}
     elif arguments.bench == "deformable":
         limits = {"clients": (1, 64), "vertices": (16, 10_000)}
+    elif arguments.bench == "join":
+        limits = {"clients": (1, 64), "objects": (1, 2000), "assets_mb": (1, 2000)}
+        if arguments.curve or arguments.profile:
+            raise CommandError("bench join runs on plain loopback: its bars are stated for that")
     for name, (low, high) in limits.items():
         if not low <= (value := getattr(arguments, name)) <= high:
             per = ", one robot each" if name == "operators" else ""
-            raise CommandError(f"--{name} {value}: bench {arguments.bench} takes {low} to {high}{per}")
+            raise CommandError(
+                f"--{name.replace('_', '-')} {value}: bench {arguments.bench} takes {low} to {high}{per}"
+            )
 
 
 def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> BenchReport:
@@ -106,6 +115,11 @@ def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> B
         from iris_session.bench.alignment import run_alignment
 
         return run_alignment(arguments.pairs, arguments.seed, progress)
+    if arguments.bench == "join":
+        from iris_session.bench.join import run_join
+
+        sizes = (arguments.objects, arguments.assets_mb, arguments.clients)
+        return run_join(*sizes, arguments.seconds or 20.0, arguments.seed, progress)
     common = {"curve": arguments.curve, "profile": arguments.profile, "seed": arguments.seed, "progress": progress}
     if arguments.bench == "state":
         from iris_session.bench.state import run_state

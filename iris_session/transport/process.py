@@ -61,6 +61,11 @@ class FrontProcess:
         return 0 if self._process is None else self._process.pid
 
     @property
+    def scene(self) -> SceneInfo:
+        """What this front and its successors were told last."""
+        return self._scene
+
+    @property
     def alive(self) -> bool:
         """Whether the front runs, reads its link and says something now and then, or is being replaced."""
         if self._replacing is not None and self._replacing.is_alive():

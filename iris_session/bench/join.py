@@ -1,0 +1,213 @@
+"""`bench join`: a scene of 300 objects and 200 MB of assets made ready, fetched, verified and decoded; once more with a
+cache. Others watch the moving scene meanwhile: what they notice is measured too."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import msgspec
+import mujoco
+import numpy as np
+import zmq
+
+from iris_session.bench.arena import Log, grouped, measure
+from iris_session.bench.clients import ClientJob
+from iris_session.bench.contract import BenchError, BenchReport, bar
+from iris_session.bench.join_clients import Joined, JoinJob
+from iris_session.bench.join_scene import Ready, join_model
+from iris_session.runtime.session import Session
+from iris_session.scene.store import AssetStore
+
+#: From the beginning of the window: what the others are used to is measured first.
+BEGIN_S: Final = 4.0
+#: Rejoining with a cache may cost so much of the bytes.
+WARM_SHARE: Final = 0.01
+
+
+def run_join(
+    objects: int = 300,
+    assets_mb: float = 200.0,
+    clients: int = 4,
+    seconds: float = 20.0,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BenchReport:
+    """One client joins while `clients` observers watch. Reference: the same bytes in one message, in the same run."""
+    progress("compiling the scene")
+    model = join_model(objects, assets_mb, seed).compile()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
+        file = folder / "model.mjb"
+        mujoco.mj_saveModel(model, str(file), None)
+        store = AssetStore(folder / "store")
+        progress("encoding its assets, cache cold")
+        cold = _made_ready(file, store.root)
+        progress("and warm")
+        ready = _made_ready(file, store.root)
+        if ready.built:
+            raise BenchError(f"with a warm cache {ready.built} pieces were encoded anew")
+        paths = [store.path(address) for address in ready.sizes]
+        joiner = stack.enter_context(_Joiner(folder, ready, store.root, stack.enter_context(_Bare(paths)).port))
+        got = measure(
+            model,
+            grouped([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)]),
+            seconds,
+            actions=[(BEGIN_S, lambda _: joiner.go())],
+            beside=joiner.prepare,
+            seed=seed,
+            progress=progress,
+        )
+        first, second, bare_s = joiner.result()
+    results = {
+        **_results(cold, ready, first, second),
+        "others_age_ms_p99": _p99(got.logs, first.begin_ns, second.end_ns),
+        "others_age_ms_p99_baseline": _p99(got.logs, got.begin_ns, first.begin_ns),
+        "late_tick_share": round(got.stats.late_share, 6),
+        "scheduling": got.scheduling,
+        "drops": got.drops,
+    }
+    params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
+    reference = {"bare_transfer_s": round(bare_s, 3)}
+    return BenchReport("join", params, results, tuple(_bars(results, first.bytes)), reference)
+
+
+def _results(cold: Ready, ready: Ready, first: Joined, second: Joined) -> dict[str, Any]:
+    return {
+        "ready_s": round(ready.seconds, 3),
+        "server_rss_mib": round(ready.rss_mib, 1),
+        "first_picture_s": round(first.first_picture_s, 3),
+        "complete_s": round(first.complete_s, 3),
+        "bytes": first.bytes,
+        "warm_complete_s": round(second.complete_s, 3),
+        "warm_bytes": second.bytes,
+        "assets": first.assets,
+        "client_cpu_s": round(first.cpu_s, 3),
+        "ready_cold_s": round(cold.seconds, 3),
+        "server_rss_cold_mib": round(cold.rss_mib, 1),
+    }
+
+
+def _bars(results: dict[str, Any], sent: int) -> list[Any]:
+    return [
+        bar(results, "ready_s", "<=", 2.0),
+        bar(results, "server_rss_mib", "<=", 150.0),
+        bar(results, "complete_s", "<=", 1.0),
+        bar(results, "warm_bytes", "<=", WARM_SHARE * sent),
+        bar(results, "others_age_ms_p99", "<=", 3.0),
+    ]
+
+
+def _made_ready(model: Path, store: Path) -> Ready:
+    command = [sys.executable, "-m", "iris_session.bench.join_scene", str(model), str(store)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
+    if done.returncode:
+        raise BenchError(f"the scene could not be made ready: status {done.returncode}")
+    return msgspec.json.decode(done.stdout, type=Ready)
+
+
+def _p99(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
+    """99th percentile of the age of state at everybody [ms], of frames handed out between two session times."""
+    ages = [
+        (log["handed_ns"] - log["state_ns"])[(log["handed_ns"] >= begin_ns) & (log["handed_ns"] < end_ns)]
+        for log in logs.values()
+    ]
+    together = np.concatenate(ages)
+    if not len(together):
+        raise BenchError("nobody was handed any state while the client joined, or before it")
+    return round(float(np.percentile(together, 99)) * 1e-6, 3)
+
+
+class _Joiner:
+    """The process that joins, begun before it is needed: to start Python is no part of joining."""
+
+    def __init__(self, folder: Path, ready: Ready, root: Path, bare_port: int) -> None:
+        self._cache, self._ready, self._root, self._bare_port = str(folder / "cache"), ready, str(root), bare_port
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def prepare(self, session: Session) -> None:
+        """Shows the scene's assets, and starts the process. Once, in the warm-up."""
+        if self._process is not None:
+            return
+        front = session.processes.front
+        if front is None:
+            raise BenchError("the session has no front that could serve assets")
+        shown = front.scene
+        addresses = tuple(self._ready.sizes)
+        front.set_scene(
+            msgspec.structs.replace(shown, scene_hash=self._ready.scene, asset_root=self._root, assets=addresses)
+        )
+        job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "iris_session.bench.join_clients"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        self._say(msgspec.json.encode(job))
+
+    def go(self) -> None:
+        """Lets it join."""
+        self._say(b"go")
+
+    def _say(self, line: bytes) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + b"\n")
+        self._process.stdin.flush()
+
+    def result(self) -> tuple[Joined, Joined, float]:
+        """The first time, the second time, and the seconds of the bare transfer, which is made now."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        self._process.stdout.readline()
+        first, second = (msgspec.json.decode(self._line(), type=Joined) for _ in range(2))
+        self._say(b"bare")
+        return first, second, float(self._line())
+
+    def _line(self) -> bytes:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise BenchError("the client that joined failed; it has said why")
+        return line
+
+
+class _Bare:
+    """All assets in one message to whoever asks, from a thread."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self._paths = paths
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.REP)
+        self.port = self._socket.bind_to_random_port("tcp://127.0.0.1")
+        self._thread = threading.Thread(target=self._run, name="bench-bare", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
+        self._context.destroy(linger=0)
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            self._socket.recv()
+            self._socket.send_multipart([path.read_bytes() for path in self._paths], copy=False)
+            self._socket.poll(60_000)  # until it has left
+        except zmq.ZMQError:  # closed
+            return

@@ -1,0 +1,128 @@
+"""The scene that `bench join` shares: moving bodies that look like something, and a server that makes it ready.
+
+    python -m iris_session.bench.join_scene MODEL.mjb STORE     prints what became of it as one JSON object
+
+A process of its own: what memory a scene needs can only be told in one that has done nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from iris_session.physics.scenes import free_bodies_scene
+
+MESHES: Final = 60
+TEXTURES: Final = 60
+#: Of the bytes; meshes have the rest.
+TEXTURE_SHARE: Final = 0.8
+#: As measured, coarser levels included: bytes by those of level 0 as raw pixels, and of a mesh by its vertices.
+_LEVELS: Final = 1.228
+_VERTEX_BYTES: Final = 35.5
+
+
+class Ready(msgspec.Struct, frozen=True):
+    """`seconds`: from the compiled model to assets that can be fetched. `rss_mib`: most memory meanwhile, beyond that
+    of the process with the model. `scene`: address of the specification; `sizes`: bytes of all assets by address."""
+
+    seconds: float
+    rss_mib: float
+    built: int
+    scene: str
+    sizes: dict[str, int]
+
+
+def join_model(objects: int, assets_mb: float, seed: int) -> Any:
+    """An `mujoco.MjSpec`: `objects` moving bodies with 60 meshes and 60 textures between them, about `assets_mb` MB."""
+    import mujoco
+
+    spec = free_bodies_scene(objects, seed)
+    rng = np.random.default_rng(seed)
+    side = max(16, round((assets_mb * 1e6 * TEXTURE_SHARE / TEXTURES / 3 / _LEVELS) ** 0.5))
+    vertices = max(100, round(assets_mb * 1e6 * (1.0 - TEXTURE_SHARE) / MESHES / _VERTEX_BYTES))
+    for i in range(TEXTURES):
+        pixels = rng.integers(0, 256, (side, side, 3), np.uint8)  # noise: what is sent is what is counted
+        spec.add_texture(
+            name=f"texture{i}",
+            type=mujoco.mjtTexture.mjTEXTURE_2D,
+            width=side,
+            height=side,
+            nchannel=3,
+            data=pixels.ravel().tolist(),
+        )
+        material = spec.add_material(name=f"material{i}")
+        material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = f"texture{i}"
+    for i in range(MESHES):
+        points, faces, uv = _stone(rng, vertices)
+        spec.add_mesh(
+            name=f"mesh{i}",
+            uservert=points.ravel().tolist(),
+            userface=faces.ravel().tolist(),
+            usertexcoord=uv.ravel().tolist(),
+            userfacetexcoord=faces.ravel().tolist(),
+        )
+    for i, body in enumerate(body for body in spec.bodies if body.name.startswith("body")):
+        geom = body.first_geom()
+        geom.type = mujoco.mjtGeom.mjGEOM_MESH
+        geom.meshname = f"mesh{i % MESHES}"
+        geom.material = f"material{i % TEXTURES}"
+    return spec
+
+
+def _stone(
+    rng: np.random.Generator, vertices: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Points [m] of a rough ball of 6 cm, triangles and texture coordinates."""
+    rows = max(4, round((vertices / 2) ** 0.5))
+    columns = 2 * rows
+    v, u = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns, endpoint=False), indexing="ij")
+    theta, phi = np.pi * (0.02 + 0.96 * v), 2 * np.pi * u
+    radius = 0.06 * rng.uniform(0.97, 1.0, theta.shape)
+    points = radius[..., None] * np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
+    )
+    at = np.arange(rows * columns).reshape(rows, columns)
+    right = np.roll(at, -1, axis=1)
+    a, b, c, d = at[:-1], at[1:], right[1:], right[:-1]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    top, bottom = np.full((columns,), at[0, 0]), np.full((columns,), at[-1, 0])
+    caps = [np.stack([top, at[0], right[0]], -1)[1:-1], np.stack([bottom, right[-1], at[-1]], -1)[1:-1]]
+    return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def make_ready(model_path: str, store_path: str) -> Ready:
+    """What a server does at its start with a compiled model."""
+    from iris_session.physics.load import load_model
+    from iris_session.protocol.scene import asset_addresses, encode_scene
+    from iris_session.scene.mujoco_scene import parse_mujoco
+    from iris_session.scene.store import AssetStore
+
+    model = load_model(model_path)
+    store = AssetStore(Path(store_path))
+    process = psutil.Process()
+    before = process.memory_info().rss
+    Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
+    began_s = time.perf_counter()
+    parsed = parse_mujoco(model, store)
+    data = encode_scene(parsed.spec)
+    scene = store.put(data)
+    seconds = time.perf_counter() - began_s
+    sizes = {scene: len(data), **asset_addresses(parsed.spec)}
+    return Ready(seconds, (_peak() - before) / 2**20, parsed.built, scene, sizes)
+
+
+def _peak() -> int:
+    """Most resident memory of this process [bytes] since it was last asked to count anew."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024
+
+
+if __name__ == "__main__":
+    sys.stdout.buffer.write(msgspec.json.encode(make_ready(sys.argv[1], sys.argv[2])))
