@@ -150,6 +150,7 @@ def measure(
     actions: Sequence[Action] = (),
     keep_poses: bool = False,
     curve: bool = False,
+    assets: bool | Path = False,
     module: str = CLIENTS,
     make_job: Callable[..., Job] = Job,
     beside: Callable[[Session], None] = lambda _: None,
@@ -157,8 +158,9 @@ def measure(
 ) -> Measured:
     """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
 
-    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `module` and
-    `make_job`: what other clients run, and their jobs. `beside`: what the loop does after every tick, warm-up included.
+    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `assets`: the store
+    of those of the scene; False: clients get poses only. `module` and `make_job`: what other clients run, and their
+    jobs. `beside`: what the loop does after every tick, warm-up included.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
@@ -168,6 +170,7 @@ def measure(
             control_port=0,
             state_port=0,
             record=False,
+            assets=assets,
             curve_key="" if keys is None else keys["server_file"],
             curve_clients="" if keys is None else str(folder / "clients"),
         )

@@ -55,12 +55,13 @@ def run_join(
         if ready.built:
             raise BenchError(f"with a warm cache {ready.built} pieces were encoded anew")
         paths = [store.path(address) for address in ready.sizes]
-        joiner = stack.enter_context(_Joiner(folder, ready, store.root, stack.enter_context(_Bare(paths)).port))
+        joiner = stack.enter_context(_Joiner(folder, stack.enter_context(_Bare(paths)).port))
         got = measure(
             model,
             grouped([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)]),
             seconds,
             actions=[(BEGIN_S, lambda _: joiner.go())],
+            assets=store.root,
             beside=joiner.prepare,
             seed=seed,
             progress=progress,
@@ -128,8 +129,8 @@ def _p99(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
 class _Joiner:
     """The process that joins, begun before it is needed: to start Python is no part of joining."""
 
-    def __init__(self, folder: Path, ready: Ready, root: Path, bare_port: int) -> None:
-        self._cache, self._ready, self._root, self._bare_port = str(folder / "cache"), ready, str(root), bare_port
+    def __init__(self, folder: Path, bare_port: int) -> None:
+        self._cache, self._bare_port = str(folder / "cache"), bare_port
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
@@ -141,17 +142,9 @@ class _Joiner:
             self._process.wait()
 
     def prepare(self, session: Session) -> None:
-        """Shows the scene's assets, and starts the process. Once, in the warm-up."""
+        """Starts the process. Once, in the warm-up."""
         if self._process is not None:
             return
-        front = session.processes.front
-        if front is None:
-            raise BenchError("the session has no front that could serve assets")
-        shown = front.scene
-        addresses = tuple(self._ready.sizes)
-        front.set_scene(
-            msgspec.structs.replace(shown, scene_hash=self._ready.scene, asset_root=self._root, assets=addresses)
-        )
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "iris_session.bench.join_clients"], stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -211,6 +211,7 @@ def _lines(report: StatusReport) -> Iterator[str]:
             f"{_quantiles(r.receive_to_step):>19s}  {waits}"
         )
     yield from _media(report)
+    yield from _assets(report)
     yield ""
     took = stages(report.participants, report)
     yield "data age, p99 of the worst: " + (
@@ -268,6 +269,15 @@ def _media(report: StatusReport) -> Iterator[str]:
                     gets.append(f"{p.name} ({p.id}) {budget.budget_class}" + _dropped(p.media_drops))
         source = f" from {one.source}" if one.source else ""
         yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {', '.join(gets) or 'nobody'}"
+
+
+def _assets(report: StatusReport) -> Iterator[str]:
+    """What of the scene's meshes and textures was fetched."""
+    one = report.assets
+    if one is not None and (one.served or one.requests):
+        refused = f", {one.refusals} refused" if one.refusals else ""
+        waiting = f"; {one.waiting} clients wait for some" if one.waiting else ""
+        yield f"assets: {one.served} served, {one.bytes_sent / 1e6:.1f} MB sent{refused}{waiting}"
 
 
 def _dropped(n: int) -> str:

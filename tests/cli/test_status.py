@@ -14,6 +14,7 @@ from iris_session.cli.status import screen
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.status import (
+    AssetsReport,
     MediaStreamReport,
     ParticipantReport,
     Quantiles,
@@ -75,6 +76,13 @@ def test_one_screen_says_it_all() -> None:
     assert "device -> front 20.0 ms" in text
     assert "front 1" in text
     assert "mind the gap" in text
+
+
+def test_assets_are_shown_where_there_are_some() -> None:
+    assert "assets:" not in screen(msgspec.structs.replace(REPORT, assets=AssetsReport()))
+    report = msgspec.structs.replace(REPORT, assets=AssetsReport(183, 17_500_000, 400, 3, 2))
+    assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients wait for some" in screen(report)
+    assert "iris_session_assets_bytes_total 17500000" in exposition(report)
 
 
 def test_media_are_shown_with_who_gets_what() -> None:
