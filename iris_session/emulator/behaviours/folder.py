@@ -20,13 +20,13 @@ PRESS: float = 0.0115
 DEEPER: float = 0.0015
 #: How far the trigger is pulled when the fingers come down, 60 mm apart then: both must land on the cloth.
 TRIGGER_BEFORE: float = 0.25
-#: Height of the tip above the table at which the corner is let go [m]: much lower, and cloth heaps up around the fingers;
-#: higher, and it swings back as it falls.
+#: Height of the tip above the table at which the corner is let go [m]: much lower, and cloth heaps up around the
+#: fingers; higher, and it swings back as it falls.
 RELEASE: float = 0.036
 #: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
-#: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that open
-#: wide sweep the cloth along.
+#: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that
+#: open wide sweep the cloth along.
 TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
 CAREFUL_SPEED: float = 0.12

@@ -35,15 +35,15 @@ def soft_scene() -> Any:
 
 
 def _round_tips(arm: Any) -> None:
-    """Finger tips that end in a rubber rod of 12 mm under a flat pad: square ones pierce cloth with their edges. Their
-    faces and ends are where those of the pads were."""
+    """Finger tips that end in a rubber rod as thick as the pad above it: square ones pierce cloth with their edges, and
+    from under a thicker rod a low wrinkle slips. Faces and ends are where those of the pads were."""
     import mujoco
 
     for side in ("left", "right"):
         pad, tip = arm.geom(f"pad_{side}"), arm.geom(f"finger_{side}_tip")
-        pad.size, pad.pos = [0.011, 0.004, 0.009], [0.0, 0.004, 0.042]
+        pad.size, pad.pos = [0.011, 0.004, 0.010], [0.0, 0.004, 0.043]
         tip.type = mujoco.mjtGeom.mjGEOM_CAPSULE
-        tip.size, tip.pos, tip.quat = [0.006, 0.011, 0.0], [0.0, 0.006, 0.051], [0.5**0.5, 0.0, 0.5**0.5, 0.0]
+        tip.size, tip.pos, tip.quat = [0.004, 0.011, 0.0], [0.0, 0.004, 0.053], [0.5**0.5, 0.0, 0.5**0.5, 0.0]
         for attribute in ("condim", "priority", "friction", "solref", "solimp", "material"):
             setattr(tip, attribute, getattr(pad, attribute))
 
