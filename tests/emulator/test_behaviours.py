@@ -202,7 +202,7 @@ def test_make_behaviour() -> None:
     assert isinstance(make_behaviour("idle", "arm3", device=DEVICE), Idle)
     with pytest.raises(ValueError, match="needs a partner"):
         make_behaviour("giver", "arm1")
-    with pytest.raises(ValueError, match="Available behaviours: giver, receiver, wander, idle"):
+    with pytest.raises(ValueError, match="Available behaviours: giver, receiver, folder, stower, wander, idle"):
         make_behaviour("juggler", "left")
     with pytest.raises(ValueError, match="Known things: hammer, board"):
         make_behaviour("giver", "left", "teapot")

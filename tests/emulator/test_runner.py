@@ -119,9 +119,7 @@ def test_what_is_seen_travels_with_the_head_pose_of_that_moment(session: LiveSes
     near = 0
     for entry in seen:
         away_ns = np.abs(heads - entry.message.capture_ns)  # type: ignore[union-attr]
-        if (
-            away_ns.min() < 50_000_000
-        ):  # of samples between two steps, long on a busy machine, one stays
+        if away_ns.min() < 50_000_000:  # of samples between two steps, long on a busy machine, one stays
             assert epochs[int(away_ns.argmin())] == entry.message.tracking_epoch  # type: ignore[union-attr]
             near += 1
     assert near > len(seen) / 2
