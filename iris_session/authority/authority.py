@@ -40,6 +40,7 @@ from iris_session.protocol.names import (
     RejectReason,
     Role,
 )
+from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.security import Audited, RemoveParticipant
 from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -65,6 +66,7 @@ HOST_ONLY: Final = (
     em.Audit,
     em.SessionResumed,
     em.SceneLoaded,
+    em.ScenePatched,
 )
 #: Entries that the front makes of its own, for the participant of a connection: no envelope, quota or sign of life.
 FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
@@ -176,6 +178,11 @@ class Authority:
     def scene(self) -> em.SceneLoaded | None:
         """The scene that was loaded last, None while it is the one that the session began with."""
         return self._ctx.state.scene
+
+    @property
+    def patches(self) -> tuple[PatchOp, ...]:
+        """What has changed in how the scene is drawn since it was loaded."""
+        return self._ctx.state.patches
 
     @property
     def anchors(self) -> dict[str, Pose]:
@@ -334,6 +341,8 @@ class Authority:
         elif isinstance(m, em.SceneLoaded):
             scenes.load(ctx, m)
             self._commands = arbitration.Commands()
+        elif isinstance(m, em.ScenePatched):
+            scenes.patch(ctx, m)
         elif isinstance(m, em.StalledGap) and not self._gap_seen:
             self._gap_seen = True
             stops.gap(ctx, m.duration_ns)

@@ -10,8 +10,10 @@ from iris_session.authority import leases, stops
 from iris_session.authority.context import Context, some
 from iris_session.authority.state import HOST_ID, KEPT, LeaseState, Pending
 from iris_session.protocol.common import Denial
-from iris_session.protocol.entries import SceneLoaded
+from iris_session.protocol.entries import SceneLoaded, ScenePatched
 from iris_session.protocol.names import DenialReason, LeaseMode, TargetKind
+from iris_session.protocol.scene_patch import merged
+from iris_session.protocol.server_messages import SceneChanged
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 #: `LeaseChanged.cause` of what ends with its scene.
@@ -32,11 +34,19 @@ def load(ctx: Context, m: SceneLoaded) -> None:
     state.robots, state.objects = robots, object_leases(m.objects)
     state.feedback = {name: told for name, told in state.feedback.items() if name in robots}
     state.handover_tick = -1
-    state.scene = m
+    state.scene, state.patches, state.scene_revision = m, (), 0
     ctx.use(m.robots, m.objects)
     for pending in (*state.queue, *state.consents):
         _end_request(ctx, pending)
     stops.new_scene(ctx, "new_scene")
+
+
+def patch(ctx: Context, m: ScenePatched) -> None:
+    """What is drawn is another: nothing else changes, so no robot stops."""
+    state = ctx.state
+    state.patches = merged(state.patches, m.ops)
+    state.scene_revision += 1
+    ctx.emit(SceneChanged(state.scene_epoch, state.scene_revision, "patch", m.scene_hash))
 
 
 def robot_leases(robots: tuple[RobotSpec, ...], default_mode: str) -> dict[str, LeaseState]:

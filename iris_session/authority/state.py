@@ -12,6 +12,7 @@ import msgspec
 from iris_session.protocol.common import IDENTITY, Alignment, Pose, Vec3
 from iris_session.protocol.entries import SceneLoaded
 from iris_session.protocol.names import HoldReason
+from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.server_messages import EpisodeChanged, Feedback
 from iris_session.protocol.steps import CommandSource
 
@@ -240,7 +241,7 @@ class Compared(msgspec.Struct):
 class State(msgspec.Struct):
     """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
 
-    `scene`: None while it is the one that the session began with.
+    `scene`: None while it is the one that the session began with. `patches`: all that it has had, merged.
     `anchors`: `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b".
     `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
     """
@@ -254,6 +255,7 @@ class State(msgspec.Struct):
     scene_epoch: int = 1
     scene_revision: int = 0
     scene: SceneLoaded | None = None
+    patches: tuple[PatchOp, ...] = ()
     next_participant: int = 1
     next_engagement: int = 1
     next_consent: int = 1

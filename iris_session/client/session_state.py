@@ -172,9 +172,10 @@ class SessionMirror:
                 info_or_none = self.participants.get(name)
                 if info_or_none is not None:
                     self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
-            case SceneChanged(scene_epoch=epoch, scene_revision=revision, cause=cause):
+            case SceneChanged(scene_epoch=epoch, scene_revision=revision, cause=cause, scene_hash=scene_hash):
                 self.scene_epoch = epoch
                 self.scene_revision = revision
+                self.scene_hash = scene_hash or self.scene_hash
                 self.synced = cause in SAME_BODIES
             case EStopChanged(active=active):
                 self.estop = active

@@ -118,12 +118,24 @@ class World:
         self.diverged = ""
         self.reset()
 
+    def initial_data(self, state: bytes = b"") -> Any:
+        """Data of its own at the beginning, positions derived: `state` (`mjSTATE_INTEGRATION`), or the initial one."""
+        data = mujoco.MjData(self.model)
+        self._begin(data)
+        if state:
+            mujoco.mj_setState(self.model, data, np.frombuffer(state, np.float64), STATE)
+        mujoco.mj_fwdPosition(self.model, data)
+        return data
+
+    def _begin(self, data: Any) -> None:
+        if self._keyframe >= 0:
+            mujoco.mj_resetDataKeyframe(self.model, data, self._keyframe)
+        else:
+            mujoco.mj_resetData(self.model, data)
+
     def reset(self) -> None:
         """Back to the initial keyframe (or default state), tick 0."""
-        if self._keyframe >= 0:
-            mujoco.mj_resetDataKeyframe(self.model, self.data, self._keyframe)
-        else:
-            mujoco.mj_resetData(self.model, self.data)
+        self._begin(self.data)
         self._forces = (0.0,) * len(self._forces)
         self._derive(0)
 

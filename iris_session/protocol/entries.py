@@ -6,7 +6,7 @@ They hold no key, secret or token. A step is `(now_ns, entries, n_ticks)`; see d
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
@@ -35,6 +35,7 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
 from iris_session.protocol.decoding import decoder
+from iris_session.protocol.scene_patch import MAX_OPS, PatchOp
 from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
@@ -168,6 +169,13 @@ class SceneLoaded(Message, frozen=True, tag="scene_loaded"):
     initial_state: bytes = b""
 
 
+class ScenePatched(Message, frozen=True, tag="scene_patched"):
+    """What is drawn changes in this step (host only). `scene_hash`: of the specification after `ops`."""
+
+    ops: Annotated[tuple[PatchOp, ...], msgspec.Meta(max_length=MAX_OPS)]
+    scene_hash: Name
+
+
 EntryMessage = (
     Join
     | Lost
@@ -203,6 +211,7 @@ EntryMessage = (
     | Audit
     | SessionResumed
     | SceneLoaded
+    | ScenePatched
 )
 
 

@@ -268,7 +268,7 @@ def decode_scene(data: Bytes) -> SceneSpec:
         raise SceneError(f"no scene specification: {error}") from None
     if spec.version != SCENE_VERSION:
         raise SceneError(f"scene specification version {spec.version}, this side reads {SCENE_VERSION}: update it")
-    _check(spec)
+    check_scene(spec)
     return spec
 
 
@@ -289,7 +289,8 @@ def asset_addresses(spec: SceneSpec) -> dict[str, int]:
     return found
 
 
-def _check(spec: SceneSpec) -> None:
+def check_scene(spec: SceneSpec) -> None:
+    """Raises `SceneError` unless every reference has its target, and no id occurs twice."""
     bodies = {body.id for body in spec.bodies}
     if len(bodies) != len(spec.bodies):
         raise SceneError("two bodies have the same id")

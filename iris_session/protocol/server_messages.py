@@ -214,11 +214,15 @@ class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
 
 
 class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
-    """`cause`: reset, new_scene, patch, external (the user's loop went back in time)."""
+    """`cause`: reset, new_scene, patch, external (the user's loop went back in time).
+
+    `scene_hash`: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
+    """
 
     scene_epoch: Count
     scene_revision: Count
     cause: Name
+    scene_hash: Name = ""
 
 
 class EStopChanged(EventBody, frozen=True, tag="estop_changed"):

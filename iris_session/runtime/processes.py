@@ -17,7 +17,6 @@ from typing import Final
 
 import msgspec
 
-from iris_session.physics import World
 from iris_session.protocol.client_messages import Marker
 from iris_session.recording import (
     CLOSED,
@@ -42,7 +41,7 @@ from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
 from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, note_path
 from iris_session.runtime.shared_scene import SharedScenes
-from iris_session.runtime.stepper import NextScene, ResumedFrom, Stepper
+from iris_session.runtime.stepper import NextPatch, NextScene, ResumedFrom, Stepper
 from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replaced
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, addresses_of
 from iris_session.transport.sockets import host_in_address
@@ -69,7 +68,7 @@ class SessionProcesses:
     def __init__(
         self,
         config: SessionConfig,
-        world: World,
+        core: SessionCore,
         origin_ns: int,
         past: Continuation | None = None,
     ) -> None:
@@ -83,7 +82,7 @@ class SessionProcesses:
         self.recording = config.recording_path() if past is None else past.recording
         self._in_use: RecordingLock | None = None
         self._keeper: NoteKeeper | None = None
-        self._world, self._tick_period_ns = world, world.tick_period_ns
+        self._core, self._tick_period_ns = core, core.world.tick_period_ns
         self.scenes = SharedScenes(config.assets, config.name)
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
@@ -115,7 +114,12 @@ class SessionProcesses:
                 self._keeper = NoteKeeper(note_path(self.recording))
             self.name = others.free_name(self._config.name, self.session_id)
             self.notes += others.notes
-            self.front = FrontProcess(self._front_config(), self.scenes.info(self._world))
+            self.front = FrontProcess(
+                self._front_config(),
+                self.scenes.take(
+                    self.scenes.make(self._core.world, self._core.scene.initial_state, self._core.authority.patches)
+                ),
+            )
             self.notes += self.scenes.notes
             if self._past is not None:
                 self.notes += self._past.notes
@@ -206,10 +210,10 @@ class SessionProcesses:
         stepper.beside_state.append(self._deformables.send)
         return stepper
 
-    def _scene_changed(self, scene: NextScene) -> None:
+    def _scene_changed(self, scene: NextScene | NextPatch) -> None:
         if self.front is not None:
-            self.front.set_scene(scene.info)
-        if self._deformables is not None:
+            self.front.set_scene(scene.shown.info)
+        if self._deformables is not None and isinstance(scene, NextScene):
             self._deformables.use(scene.plant.world)
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:

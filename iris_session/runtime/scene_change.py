@@ -14,7 +14,9 @@ import mujoco
 from iris_session.authority.config import check_config
 from iris_session.physics import find_objects, find_robots
 from iris_session.physics.load import load_model, model_bytes, scene_hash
-from iris_session.protocol.entries import HOST, Entry, SceneLoaded, decode_entry, encode_entry
+from iris_session.protocol.entries import HOST, Entry, SceneLoaded, ScenePatched, decode_entry, encode_entry
+from iris_session.protocol.scene import SceneError, SceneSpec
+from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.runtime.config import SessionConfig
@@ -22,7 +24,7 @@ from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.shared_scene import SharedScenes
-from iris_session.runtime.stepper import NextScene, Stepper
+from iris_session.runtime.stepper import NextPatch, NextScene, Stepper
 from iris_session.runtime.user_loop import UserLoop
 
 
@@ -67,7 +69,10 @@ class SceneChanges:
 
         def work() -> None:
             try:
-                stepper.change_scene(prepare(stepper.core, scenes, load_model_of(model), state, *known))
+                scene = prepare(stepper.core, scenes, load_model_of(model), state, *known)
+                with scenes.lock:
+                    scenes.take(scene.shown)
+                    stepper.change_scene(scene)
             except BaseException as error:  # of whoever asks for the result
                 done.set_exception(error)
             else:
@@ -77,10 +82,41 @@ class SceneChanges:
         threading.Thread(target=work, name="iris-scene", daemon=True).start()
         return done
 
+    def patch_scene(self, *ops: PatchOp) -> None:
+        """Changes how the scene is drawn, for everybody: colours, visibility, poses of visuals, decoration. Physics
+        does not know of it. `session.scene` is the specification that `ops` refer to.
+
+        Raises `ConfigError` for what does not fit (nothing is changed then), `OwnershipError` before the session is
+        driven. From any thread.
+        """
+        stepper = self._stepper
+        if stepper is None:
+            raise OwnershipError("patch_scene needs a session that runs: call it while run() is under way")
+        scenes = self._live().scenes
+        try:
+            # What is journaled is what is used, and it is what clients can read.
+            checked = decode_entry(encode_entry(Entry(HOST, HOST, 0, ScenePatched(ops, "")))).message
+            assert isinstance(checked, ScenePatched)
+            with scenes.lock:
+                shown = scenes.patch(checked.ops)
+                scenes.take(shown)
+                message = ScenePatched(checked.ops, shown.info.scene_hash)
+                stepper.change_scene(NextPatch(message, shown))
+        except (SceneError, OSError, msgspec.ValidationError) as error:
+            raise ConfigError(f"patch_scene: {error}") from error
+
+    @property
+    def scene(self) -> SceneSpec | None:
+        """What clients draw, with all patches that were asked for; None when the session shares no specification."""
+        newest = self._live().scenes.newest
+        return None if newest is None else newest.spec
+
     @abstractmethod
     def _live(self) -> SessionProcesses: ...
 
-    def _take_scene(self, scene: NextScene) -> None:
+    def _take_scene(self, scene: NextScene | NextPatch) -> None:
+        if isinstance(scene, NextPatch):
+            return
         plant = scene.plant
         self.model, self.data = plant.world.model, plant.world.data
         self.robots, self.objects = plant.scene.robots, plant.scene.objects
@@ -118,4 +154,4 @@ def prepare(
             f"the scene has a timestep of {then_ns * 1e-6:g} ms, the session one of {now_ns * 1e-6:g} ms: "
             f'set <option timestep="{now_ns * 1e-9:g}"/>'
         )
-    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), scenes.info(plant.world))
+    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), scenes.make(plant.world, state))

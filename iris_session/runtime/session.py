@@ -110,8 +110,8 @@ class Session(Publishing, SceneChanges):
         afterwards `StartError`: a port in use, a folder that cannot be written, a key that is missing.
         """
         if self._processes is None:
-            world = self._make_core(user_owned=False).world
-            processes = SessionProcesses(self.config, world, self.origin_ns, self._past)
+            core = self._make_core(user_owned=False)
+            processes = SessionProcesses(self.config, core, self.origin_ns, self._past)
             processes.start()
             self._processes = processes
 

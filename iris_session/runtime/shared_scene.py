@@ -6,29 +6,42 @@ What a model became is remembered on the disk, so only the first session with a 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneSpec, asset_addresses, encode_scene
+from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, encode_scene
+from iris_session.protocol.scene_patch import MAX_OPS, MAX_PATCHES, PatchOp, merged, patched
 from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.transport import SceneInfo
+
+
+class Shown(NamedTuple):
+    """What clients get of one scene. `spec`: None where nothing is shared but bodies and poses."""
+
+    info: SceneInfo
+    spec: SceneSpec | None = None
+    patches: tuple[PatchOp, ...] = ()
 
 
 class SharedScenes:
     """Makes what clients get of each scene of one session. `notes`: what people should know; one line each.
 
     `where`: True for the store of this user, a folder for another one, False for none: clients then get bodies and
-    poses, nothing to draw them with.
+    poses, nothing to draw them with. `lock`: held while a scene or patch takes its place in the order of both, which is
+    short; `newest`: the last one that did.
     """
 
     def __init__(self, where: bool | str | Path, name: str) -> None:
         self.notes: list[str] = []
-        self.spec: SceneSpec | None = None
+        self.lock = threading.RLock()
+        self.newest: Shown | None = None
         self._name = name
-        self._lock = threading.Lock()  # the next scene is made in a thread of its own
         self._holds: list[Hold] = []
         self._store: AssetStore | None = None
         if where is not False:
@@ -37,34 +50,50 @@ class SharedScenes:
             except OSError as error:
                 self._without(f"{error.filename or where}: {error.strerror or error}")
 
-    def info(self, world: World) -> SceneInfo:
-        """Of a world in its initial state. Takes long for a model that was never shared before."""
+    def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> Shown:
+        """Of the scene as it begins (`initial_state` empty: as the model says) and what has changed in it since: so
+        a session that goes on shows what it showed. Takes long for a model that was never shared before. From any
+        thread."""
         poses = np.zeros((len(world.bodies), 7))
         world.poses(poses)
         plain = SceneInfo(world.scene_hash, world.robot_infos, world.bodies, poses.tobytes())
-        with self._lock:
-            store = self._store
-            if store is None:
-                return plain
-            try:
-                parsed = parse_mujoco(world.model, store, data=world.data, name=self._name)
-                address = store.put(encode_scene(parsed.spec))
-            except (OSError, SceneBuildError) as error:  # the session is worth more than its picture
-                self._without(str(error))
-                return plain
-            self.spec = parsed.spec
-            self.notes += [f"clients do not see {what}" for what in parsed.skipped]
-            addresses = (address, *asset_addresses(parsed.spec))
-            self._holds.append(store.hold(addresses))
-            if len(self._holds) > 2:  # the front serves the scene before too, until everybody has left it
-                self._holds.pop(0).release()
-            return SceneInfo(
-                address, plain.robots, plain.bodies, plain.poses, asset_root=str(store.root), assets=addresses
+        store = self._store
+        if store is None:
+            return Shown(plain)
+        try:
+            parsed = parse_mujoco(world.model, store, data=world.initial_data(initial_state), name=self._name)
+            shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
+        except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
+            self._without(str(error))
+            return Shown(plain)
+        self.notes += [f"clients do not see {what}" for what in parsed.skipped]
+        return shown
+
+    def patch(self, ops: Sequence[PatchOp]) -> Shown:
+        """The newest scene with `ops`. Raises `SceneError`, `OSError`. Hold `lock` until `take`."""
+        newest = self.newest
+        if self._store is None or newest is None or newest.spec is None:
+            raise SceneError("this session shares no specification of its scene: set `assets` of SessionConfig")
+        merging = merged(newest.patches, ops)
+        if len(ops) > MAX_OPS or len(merging) > MAX_PATCHES:
+            raise SceneError(
+                f"at most {MAX_OPS} operations a patch, {MAX_PATCHES} since the scene was loaded: load it anew"
             )
+        return _stored(self._store, patched(newest.spec, ops), newest.info, merging)
+
+    def take(self, shown: Shown) -> SceneInfo:
+        """It is the newest from now on; its files stay, and those of the one before, which the front still serves."""
+        with self.lock:
+            self.newest = shown
+            if self._store is not None and shown.spec is not None:
+                self._holds.append(self._store.hold(shown.info.assets))
+            while len(self._holds) > 2:
+                self._holds.pop(0).release()
+        return shown.info
 
     def close(self) -> None:
         """Lets go of the files."""
-        with self._lock:
+        with self.lock:
             for hold in self._holds:
                 hold.release()
             self._holds.clear()
@@ -72,3 +101,10 @@ class SharedScenes:
     def _without(self, why: str) -> None:
         self._store = None
         self.notes.append(f"clients get no meshes and textures: {why}")
+
+
+def _stored(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
+    address = store.put(encode_scene(spec))
+    addresses = (address, *asset_addresses(spec))
+    info = msgspec.structs.replace(info, scene_hash=address, asset_root=str(store.root), assets=addresses)
+    return Shown(info, spec, patches)

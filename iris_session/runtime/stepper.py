@@ -23,7 +23,7 @@ from iris_session.protocol.entries import (
     Entry,
     EntryMessage,
     RecordingGap,
-    SceneLoaded,
+    ScenePatched,
     SessionResumed,
     decode_entry,
     encode_entry,
@@ -33,8 +33,8 @@ from iris_session.protocol.server_messages import BodyInfo, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.runtime.core import Plant, SessionCore, StepOutcome, unmeasured
+from iris_session.runtime.shared_scene import Shown
 from iris_session.runtime.status import SessionLedger
-from iris_session.transport import SceneInfo
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
 MAX_HOST_ENTRIES: Final = 256
@@ -82,12 +82,19 @@ class RecorderPort(Protocol):
 
 
 class NextScene(NamedTuple):
-    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `info`: for the front."""
+    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `shown`: to clients."""
 
     plant: Plant
     model_hash: str
     packed_model: bytes
-    info: SceneInfo
+    shown: Shown
+
+
+class NextPatch(NamedTuple):
+    """A change of what is drawn. `shown`: to clients after it."""
+
+    message: ScenePatched
+    shown: Shown
 
 
 class ResumedFrom(NamedTuple):
@@ -126,9 +133,9 @@ class Stepper:
         self._newest_step = 0
         self.last: StepOutcome | None = None
         self._host: deque[EntryMessage] = deque()
-        self._scenes: deque[NextScene] = deque()
+        self._scenes: deque[NextScene | NextPatch] = deque()
         #: Called with another scene before the step that loads it.
-        self.on_scene: list[Callable[[NextScene], None]] = []
+        self.on_scene: list[Callable[[NextScene | NextPatch], None]] = []
         self._state_period_ns = state_period_ns
         self._keyframe_period_ns = keyframe_period_ns
         self._next_state_ns = 0
@@ -161,8 +168,9 @@ class Stepper:
             raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
         self._host.append(_checked(message))
 
-    def change_scene(self, scene: NextScene) -> None:
-        """Another scene from the next step on. From any thread; of several that wait each gets a step of its own."""
+    def change_scene(self, scene: NextScene | NextPatch) -> None:
+        """Another scene, or another look of it, from the next step on. From any thread; of several that wait each gets
+        a step of its own."""
         self._scenes.append(scene)
 
     def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:
@@ -216,23 +224,27 @@ class Stepper:
             begin = (SessionResumed(now_ns - past.now_ns, dict(past.anchors)), GetSnapshot())
             host += [Entry(HOST, HOST, now_ns, message) for message in begin]
         if self._scenes:
-            # The ledger gets the new leases as a client would.
-            host += [Entry(HOST, HOST, now_ns, message) for message in (self._announce_scene(), GetSnapshot())]
+            host += [Entry(HOST, HOST, now_ns, message) for message in self._announce_scene()]
         while self._host:
             host.append(Entry(HOST, HOST, now_ns, self._host.popleft()))
         return host + entries if host else entries
 
-    def _announce_scene(self) -> SceneLoaded:
-        """Hands the next scene to everybody who must have it before the step."""
+    def _announce_scene(self) -> Sequence[EntryMessage]:
+        """Hands the next scene or patch to everybody who must have it before the step."""
         scene = self._scenes.popleft()
-        self.core.prepared[scene.model_hash] = scene.plant
-        world = scene.plant.world
-        self._poses = np.zeros((len(world.bodies), 7))
-        if self.recorder is not None:
-            self.recorder.scene(scene.model_hash, scene.packed_model, world.bodies)
+        messages: Sequence[EntryMessage]
+        if isinstance(scene, NextPatch):
+            messages = (scene.message,)
+        else:
+            self.core.prepared[scene.model_hash] = scene.plant
+            bodies = scene.plant.world.bodies
+            self._poses = np.zeros((len(bodies), 7))
+            if self.recorder is not None:
+                self.recorder.scene(scene.model_hash, scene.packed_model, bodies)
+            messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client would
         for follow in self.on_scene:
             follow(scene)
-        return scene.plant.scene
+        return messages
 
     def publish(self, end_ns: int) -> None:
         """Sends the rigid state when it is due. `end_ns`: session time of the end of the tick it belongs to."""

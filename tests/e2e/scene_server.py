@@ -1,4 +1,4 @@
-"""A session that loads another scene whenever a file named after one appears: what a lab's own program would do.
+"""A session that loads or paints a scene when a file with that name appears: what a lab's own program would do.
 
 python scene_server.py RECORDING FOLDER
 """
@@ -14,6 +14,11 @@ import mujoco
 
 from iris_session import Session, SessionConfig
 from iris_session.physics.scenes import n_arms_scene, scene_path
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene import Geometry, Visual
+from iris_session.protocol.scene_patch import AddVisual, SetVisual
+
+RED = (1.0, 0.0, 0.0, 1.0)
 
 
 def slow() -> mujoco.MjModel:
@@ -31,6 +36,17 @@ SCENES: dict[str, Callable[[], Any]] = {
 }
 
 
+def paint(session: Session) -> None:
+    """Everything red, and a lamp above the table."""
+    assert session.scene is not None
+    spec = session.scene
+    number = max(visual.id for visual in spec.visuals) + 1
+    geometry = Geometry("sphere", (0.1, 0.1, 0.1))
+    lamp = Visual(number, 0, "lamp", Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)), 0, geometry, -1, RED)
+    session.patch_scene(*(SetVisual(visual.id, rgba=RED) for visual in spec.visuals[:60]))
+    session.patch_scene(AddVisual(lamp))
+
+
 def main() -> None:
     recording, folder = Path(sys.argv[1]), Path(sys.argv[2])
     config = SessionConfig(control_port=0, state_port=0, record=recording, beacon_port=0)
@@ -41,6 +57,10 @@ def main() -> None:
             if (folder / name).exists():
                 (folder / name).unlink()
                 pending.append(session.load_scene(make()))
+        if (folder / "paint").exists():
+            (folder / "paint").unlink()
+            paint(session)
+            print("painted", flush=True)
         for future in [future for future in pending if future.done()]:
             pending.remove(future)
             error = future.exception()

@@ -6,12 +6,17 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from anchors.pose import distance
+from iris_session.client import Client
 from iris_session.protocol.entries import SceneLoaded, decode_entries
+from iris_session.protocol.scene import SceneSpec, decode_scene
+from iris_session.protocol.server_messages import SceneChanged
 from iris_session.recording import Recording
 from tests.e2e.conftest import COMMAND, Server, Stage, end_all
+from tests.e2e.scene_server import RED
 
 pytestmark = pytest.mark.e2e
 
@@ -105,7 +110,14 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
     hand = stage.hand(ann, "arm3")
     stage.engage(hand)
     stage.run((stage.server.folder / "session.part2.rrd").exists, "the recording goes on")
-    stage.seconds(1.0)
+    engaged_ns = ann.session_now_ns()
+
+    def recorded() -> bool:
+        stage.seconds(0.5)
+        with Recording.open(stage.server.recording, warn=False) as recording:
+            return max(row.now_ns for row in recording.rows()) > engaged_ns
+
+    stage.run(recorded, "what she does is in the file")
     stage.server.process.kill()
     stage.server.process.wait()
     resumed_file = stage.server.folder / "session.resume2.rrd"
@@ -117,6 +129,48 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
         stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
         stage.engage(hand)
         assert ann.mirror.leases["arm3"].holder == ann.participant_id
+        assert resumed.finish()["ok"]
+    finally:
+        end_all([resumed])
+
+
+def spec_of(stage: Stage, client: Client) -> SceneSpec:
+    """The scene as a client that comes now gets it."""
+    address = client.mirror.scene_hash
+    fetch = client.fetch_assets([address])
+    stage.run(lambda: fetch.done, "the specification has come")
+    return decode_scene(fetch.read(address))
+
+
+def test_what_is_painted_is_the_same_for_those_who_were_there_and_who_came_late_or_after(stage: Stage) -> None:
+    ann = stage.join("ann")
+    ann.acquire(["left"])
+    hand = stage.hand(ann, "left")
+    stage.engage(hand)
+    before = spec_of(stage, ann)
+    order(stage, "paint", "painted")
+    stage.run(lambda: ann.mirror.scene_revision == 2, "both patches have come")
+    assert stage.following(hand), "robots go on while things are painted"
+    changes = [e.body for e in stage.events["ann"] if isinstance(e.body, SceneChanged)]
+    late = stage.join("late", role="observer")
+    stage.run(lambda: late.mirror.event_seq == ann.mirror.event_seq, "both know the same")
+    assert late.mirror.scene_hash == ann.mirror.scene_hash == changes[-1].scene_hash
+    assert late.mirror.mirror_hash() == ann.mirror.mirror_hash()
+    after = spec_of(stage, late)
+    assert spec_of(stage, ann) == after
+    assert [v.name for v in after.visuals] == [*(v.name for v in before.visuals), "lamp"]
+    red = [msgspec.structs.replace(v, rgba=RED) for v in before.visuals]
+    assert list(after.visuals[:60]) == red[:60]
+    assert after.visuals[60:-1] == before.visuals[60:]
+
+    stage.server.process.kill()
+    stage.server.process.wait()
+    resumed_file = stage.server.folder / "session.resume2.rrd"
+    command = [*COMMAND, "serve", "--resume", str(stage.server.folder / "session.rrd")]
+    resumed = Server(stage.server.folder, resumed_file, command)
+    try:
+        stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
+        assert ann.mirror.scene_hash == changes[-1].scene_hash
         assert resumed.finish()["ok"]
     finally:
         end_all([resumed])

@@ -125,7 +125,7 @@ def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
     moved = Pose((1.0, 0.0, 0.0), IDENTITY.q)
     core.step(TICK_NS, [host(TICK_NS, MoveAnchor(0, "table", moved))], 0)
     told: list[object] = []
-    session_processes = SessionProcesses(SessionConfig(record=False), core.world, 0)
+    session_processes = SessionProcesses(SessionConfig(record=False), core, 0)
     session_processes.front = SimpleNamespace(  # type: ignore[assignment]
         alive=False, set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
     )

@@ -4617,6 +4617,8 @@ namespace IrisSession.Protocol
 
     /// <summary>
     /// cause: reset, new_scene, patch, external (the user's loop went back in time).
+    ///
+    /// scene_hash: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
     /// </summary>
     public sealed class SceneChanged : EventKind
     {
@@ -4625,6 +4627,7 @@ namespace IrisSession.Protocol
         public long SceneEpoch = 0;
         public long SceneRevision = 0;
         public string Cause = "";
+        public string SceneHash = "";
 
         public static SceneChanged Read(WireReader reader)
         {
@@ -4637,6 +4640,7 @@ namespace IrisSession.Protocol
                     case "scene_epoch": value.SceneEpoch = reader.ReadLong(); seen |= 1u; break;
                     case "scene_revision": value.SceneRevision = reader.ReadLong(); seen |= 2u; break;
                     case "cause": value.Cause = reader.ReadString(); seen |= 4u; break;
+                    case "scene_hash": value.SceneHash = reader.ReadString(); break;
                     default: reader.Skip(); break;
                 }
             }
@@ -4646,7 +4650,7 @@ namespace IrisSession.Protocol
 
         public override void WriteTo(WireWriter writer)
         {
-            writer.WriteMapHeader(4);
+            writer.WriteMapHeader(5);
             writer.Write("event");
             writer.Write(TagName);
             writer.Write("scene_epoch");
@@ -4655,6 +4659,8 @@ namespace IrisSession.Protocol
             writer.Write(SceneRevision);
             writer.Write("cause");
             writer.Write(Cause);
+            writer.Write("scene_hash");
+            writer.Write(SceneHash);
         }
     }
 

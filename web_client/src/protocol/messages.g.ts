@@ -1155,12 +1155,17 @@ export interface HeadsetsCompared {
   n: number;
 }
 
-/** `cause`: reset, new_scene, patch, external (the user's loop went back in time). */
+/**
+ * `cause`: reset, new_scene, patch, external (the user's loop went back in time).
+ *
+ * `scene_hash`: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
+ */
 export interface SceneChanged {
   event: "scene_changed";
   scene_epoch: number;
   scene_revision: number;
   cause: string;
+  scene_hash?: string;
 }
 
 export interface EStopChanged {
@@ -1522,7 +1527,7 @@ export const DEFAULTS = {
   alignment_alarmed: { beside: [] },
   anchor_moved: { by: "" },
   headsets_compared: {},
-  scene_changed: {},
+  scene_changed: { scene_hash: "" },
   estop_changed: { reason: "" },
   pause_changed: { participant: "" },
   episode_changed: { label: "", participant: "" },
