@@ -25,6 +25,9 @@ TRIGGER_BEFORE: float = 0.25
 RELEASE: float = 0.036
 #: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
+#: So far at most the fingers go beyond the other corner [m]: the one that is tucked under them may unfold when it is
+#: let go.
+BEYOND: float = 0.01
 #: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that
 #: open wide sweep the cloth along.
 TRIGGER_AFTER: float = 0.75
@@ -55,6 +58,7 @@ class Folder(Phases):
         self._pinch: Vec3 = (0.0, 0.0, 0.0)
         self._goal: Vec3 = (0.0, 0.0, 0.0)
         self._outward: Vec3 = (0.0, 0.0, 0.0)  # from the partner's corner to mine
+        self._ahead: Vec3 = (0.0, 0.0, 0.0)  # from my corner to where it goes
         self._shakes = 0
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
         self._steps |= {
@@ -93,7 +97,7 @@ class Folder(Phases):
         mine, onto, other = corners[self._mine], corners[self._onto], corners[self._other]
         self._pinch = _inset(mine, onto, other)
         self._goal = _inset(onto, mine, corners[beyond])
-        self._outward = _toward(other, mine)
+        self._outward, self._ahead = _toward(other, mine), _toward(mine, onto)
         self._diagonal = math.atan2(self._pinch[1] - mine[1], self._pinch[0] - mine[0])
         self._enter("approach")
 
@@ -176,7 +180,9 @@ class Folder(Phases):
             mine, onto = self.eyes.corner(self._mine), self.eyes.corner(self._onto)
             ox, oy, _ = self._outward
             x, y = tip[0] + onto[0] - mine[0] + FALLS_BACK * ox, tip[1] + onto[1] - mine[1] + FALLS_BACK * oy
-            self._goal = (x, y, 0.0)
+            fx, fy, _ = self._ahead
+            back = min(0.0, BEYOND - (x - onto[0]) * fx - (y - onto[1]) * fy)
+            self._goal = (x + back * fx, y + back * fy, 0.0)
             self.hand.move_to(self._tip_at(self._goal, RELEASE + 0.015), CAREFUL_SPEED)
         self._carried("lower", 0.006)
 
