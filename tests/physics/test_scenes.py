@@ -25,7 +25,7 @@ def _settled(model: mujoco.MjModel, steps: int = 500) -> mujoco.MjData:
 
 
 def test_unknown_scene_lists_the_available_ones() -> None:
-    with pytest.raises(FileNotFoundError, match="arm, handover"):
+    with pytest.raises(FileNotFoundError, match="arm, cloth, handover, soft"):
         scene_path("kitchen")
     with pytest.raises(FileNotFoundError):
         scene_path("../physics")

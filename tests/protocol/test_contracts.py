@@ -13,7 +13,9 @@ from iris_session.protocol.codec import decode_server, encode_server
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Applied, Denial, Pose, Target
 from iris_session.protocol.entries import Entry, decode_entries, decode_entry, encode_entries, encode_entry
 from iris_session.protocol.generate.examples import extreme, full, least
+from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
+from iris_session.protocol.specs import RobotSpec
 
 WIRE = set(get_args(ClientMessage))
 INTERNAL = [kind for kind in get_args(entries.EntryMessage) if kind not in WIRE]
@@ -52,6 +54,8 @@ def test_client_messages_survive_as_entries(kind: type[msgspec.Struct], make: ob
         entries.Audit("key_refused", "ab12", "Ada", "10.0.0.7", "pair", 3),
         entries.SessionResumed(5_000_000_000),
         entries.RecordingGap(7),
+        entries.SceneLoaded("ab12", (RobotSpec("left", ("j",), ("a",), "tcp", "base"),), (), b"state"),
+        entries.ScenePatched((SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0)), RemoveVisual(2)), "cd34"),
     ],
     ids=lambda message: type(message).__name__,
 )
@@ -63,7 +67,7 @@ def test_internal_messages_survive_as_entries(message: entries.EntryMessage) -> 
 
 def test_every_internal_message_was_tried() -> None:
     names = {"Join", "Lost", "AlignmentProposal", "ExternalReset", "StalledGap", "FrontRestarted", "RecordingGap"}
-    names |= {"Audit", "SessionResumed", "AlignmentAlarm", "CrossChecked"}
+    names |= {"Audit", "SessionResumed", "AlignmentAlarm", "CrossChecked", "SceneLoaded", "ScenePatched"}
     assert {kind.__name__ for kind in INTERNAL} == names
 
 

@@ -14,6 +14,7 @@ from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.recording import Recording, SessionHeader, verify
 from iris_session.recording.journal import CRASHED, Keyframe, make_row, seal
+from iris_session.recording.verify import Models
 from tests.recording.support import TICK_NS, SmallCore, journal, write
 
 
@@ -165,7 +166,7 @@ def test_another_header_is_named(path: Path) -> None:
 
 
 def test_a_core_that_cannot_be_built_is_in_the_report(path: Path) -> None:
-    def refuse(header: SessionHeader) -> SmallCore:
+    def refuse(header: SessionHeader, models: Models) -> SmallCore:
         raise ValueError("config of\nversion 9")
 
     report = verify(write(path, *journal(50)), refuse)
