@@ -35,21 +35,21 @@ def check_events(recording: Path, folder: Path) -> tuple[dict[str, int], list[st
 
 
 def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int]) -> tuple[int, list[str]]:
-    """One client's events (generation, gaps, event_seq, CRC): without a gap from each of its snapshots on, in order of
-    all, each as recorded. A client whose link takes nothing loses events, knows so, and is given a snapshot in
-    their place: how often, on connections that went on."""
-    last_generation = last_gaps = last_seq = -1
+    """One client's events (generation, times that it was told of missed ones, event_seq, CRC): none is missed without
+    being told, all in order, each as recorded. A client whose link takes nothing loses events, and is given a snapshot
+    in their place: how often, on connections that went on."""
+    last_generation = last_told = last_seq = -1
     filled = 0
-    for generation, gaps, seq, crc in records:
-        if generation == last_generation and seq != last_seq + 1:
-            if gaps == last_gaps:
-                return filled, [f"{name}: event {seq} came after {last_seq} without a snapshot between them"]
-            filled += 1
+    for generation, told, seq, crc in records:
+        if last_seq >= 0 and seq != last_seq + 1:
+            if told == last_told:
+                return filled, [f"{name}: event {seq} came after {last_seq}, and nobody told of those between"]
+            filled += generation == last_generation
         if seq <= last_seq:
             return filled, [f"{name}: event {seq} came after {last_seq}"]
         if recorded.get(seq) != crc:
             return filled, [f"{name}: event {seq} is not that of the recording"]
-        last_generation, last_gaps, last_seq = generation, gaps, seq
+        last_generation, last_told, last_seq = generation, told, seq
     return filled, []
 
 

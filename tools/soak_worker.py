@@ -2,9 +2,9 @@
 
     python tools/soak_worker.py < job.json        {"address": ..., "specs": [HeadsetSpec, ...], "log": "folder/worker3"}
 
-One log per person: `<log>-<name>.events`, records of (connection generation, gaps that a snapshot has filled on it,
-event_seq, CRC-32 of the event), and one
-`<log>-<name>.json` with the person's report, written every second. Ends at SIGTERM.
+One log per person: `<log>-<name>.events`, records of (connection generation, how often it was told so far that it
+missed events, event_seq, CRC-32 of the event), and one `<log>-<name>.json` with the person's report, written every
+second. Ends at SIGTERM.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ class Witness:
         self._next_report_ns = 0
         self._pass_on = self.person.client.on_event
         self.person.client.on_event = self._note
+        self._missed = 0
+        self.person.client.on_missed = self._miss
 
     def step(self, ready: bool) -> None:
         """One round of the loop."""
@@ -72,9 +74,12 @@ class Witness:
             file.write(msgspec.json.encode(self.person.finish_report()))
         os.replace(f"{path}.new", path)
 
+    def _miss(self, _first: int, _last: int) -> None:
+        self._missed += 1
+
     def _note(self, event: Event) -> None:
         connection = self.person.client.connection
-        record = RECORD.pack(connection.generation, connection.mirror.gaps, event.event_seq, fingerprint(event))
+        record = RECORD.pack(connection.generation, self._missed, event.event_seq, fingerprint(event))
         os.write(self._file, record)
         if self._pass_on is not None:
             self._pass_on(event)

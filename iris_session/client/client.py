@@ -43,7 +43,8 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
     `alignment`: `measured` or `not_needed` (default: by role). `identity`: an `Identity`, a file that keeps one across
     restarts, or `None` for this process only. `curve`: keys of your own instead of those in the home of keys.
     `on_state(state)`, `on_event(event)`, `on_feedback(feedback)`: called from `poll` (or the thread of `start`).
-    `on_denial(denial)`: of a message that waits for no answer.
+    `on_missed(first, last)`: between two events, numbers of those that this client lost (its link took nothing for a
+    while, or was another one); what came of them is known. `on_denial(denial)`: of a message that waits for no answer.
 
         with Client("127.0.0.1:7721", role="agent", name="policy", devices=("target",)) as client:
             client.acquire(["left"])
@@ -70,6 +71,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         software: str = "iris-session",
         on_state: Callable[[SceneState], None] | None = None,
         on_event: Callable[[Event], None] | None = None,
+        on_missed: Callable[[int, int], None] | None = None,
         on_feedback: Callable[[Feedback], None] | None = None,
         on_denial: Callable[[Denial], None] | None = None,
     ) -> None:
@@ -95,6 +97,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         self.connection = Connection(hello, identity)
         self.on_state = on_state
         self.on_event = on_event
+        self.on_missed = on_missed
         self.on_feedback = on_feedback
         self.on_denial = on_denial
         self.feedback: dict[str, Feedback] = {}

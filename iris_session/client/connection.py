@@ -29,7 +29,7 @@ from iris_session.client.limits import (
     STEADY_NS,
 )
 from iris_session.client.outgoing import Outgoing, PendingStop
-from iris_session.client.receiving import Receiving
+from iris_session.client.receiving import Receiving, Told
 from iris_session.client.session_state import SessionMirror
 from iris_session.client.state_stream import StateStream
 from iris_session.client.status import ConnectionCounters, Phase
@@ -50,11 +50,8 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
-    Event,
-    Feedback,
     ProtocolFault,
     Refused,
-    Reply,
     Welcome,
 )
 from iris_session.protocol.status import DeliveryBudget, StatusReport
@@ -80,7 +77,7 @@ class Connection(Receiving):
         self.clock = ClockSync()
         self.stream = StateStream()
         self.counters = ConnectionCounters()
-        self.inbox: deque[Event | Feedback | ProtocolFault | Reply] = deque()  # replies: unasked denials
+        self.inbox: deque[Told] = deque()
         #: Newest message of the kinds of which only the newest matters, by type.
         self.latest: dict[type, StatusReport | DeliveryBudget | Paired] = {}
         self.answers = Answers(self.counters)

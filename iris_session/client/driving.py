@@ -14,13 +14,15 @@ from iris_session.client.assets import Assets
 from iris_session.client.errors import ClientError, NotConnectedError
 from iris_session.client.joining import Joining
 from iris_session.client.media import Media
+from iris_session.client.receiving import Told
 from iris_session.client.reporting import ArrivalMeter
 from iris_session.client.scene_view import SceneView
+from iris_session.client.session_state import Missed
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
 from iris_session.client.waiting import milliseconds
 from iris_session.protocol.common import Denial
-from iris_session.protocol.server_messages import Event, Feedback, ProtocolFault, Reply
+from iris_session.protocol.server_messages import Event, Feedback, Reply
 
 DEFAULT_TIMEOUT_S = 5.0
 
@@ -30,6 +32,7 @@ class Driving(SceneView, Media, Assets, Joining):
 
     on_state: Callable[[SceneState], None] | None
     on_event: Callable[[Event], None] | None
+    on_missed: Callable[[int, int], None] | None
     on_feedback: Callable[[Feedback], None] | None
     on_denial: Callable[[Denial], None] | None
     feedback: dict[str, Feedback]
@@ -205,9 +208,11 @@ class Driving(SceneView, Media, Assets, Joining):
                 return
             self.connection.pop_outgoing(sent=sent)
 
-    def _call_back(self, message: Event | Feedback | ProtocolFault | Reply) -> None:
+    def _call_back(self, message: Told) -> None:
         if isinstance(message, Event) and self.on_event is not None:
             self.on_event(message)
+        elif isinstance(message, Missed) and self.on_missed is not None:
+            self.on_missed(message.first, message.last)
         elif isinstance(message, Feedback) and self.on_feedback is not None:
             self.on_feedback(message)
         elif isinstance(message, Reply) and self.on_denial is not None and message.denial is not None:

@@ -15,7 +15,7 @@ from iris_session.client.errors import ClientError, RefusedError, VersionError
 from iris_session.client.identity import Identity
 from iris_session.client.limits import MAX_INBOX, NOT_TAKEN, TRANSIENT, end_for_good, heartbeat_period
 from iris_session.client.outgoing import PendingStop
-from iris_session.client.session_state import SessionMirror
+from iris_session.client.session_state import Missed, SessionMirror
 from iris_session.client.state_stream import StateStream, poses_from_bytes
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
@@ -37,6 +37,9 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
+#: What is handed to the application, in this order. Replies: denials that nobody waits for.
+Told = Event | Missed | Feedback | ProtocolFault | Reply
+
 
 class Receiving:
     """Part of `Connection`."""
@@ -53,7 +56,7 @@ class Receiving:
     clock: ClockSync
     stream: StateStream
     counters: ConnectionCounters
-    inbox: deque[Event | Feedback | ProtocolFault | Reply]
+    inbox: deque[Told]
     latest: dict[type, StatusReport | DeliveryBudget | Paired]
     answers: Answers
     stop: PendingStop
@@ -189,7 +192,11 @@ class Receiving:
             self.counters.malformed += 1
             return
         self.counters.snapshots += 1
-        for event in self.mirror.apply_snapshot(snapshot):
+        known = self.mirror.event_seq
+        events = self.mirror.apply_snapshot(snapshot)
+        if 0 < known < snapshot.event_seq:
+            self._deliver(Missed(known + 1, snapshot.event_seq))
+        for event in events:
             self._deliver(event)
         if self.mirror.estop:
             self.stop.withdraw()
@@ -202,7 +209,7 @@ class Receiving:
         if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.settled:
             self.phase = Phase.READY
 
-    def _deliver(self, message: Event | Feedback | ProtocolFault | Reply) -> None:
+    def _deliver(self, message: Told) -> None:
         if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
             self.stream.forget_presence(message.body.participant)
         if len(self.inbox) >= MAX_INBOX:

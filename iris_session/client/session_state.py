@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -36,6 +36,13 @@ MAX_HELD_EVENTS: Final = 256  # kept while a snapshot is on its way; more than t
 #: Causes of `SceneChanged` that leave robots and bodies as they are; after any other a new snapshot tells them.
 SAME_BODIES: Final = frozenset({"reset", "patch", "external"})
 _encoder = msgspec.msgpack.Encoder(order="deterministic")
+
+
+class Missed(NamedTuple):
+    """Events `first` to `last` that were not handed over: a snapshot tells what came of them, not what they were."""
+
+    first: int
+    last: int
 
 
 class SessionMirror:

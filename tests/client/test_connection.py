@@ -15,6 +15,7 @@ from iris_session.client.errors import IdentityError, NotConnectedError, Version
 from iris_session.client.identity import Identity
 from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
 from iris_session.client.outgoing import MAX_OUTGOING
+from iris_session.client.session_state import Missed
 from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -319,7 +320,21 @@ def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> N
     assert 4 <= asked <= 7
     wire.snapshot(now, event_seq=2)
     assert wire.connection.mirror.event_seq == 3
-    assert [e.event_seq for e in wire.connection.inbox if isinstance(e, Event)] == [1, 3]
+    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
+    assert told == [1, Missed(2, 2), 3]
+
+
+def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> None:
+    """The link took nothing for a while, and the snapshot is the first thing that came through."""
+    wire.join()
+    wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
+    wire.snapshot(2 * MS, event_seq=1)
+    assert not [m for m in wire.connection.inbox if isinstance(m, Missed)], "none is missed"
+    wire.snapshot(3 * MS, event_seq=7)
+    wire.get(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
+    assert wire.connection.mirror.gaps == 0
+    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
+    assert told == [1, Missed(2, 7), 8]
 
 
 def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
