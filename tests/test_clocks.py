@@ -23,6 +23,8 @@ ALLOWED = {
     "iris_session/keys/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
     "iris_session/transport/pairing_desk.py": "whether a join code is open, as join_codes.py says",
     "iris_session/cli/pair.py": "how long a join code is shown, as join_codes.py says",
+    "iris_session/client/asset_cache.py": "which files were used longest ago, as the file system stamps them",
+    "iris_session/scene/store.py": "which files were used longest ago, as the file system stamps them",
     "iris_session/runtime/config.py": "name of a default folder",
     "iris_session/runtime/processes.py": "when a recording was made, for people",
 }

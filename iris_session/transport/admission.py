@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from iris_session.keys import fingerprint
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
@@ -54,6 +56,8 @@ class Admission:
         self._keyring = keyring
         self._audit = audit
         self._doors = doors
+        #: Called when somebody is let in, before he is told: by then every channel must know him.
+        self.lets_in: list[Callable[[], None]] = []
         self._hellos = HelloShares(config.limits)
         self._knocks: dict[int, RateLimiter] = {}
 
@@ -200,6 +204,8 @@ class Admission:
         connection.admitted = True
         self._keyring.welcomed(connection.key_id)
         connection.participant_id = admitted.participant_id
+        for let_in in self.lets_in:
+            let_in()
         self._outbox.send(
             connection,
             Welcome(

@@ -50,15 +50,18 @@ class AssetDesk:
     def turn(self, now_ns: int) -> None:
         """Lets in who came and out who left, at once; gives the state its way."""
         self._give_way(now_ns)
+        self.look(keys=now_ns >= self._next_ns)
+        if now_ns >= self._next_ns:
+            self._next_ns = now_ns + LOOK_NS
+            self._count()
+
+    def look(self, *, keys: bool = False) -> None:
+        """Tells the thread who is there, and which scene. `keys`: also when only the allow-list may have changed."""
         if self._publisher.scene is not self._present:
             self._change(self._publisher.scene)
         listeners = {n: self._user_of(one) for n, one in self._clients.by_number.items() if one.admitted}
-        look = now_ns >= self._next_ns
-        if look or listeners != self._told.listeners or self._stores is not self._told.stores:
+        if keys or listeners != self._told.listeners or self._stores is not self._told.stores:
             self._tell(listeners)
-        if look:
-            self._next_ns = now_ns + LOOK_NS
-            self._count()
 
     def close(self) -> None:
         self._server.close()

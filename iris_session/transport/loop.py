@@ -146,6 +146,7 @@ class Front:
             self._open_state_again,
         )
         self._assets = self._make_assets()
+        admission.lets_in += [self._media.meet, self._assets.look]
         self._services += [self._pairing, revocation, self._audit, self._assets]
         self._downlink = Downlink(
             self._link,

@@ -79,22 +79,29 @@ class MediaDesk:
         self._facts: dict[str, StreamFacts] = {}
         self._names: dict[str, str] = {}  # of sources, by key
         self._next_ns = 0
+        self._met = False  # since the last turn
         proxy.start()
 
     def turn(self, now_ns: int) -> None:
         """Lets in who came and out who left, at once; looks at everybody now and then."""
         if self._proxy.asking:
             self._decide()
-        here = {number for number, one in self._clients.by_number.items() if one.admitted}
+        self.meet()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + LOOK_NS
-            self._look(here, now_ns)
-        elif here != set(self._told):
+            self._look(set(self._told), now_ns)
+        elif not self._met:
+            return
+        self._met = False
+        self._tell()
+
+    def meet(self) -> None:
+        """Lets the thread know who is there, before it hears of them."""
+        here = {number for number, one in self._clients.by_number.items() if one.admitted}
+        if here != set(self._told):
+            self._met = True
             self._take_over(here)
             self._publish()
-        else:
-            return
-        self._tell()
 
     def close(self) -> None:
         self._proxy.close()

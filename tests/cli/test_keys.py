@@ -105,8 +105,9 @@ def test_pair_shows_a_uri_that_holds_everything(lab: KeyHome, tmp_path: Path, ca
     assert pairing.normal_code(told["code"]) == address.join_code
     assert told["addresses"] == ["10.0.0.5:7731", "[fd00::5]:7731"]
     assert 60 < told["expires"] - time.time() <= 120
-    read, *_ = cv2.QRCodeDetector().detectAndDecode(cv2.imread(str(png)))
-    assert read == told["uri"], "a camera reads it"
+    picture = cv2.imread(str(png))  # of some random codes one of OpenCV's two finders sees no corners
+    readers = (cv2.QRCodeDetector(), cv2.QRCodeDetectorAruco())
+    assert told["uri"] in [reader.detectAndDecode(picture)[0] for reader in readers], "a camera reads it"
     (made,) = lab.codes.read()
     assert (made.name, made.roles) == ("tablet", ("operator", "observer", "agent", "leader"))
 

@@ -104,7 +104,7 @@ def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
         (["serve", "handover", "--assign", "ann=left,"], "NAME=ROBOT[,ROBOT]"),
         (["serve", "handover", "--assign", "ann=left", "--assignment", "nearest"], "--assignment config"),
         (["serve", "handover", "--assign", "ann=elbow", "--control-port", "0", "--state-port", "0"], "left"),
-        (["emulate", "--behaviour", "foo"], "giver, receiver, wander, idle, observer"),
+        (["emulate", "--behaviour", "foo"], "giver, receiver, folder, stower, wander, idle, observer"),
         (["emulate", "--behaviour", "giver"], "needs a partner"),
         (["emulate", "nowhere:port"], "HOST:PORT"),
         (["emulate", "--curve-key", "mine.key_secret"], "go together"),

@@ -21,6 +21,7 @@ from iris_session.protocol import entries as em
 from iris_session.protocol import names
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import HOST, Entry, EntryMessage, decode_entries, encode_entries
+from iris_session.protocol.scene_patch import SetVisual
 from iris_session.protocol.steps import Decision
 from iris_session.runtime.core import CoreConfig, SessionCore
 from tests.runtime.replay_stress import make_config
@@ -157,6 +158,8 @@ class Fuzz:
             return tuple(rng.choice(known if rng.random() < 0.9 else WORDS) for _ in range(rng.randrange(4)))
         if name == "targets":
             return self.targets()
+        if name == "ops":
+            return tuple(SetVisual(rng.randrange(50), group=rng.randrange(6)) for _ in range(rng.randrange(4)))
         if name in ("T_world_tracking", "T_tracking_anchor", "T_world_anchor", "pose"):
             return self.pose()
         if name == "anchors":
