@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
+from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, Vec3, compose
 from iris_session.client import Client, PoseBuffer, SceneState, Shown
@@ -16,7 +17,9 @@ class Display:
         self._client = client
         self.buffer = PoseBuffer(int(delay_s * 1e9))
         self.hands: dict[str, PoseTuple] = {}
-        self._vertices: dict[str, Sequence[Sequence[float]]] = {}
+        self._vertices: dict[str, NDArray[np.floating]] = {}
+        #: A behaviour has asked for a vertex: somebody must tell where they are.
+        self.wants_vertices = False
         self._epoch = 0
         self._shown: Shown | None = None
         self._now_ns = 0
@@ -26,9 +29,10 @@ class Display:
         if state.header.scene_epoch != self._epoch:
             self._epoch = state.header.scene_epoch
             self.buffer.clear()
+            self._vertices.clear()
         self.buffer.add(state.header.session_time, state.poses)
 
-    def take_vertices(self, deformable: str, p_world: Sequence[Sequence[float]]) -> None:
+    def take_vertices(self, deformable: str, p_world: NDArray[np.floating]) -> None:
         """New positions of all vertices of a deformable came [m], in the order of the model."""
         self._vertices[deformable] = p_world
 
@@ -59,11 +63,12 @@ class Display:
         return None if tip is None or body is None else compose(body, tip[1])
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
-        vertices = self._vertices.get(deformable, ())
-        if not 0 <= index < len(vertices):
+        self.wants_vertices = True
+        vertices = self._vertices.get(deformable)
+        if vertices is None or not 0 <= index < len(vertices):
             return None
-        x, y, z = vertices[index]
-        return (float(x), float(y), float(z))
+        x, y, z = vertices[index].tolist()
+        return (x, y, z)
 
     def lease_version(self, robot: str) -> int | None:
         return self._client.lease_version(robot)

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, compose, inverse, quat_from_yaw
 from iris_session.client import Client, SceneState
+from iris_session.client.deformables import Deformables
 from iris_session.emulator.behaviours import HandInput
 from iris_session.emulator.clutching import Clutch
 from iris_session.emulator.display import Display
@@ -68,6 +69,7 @@ class Person:
             on_event=self._on_event,
         )
         self.display = Display(self.client, spec.display_delay_s)
+        self._deformables = Deformables(self.client)
         #: What is on its way, and what was sampled and seen in the frame that is being taken: they travel together.
         self._uplink: DelayLine[tuple[tuple[Sample, ...], Observation | None]]
         self._uplink = DelayLine(spec.model.link, self.headset.rng)
@@ -111,6 +113,9 @@ class Person:
     def step(self, now_ns: int) -> None:
         """One round of the loop, after `client.poll`."""
         self._now_ns = now_ns
+        if self.display.wants_vertices:
+            for name in self._deformables.tend():
+                self.display.take_vertices(name, self._deformables.vertices[name])
         for samples, seen in self._uplink.pop(now_ns):
             sent = self.client.send_samples(samples) if len(samples) > 1 else self.client.send(samples[0])
             self.report.samples += len(samples) if sent else 0

@@ -64,12 +64,14 @@ class FlexMesh:
     """What is drawn of a flex: `elements`, edges (n, 2) of a rope, triangles (n, 3) of a cloth or of the surface of a
     soft body; `uv`, texture coordinates of each element's corners, where it has them.
 
-    `vertices`: rows of `flexvert_xpos`, without those inside of a solid. `topology`: the plan of the stream.
+    `vertices`: rows of `flexvert_xpos`, without those inside of a solid; `numbers`: theirs in the flex. `topology`: the
+    plan of the stream.
     """
 
     elements: NDArray[np.uint32]
     uv: NDArray[np.float32] | None
     vertices: NDArray[np.int64]
+    numbers: NDArray[np.int64]
     topology: DeformableTopology
 
     @property
@@ -87,6 +89,8 @@ class FlexMesh:
                 Stored("position", rest, ArrayFilter.SHUFFLE),
                 Stored("plan", np.frombuffer(self.topology.to_bytes(), np.uint8)),
             ]
+            if len(self.numbers) <= int(self.numbers.max()):  # the inside is left out
+                arrays.append(Stored("vertex", self.numbers.astype(np.uint32), ArrayFilter.DELTA))
             if self.uv is not None:
                 arrays.append(Stored("uv", self.uv, ArrayFilter.SHUFFLE))
             return encode_arrays(ArrayKind.DEFORMABLE, arrays)
@@ -110,6 +114,7 @@ def flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:
         np.ascontiguousarray(elements, np.uint32),
         _texture_coordinates(model, index, start, corners),
         int(model.flex_vertadr[index]) + used,
+        used,
         DeformableTopology(len(used), **ends).bare(),
     )
 

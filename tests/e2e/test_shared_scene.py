@@ -10,13 +10,11 @@ import pytest
 
 from iris_session.client import Client
 from iris_session.client.asset_cache import AssetCache
-from iris_session.protocol.names import MediaEncoding
+from iris_session.client.deformables import Deformables
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
-from iris_session.streams.deformable import DeformableDecoder
-from iris_session.streams.deformable_topology import DeformableTopology
 from tests.e2e.conftest import Server, Stage
 
 pytestmark = pytest.mark.e2e
@@ -69,21 +67,18 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
 
     (cloth,) = spec.deformables
     arrays = decode_arrays(ann.asset_cache.read(cloth.address), ArrayKind.DEFORMABLE)
-    decoder = DeformableDecoder(DeformableTopology.from_bytes(arrays["plan"].tobytes()))
-    feed = ann.media(cloth.stream)
-    seen: list[np.ndarray] = []
+    shapes = Deformables(ann)
 
     def falls() -> bool:
-        frame = feed.newest
-        if frame is not None:
-            assert frame.header.encoding == MediaEncoding.DEFORMABLE
-            seen.append(decoder.decode(frame.data))
-        return bool(seen) and seen[-1][:, 2].min() < 1.2
+        shapes.tend()
+        assert shapes.fault == ""
+        return "cloth" in shapes.vertices and shapes.vertices["cloth"][:, 2].min() < 1.2
 
     stage.run(falls, "the cloth hangs over the ball")
     assert arrays["position"][:, 2] == pytest.approx(1.5)
     edges = arrays["elements"][:, :2]
-    lengths = np.linalg.norm(seen[-1][edges[:, 0]] - seen[-1][edges[:, 1]], axis=1)
+    now = shapes.vertices["cloth"]
+    lengths = np.linalg.norm(now[edges[:, 0]] - now[edges[:, 1]], axis=1)
     assert lengths.max() < 0.2, "neighbours are still neighbours"
     assert stage.server.finish()["ok"]
 

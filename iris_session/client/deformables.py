@@ -1,0 +1,123 @@
+"""What bends in the session's scene, as a client sees it: the newest vertices of every deformable.
+
+shapes = Deformables(client)
+while True:
+    client.poll(0.01)
+    for name in shapes.tend():
+        print(name, shapes.vertices[name][0])  # p_world of vertex 0 [m]
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.client import Client
+from iris_session.client.errors import ClientError
+from iris_session.client.media import MediaFeed
+from iris_session.protocol.assets import is_address
+from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.scene import Deformable, decode_scene
+from iris_session.protocol.scene_names import ArrayKind
+from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.errors import AssetError
+from iris_session.streams.deformable import DeformableDecoder
+from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.streams.errors import StreamError
+
+#: Seconds are counted by who polls: a scene whose assets did not come is tried again after so many calls of `tend`.
+RETRY_CALLS: Final = 500
+
+
+class _Mesh:
+    """One deformable: its stream, and where its vertices stand in the numbering of the model."""
+
+    def __init__(self, spec: Deformable, asset: bytes, feed: MediaFeed) -> None:
+        arrays = decode_arrays(asset, ArrayKind.DEFORMABLE)
+        self.decoder = DeformableDecoder(DeformableTopology.from_bytes(arrays["plan"].tobytes()))
+        self.numbers = arrays.get("vertex")
+        self.name, self.feed = spec.name, feed
+        self.seq = -1
+
+    def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
+        """By number in the model; what is inside of a solid is not a number."""
+        if self.numbers is None:
+            return p_world
+        everywhere = np.full((int(self.numbers.max()) + 1, 3), np.nan, np.float32)
+        everywhere[self.numbers] = p_world
+        return everywhere
+
+
+class Deformables:
+    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model.
+
+    `scene_hash`: of the scene they are of. `fault`: why nothing can be seen of it, empty while all is well. Everything
+    happens in `tend`, which never waits.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self.scene_hash = ""
+        self.fault = ""
+        self.vertices: dict[str, NDArray[np.float32]] = {}
+        self._meshes: list[_Mesh] = []
+        self._parts: tuple[Deformable, ...] = ()
+        self._fetch: AssetFetch | None = None
+        self._retry_in = 0
+
+    def tend(self) -> list[str]:
+        """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
+        scene_hash = self._client.mirror.scene_hash
+        self._retry_in = max(0, self._retry_in - 1)
+        if self._client.ready and (scene_hash != self.scene_hash or (self.fault and not self._retry_in)):
+            self._begin(scene_hash)
+        if self._fetch is not None and self._fetch.done:
+            self._take(self._fetch)
+        return [mesh.name for mesh in self._meshes if self._show(mesh)]
+
+    def _begin(self, scene_hash: str) -> None:
+        self._drop()
+        self.scene_hash, self.fault, self._retry_in = scene_hash, "", RETRY_CALLS
+        if is_address(scene_hash):
+            self._fetch = self._client.fetch_assets([scene_hash])
+        else:
+            self.fault = "this session shares no specification of its scene"
+
+    def _drop(self) -> None:
+        for mesh in self._meshes:
+            self._client.drop_media(mesh.feed.stream)
+        self._meshes, self._parts, self._fetch = [], (), None
+        self.vertices.clear()
+
+    def _take(self, fetch: AssetFetch) -> None:
+        """The specification, then the meshes that it names."""
+        self._fetch = None
+        try:
+            fetch.check()
+            if not self._parts:
+                self._parts = decode_scene(fetch.read(self.scene_hash)).deformables
+                if self._parts:
+                    self._fetch = self._client.fetch_assets([part.address for part in self._parts])
+            else:
+                self._meshes = [
+                    _Mesh(part, fetch.read(part.address), self._client.media(part.stream)) for part in self._parts
+                ]
+        except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
+            self.fault = str(error)
+
+    def _show(self, mesh: _Mesh) -> bool:
+        frame = mesh.feed.newest
+        if frame is None or frame.header.seq == mesh.seq or frame.header.encoding != MediaEncoding.DEFORMABLE:
+            return False
+        mesh.seq = frame.header.seq
+        if frame.header.scene_epoch != self._client.mirror.scene_epoch:
+            return False
+        try:
+            self.vertices[mesh.name] = mesh.placed(mesh.decoder.decode(frame.data))
+        except StreamError as error:
+            self.fault = str(error)
+            return False
+        return True
