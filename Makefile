@@ -48,7 +48,7 @@ CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 JOBS ?= 2
 T ?= tests
 
-UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --cov --cov-report=
+UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov --cov-report=
 
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
 # These tests run real processes in real time: a machine that is taken away for a second can fail one. When the run was
@@ -61,24 +61,9 @@ if [ $$status -eq 1 ]; then \
 fi
 endef
 
-# Unit tests that start no session and wait for no clock, those that take long: `make test` runs them on what the
-# processes of the tests end to end leave of the machine, which wait for each other a third of the time. `IDLE` takes
-# nothing from who wants to run.
-PURE := $(wildcard $(addprefix tests/,anchors authority control physics protocol scene streams \
-  bench/test_alignment.py cli/test_anchors.py cli/test_anchors_solve.py \
-  $(addprefix emulator/test_,behaviours.py behaviours_parts.py demo_casts.py soft_demos.py) \
-  $(addprefix recording/test_,looks.py reader.py verify.py writer.py) \
-  $(addprefix runtime/test_,continuation.py core.py goals.py plays.py replay_stress.py) \
-  $(addprefix transport/test_,alignment_desk.py anchoring.py)))
-IDLE := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
-
 test: check
-	COVERAGE_FILE=.coverage-live $(UNIT) $(addprefix --ignore=,$(PURE)) tests
-	@mkdir -p build; echo "beside the next, told after it: $(UNIT) $(PURE)"; \
-	COVERAGE_FILE=.coverage-pure $(IDLE) $(UNIT) --dist worksteal -p no:cacheprovider --timeout=1800 $(PURE) >build/pure.log 2>&1 & \
-	pure=$$!; trap 'kill $$pure' INT TERM; \
-	$(E2E); wait $$pure; beside=$$?; cat build/pure.log; exit $$((status + beside))
-	$(BIN)/python -m coverage combine --quiet .coverage-live .coverage-pure
+	$(MAKE) --no-print-directory test-unit
+	$(MAKE) --no-print-directory test-e2e
 	$(MAKE) --no-print-directory coverage
 
 test-unit: install-dev
@@ -96,7 +81,7 @@ coverage: install-dev
 
 # Every benchmark runs, whatever the one before says; the status is that of the worst.
 bench: install
-	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment"; do \
+	@status=0; for bench in "state" "state --curve" "input" "slow-client" "alignment" "join" "deformable"; do \
 	  $(BIN)/iris-session bench $$bench --check || status=1; \
 	done; exit $$status
 

@@ -240,6 +240,8 @@ class Stage:
         return client
 
     def hand(self, client: Client, robot: str) -> Hand:
+        """Somebody's right hand, who sees the robot."""
+        self.run(lambda: client.tip_pose(robot) is not None, f"{client.name} sees {robot}")
         hand = Hand(client, robot)
         self.hands.append(hand)
         return hand

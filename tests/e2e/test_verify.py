@@ -152,13 +152,26 @@ def test_a_leader_robot_that_starts_apart_ramps_and_then_leads(serve: Callable[.
             if state is not None and tip is not None and (not tips or tips[-1][0] != state.header.tick):
                 tips.append((state.header.tick, tip))
 
+        closed_at = 0.0
+
+        def hold_on() -> None:
+            """Closes the clutch; again, as people do, when no sample counted while it was open."""
+            nonlocal closed_at
+            followed = client.state is not None and bool(client.state.header.applied)
+            if not followed and time.monotonic() > closed_at + 3.0:
+                leader.clutch = False
+                stage.seconds(0.3)
+                leader.clutch, closed_at = True, time.monotonic()
+
         def caught_up() -> bool:
             note()
+            if closed_at:
+                hold_on()
             return distance(tips[-1][1][0], leader.tip()[0]) < 0.01
 
         stage.seconds(0.2)
         assert not caught_up(), "it must start apart"
-        leader.clutch = True
+        hold_on()
         stage.run(caught_up, "the follower has caught up")
         leader.swing = 0.2
         until = time.monotonic() + 2.0
