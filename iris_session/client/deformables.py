@@ -25,10 +25,10 @@ from iris_session.protocol.scene_names import ArrayKind
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.errors import AssetError
 from iris_session.streams.deformable import DeformableDecoder
-from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.streams.deformable_topology import MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
 
-#: Seconds are counted by who polls: a scene whose assets did not come is tried again after so many calls of `tend`.
+#: A scene whose assets did not come is tried again after so many calls of `tend`: who polls has the clock.
 RETRY_CALLS: Final = 500
 
 
@@ -39,6 +39,8 @@ class _Mesh:
         arrays = decode_arrays(asset, ArrayKind.DEFORMABLE)
         self.decoder = DeformableDecoder(DeformableTopology.from_bytes(arrays["plan"].tobytes()))
         self.numbers = arrays.get("vertex")
+        if self.numbers is not None and (self.numbers.ndim != 1 or self.numbers.max(initial=0) >= MAX_VERTICES):
+            raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
         self.name, self.feed = spec.name, feed
         self.seq = -1
 

@@ -7,6 +7,7 @@ static in those frames. Exact float64 poses, raw samples and the journal lie bes
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,8 @@ class RrdWriter:
         try:
             self._rows(batch)
             self._keyframes(batch)
-            self._states(batch.states)
+            for _, states in groupby(batch.states, key=lambda state: len(state.poses)):
+                self._states(list(states))
             self._events(batch.events)
             self._denials(batch.denials)
             self._metrics(batch.metrics)
@@ -188,8 +190,7 @@ class RrdWriter:
     def _states(self, states: list[StateFrame]) -> None:
         if not states:
             return
-        n = len(self._bodies)
-        poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(n, 7) for s in states])
+        poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
         moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
         times = np.array(moments, np.int64).T
         columns = [
@@ -200,7 +201,8 @@ class RrdWriter:
         ]
         self._send(paths.STATE, _times(times), columns)
         self._note_latencies(states)
-        self._transforms(states, poses, times)
+        if poses.shape[1] == len(self._bodies):  # a new recorder gets what was on its way of the scene before, too
+            self._transforms(states, poses, times)
         self._clock = moments[-1][1:3]
 
     def _note_latencies(self, states: list[StateFrame]) -> None:

@@ -71,8 +71,8 @@ class SceneChanges:
             try:
                 scene = prepare(stepper.core, scenes, load_model_of(model), state, *known)
                 with scenes.lock:
-                    scenes.take(scene.shown)
                     stepper.change_scene(scene)
+                    scenes.take(scene.shown)
             except BaseException as error:  # of whoever asks for the result
                 done.set_exception(error)
             else:
@@ -99,10 +99,10 @@ class SceneChanges:
             assert isinstance(checked, ScenePatched)
             with scenes.lock:
                 shown = scenes.patch(checked.ops)
-                scenes.take(shown)
                 message = ScenePatched(checked.ops, shown.info.scene_hash)
                 stepper.change_scene(NextPatch(message, shown))
-        except (SceneError, OSError, msgspec.ValidationError) as error:
+                scenes.take(shown)
+        except (SceneError, OSError, RuntimeError, msgspec.ValidationError) as error:
             raise ConfigError(f"patch_scene: {error}") from error
 
     @property

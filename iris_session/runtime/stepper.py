@@ -38,6 +38,8 @@ from iris_session.runtime.status import SessionLedger
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
 MAX_HOST_ENTRIES: Final = 256
+#: Scenes and patches that wait; a step takes one.
+MAX_SCENES: Final = 64
 
 
 class FrontPort(Protocol):
@@ -170,7 +172,9 @@ class Stepper:
 
     def change_scene(self, scene: NextScene | NextPatch) -> None:
         """Another scene, or another look of it, from the next step on. From any thread; of several that wait each gets
-        a step of its own."""
+        a step of its own. Raises `RuntimeError` when too many do."""
+        if len(self._scenes) >= MAX_SCENES:
+            raise RuntimeError(f"more than {MAX_SCENES} changes of the scene wait: is the loop running?")
         self._scenes.append(scene)
 
     def step(self, n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> StepOutcome:

@@ -204,6 +204,22 @@ def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp
             recording.model("feed" * 8)
 
 
+def test_states_of_the_scene_before_may_come_after_another_scene(tmp_path: Path) -> None:
+    """A new recorder is told the newest scene first, then everything that was not yet in the file."""
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.header(header)
+    cup, _ = other_scene(8)
+    before, after = np.zeros((len(header.bodies), 7)), np.zeros((1, 7))
+    writer.add(Batch(scenes=[cup]))
+    writer.add(Batch(states=[frame(0, before), frame(8, before)]))
+    writer.add(Batch(states=[frame(16, after)]))
+    writer.close()
+    with Recording.open(path, warn=False) as recording:
+        assert [len(state.poses) for state in recording.states()] == [len(before), len(before), 1]
+
+
 def test_a_model_that_was_changed_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")

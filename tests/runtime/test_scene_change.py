@@ -18,6 +18,7 @@ from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.scene_change import prepare
 from iris_session.runtime.shared_scene import SharedScenes
+from iris_session.runtime.stepper import MAX_SCENES
 from tests.runtime.play import TICK_NS, entries, host, make_core
 from tests.runtime.test_stepper import Rig
 
@@ -124,6 +125,15 @@ def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
     assert rig.stepper.ledger.mirror.synced
     assert set(rig.stepper.ledger.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
     assert rig.front.n_bodies == len(scene.plant.world.bodies)
+
+
+def test_changes_that_nobody_takes_are_refused() -> None:
+    rig = Rig()
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
+    for _ in range(MAX_SCENES):
+        rig.stepper.change_scene(scene)
+    with pytest.raises(RuntimeError, match="is the loop running"):
+        rig.stepper.change_scene(scene)
 
 
 def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:

@@ -25,6 +25,7 @@ from iris_session.transport.asset_files import AssetFiles
 from iris_session.transport.asset_server import NICER, AssetServer, AssetSockets, Table, open_below
 from iris_session.transport.media_doors import MediaDoors
 from iris_session.transport.sockets import bound_port
+from tests.e2e.conftest import unavailable
 from tests.transport.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.transport.harness import FrontSession, RawClient
 from tests.transport.lab import Lab, Open
@@ -304,7 +305,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
     if ours + NICER > 19:
-        pytest.skip("these tests run at the lowest priority already")
+        unavailable("these tests run at the lowest priority already")
     found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
     assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
     python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
