@@ -28,7 +28,45 @@ from iris_session.runtime.stepper import NextPatch, NextScene, Stepper
 from iris_session.runtime.user_loop import UserLoop
 
 
-class SceneChanges:
+class ScenePatches:
+    """Part of every session: its scene as it is drawn."""
+
+    _stepper: Stepper | None
+
+    def patch_scene(self, *ops: PatchOp) -> None:
+        """Changes how the scene is drawn, for everybody: colours, visibility, poses of visuals, decoration. Physics
+        does not know of it. `session.scene` is the specification that `ops` refer to.
+
+        Raises `ConfigError` for what does not fit (nothing is changed then), `OwnershipError` before the session is
+        driven. From any thread.
+        """
+        stepper = self._stepper
+        if stepper is None:
+            raise OwnershipError("patch_scene needs a session that runs: call it while run() is under way")
+        scenes = self._live().scenes
+        try:
+            # What is journaled is what is used, and it is what clients can read.
+            checked = decode_entry(encode_entry(Entry(HOST, HOST, 0, ScenePatched(ops, "")))).message
+            assert isinstance(checked, ScenePatched)
+            with scenes.lock:
+                shown = scenes.patch(checked.ops)
+                message = ScenePatched(checked.ops, shown.info.scene_hash)
+                stepper.change_scene(NextPatch(message, shown))
+                scenes.take(shown)
+        except (SceneError, OSError, RuntimeError, msgspec.ValidationError) as error:
+            raise ConfigError(f"patch_scene: {error}") from error
+
+    @property
+    def scene(self) -> SceneSpec | None:
+        """What clients draw, with all patches that were asked for; None when the session shares no specification."""
+        newest = self._live().scenes.newest
+        return None if newest is None else newest.spec
+
+    @abstractmethod
+    def _live(self) -> SessionProcesses: ...
+
+
+class SceneChanges(ScenePatches):
     """Part of `Session`."""
 
     model: mujoco.MjModel
@@ -36,7 +74,6 @@ class SceneChanges:
     robots: tuple[RobotSpec, ...]
     objects: tuple[ObjectSpec, ...]
     config: SessionConfig
-    _stepper: Stepper | None
     _user_loop: UserLoop | None
 
     def load_scene(
@@ -81,38 +118,6 @@ class SceneChanges:
         done.set_running_or_notify_cancel()
         threading.Thread(target=work, name="iris-scene", daemon=True).start()
         return done
-
-    def patch_scene(self, *ops: PatchOp) -> None:
-        """Changes how the scene is drawn, for everybody: colours, visibility, poses of visuals, decoration. Physics
-        does not know of it. `session.scene` is the specification that `ops` refer to.
-
-        Raises `ConfigError` for what does not fit (nothing is changed then), `OwnershipError` before the session is
-        driven. From any thread.
-        """
-        stepper = self._stepper
-        if stepper is None:
-            raise OwnershipError("patch_scene needs a session that runs: call it while run() is under way")
-        scenes = self._live().scenes
-        try:
-            # What is journaled is what is used, and it is what clients can read.
-            checked = decode_entry(encode_entry(Entry(HOST, HOST, 0, ScenePatched(ops, "")))).message
-            assert isinstance(checked, ScenePatched)
-            with scenes.lock:
-                shown = scenes.patch(checked.ops)
-                message = ScenePatched(checked.ops, shown.info.scene_hash)
-                stepper.change_scene(NextPatch(message, shown))
-                scenes.take(shown)
-        except (SceneError, OSError, RuntimeError, msgspec.ValidationError) as error:
-            raise ConfigError(f"patch_scene: {error}") from error
-
-    @property
-    def scene(self) -> SceneSpec | None:
-        """What clients draw, with all patches that were asked for; None when the session shares no specification."""
-        newest = self._live().scenes.newest
-        return None if newest is None else newest.spec
-
-    @abstractmethod
-    def _live(self) -> SessionProcesses: ...
 
     def _take_scene(self, scene: NextScene | NextPatch) -> None:
         if isinstance(scene, NextPatch):

@@ -20,31 +20,28 @@ from __future__ import annotations
 import atexit
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 import mujoco
 
 from iris_session.physics import Pacer, PacerStats
-from iris_session.protocol.client_messages import Assign, ClearEStop, Control, EStop, Marker, SetScale
+from iris_session.protocol.client_messages import Assign, Control, SetScale
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
-from iris_session.protocol.server_messages import Event
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import blas
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import begin
 from iris_session.runtime.core import SessionCore, core_of
 from iris_session.runtime.errors import OwnershipError
+from iris_session.runtime.owner import Owner
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.publishing import Publishing
 from iris_session.runtime.scene_change import SceneChanges
-from iris_session.runtime.scheduling import quiet_collector, stop_signals, tick_priority
-from iris_session.runtime.status import SessionStatus, make_status
+from iris_session.runtime.scheduling import quiet_collector, tick_priority
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
 from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
@@ -55,7 +52,7 @@ PAUSED_STEP_S: Final = 0.01
 PAUSED_STEP_TICKS: Final = 10
 
 
-class Session(Publishing, SceneChanges):
+class Session(Owner, SceneChanges):
     """A shared session over one MuJoCo model.
 
     `model`: an `MjModel`, or the path of an MJCF or MJB file. `data`: the state to begin with (None: keyframe `home`,
@@ -93,15 +90,6 @@ class Session(Publishing, SceneChanges):
         self.recording_fault = ""
 
     # --- life --------------------------------------------------------------------------------------------------------
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
-    ) -> None:
-        self.close()
 
     def start(self) -> None:
         """Opens the sockets and the recording. Called by `with`. Participants can connect from here on.
@@ -199,21 +187,6 @@ class Session(Publishing, SceneChanges):
         self._asked_ticks -= n_ticks
         stepper.step(n_ticks)
 
-    def stop(self) -> None:
-        """Ends `run()` after the step in progress. May be called from another thread or a signal handler."""
-        self._stop.set()
-
-    @property
-    def stopping(self) -> bool:
-        """True from `stop()`, Ctrl-C, SIGTERM or `close()` on."""
-        return self._stop.is_set()
-
-    @contextmanager
-    def signals(self) -> Iterator[None]:
-        """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
-        with stop_signals(self._stop):
-            yield
-
     # --- the user's loop ---------------------------------------------------------------------------------------------
 
     def begin_tick(self) -> None:
@@ -298,13 +271,6 @@ class Session(Publishing, SceneChanges):
         else:
             self.post(Control(request_id=0, action="reset"))
 
-    def estop(self, reason: str = "") -> None:
-        """Stops every robot, latched. Not a safety-rated stop."""
-        self.post(EStop(reason=reason))
-
-    def clear_estop(self) -> None:
-        self.post(ClearEStop(request_id=0))
-
     def assign(self, robots: Sequence[str], participant: str = "") -> None:
         """Gives robots to a participant, or frees them, whoever holds them."""
         self.post(Assign(request_id=0, robots=tuple(robots), participant=participant))
@@ -313,60 +279,16 @@ class Session(Publishing, SceneChanges):
         """How far `robot` moves as its holder's hand moves: 1 as far, 0.1 a tenth. Ends with that holder."""
         self.post(SetScale(request_id=0, robots=(robot,), scale=scale))
 
-    def marker(self, text: str) -> None:
-        """A note in the recording."""
-        self.post(Marker(request_id=0, text=text))
-
-    def status(self) -> SessionStatus:
-        """Who is here, who holds what, how late ticks are, what was dropped."""
-        with self._unchanging():
-            return make_status(self._stepper, self._pacer, self._processes, self._scheduling)
-
-    def recent_events(self) -> list[Event]:
-        """The newest events, oldest first (at most 200; the recording has them all)."""
-        with self._unchanging():
-            return [] if self._stepper is None else list(self._stepper.ledger.recent)
-
     @property
     def stepper(self) -> Stepper:
         """The machinery behind this session, for benchmarks and tests; not part of the public API."""
         return self._make_stepper(user_owned=self._user_loop is not None)
 
-    @property
-    def processes(self) -> SessionProcesses:
-        """Front and recorder, for benchmarks and tests; not part of the public API."""
-        return self._live()
-
     def lateness(self, *, anew: bool = False) -> PacerStats | None:
         """Accounting of ticks of the newest `run()`, None before it. `anew`: its percentiles begin again from here."""
         return None if self._pacer is None else self._pacer.stats(self.clock(), anew=anew)
 
-    @property
-    def address(self) -> str:
-        """`host:port` of the control channel, which is all that a client needs."""
-        return self._live().address
-
-    @property
-    def name(self) -> str:
-        """As the session is known: `config.name`, with a number when another session on the network has that name."""
-        return self.config.name if self._processes is None else self._processes.name
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What people should know about how the session started: another name, other addresses; one line each."""
-        return () if self._processes is None else tuple(self._processes.notes)
-
-    @property
-    def recording(self) -> Path | None:
-        """Path of the recording, None when nothing is recorded."""
-        return None if self._processes is None else self._processes.recording
-
     # --- inside ------------------------------------------------------------------------------------------------------
-
-    def _live(self) -> SessionProcesses:
-        if self._processes is None:
-            raise OwnershipError("the session is not started: use `with Session(...) as session`, or session.start()")
-        return self._processes
 
     def _make_stepper(self, *, user_owned: bool) -> Stepper:
         if self._stepper is not None:
