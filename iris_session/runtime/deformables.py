@@ -1,4 +1,4 @@
-"""What bends in the present world, as media streams: the vertices of every flex, after every published state.
+"""What bends in a session, as media streams: the vertices of every mesh, after every published state.
 
 A mesh at rest is sent once a second, for those who came meanwhile. Encoding 10,000 vertices takes the loop that takes
 the ticks about a millisecond.
@@ -6,40 +6,51 @@ the ticks about a millisecond.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.physics import World
 from iris_session.protocol.names import MediaEncoding
-from iris_session.scene.mujoco_deformables import FlexMesh, flex_mesh, stream_name
+from iris_session.scene.mujoco_deformables import flex_mesh, stream_name
 from iris_session.streams.deformable import DeformableEncoder
+from iris_session.streams.deformable_topology import DeformableTopology
 
 #: Farthest that a delivered vertex is from where it was [m].
 BOUND_M: Final = 0.0005
+#: Of a mesh at rest.
+REPEAT_NS: Final = 1_000_000_000
 #: `publish(stream, frames, capture_ns, scene_epoch, encoding)`; false: the frame is dropped, and counted there.
 Publish = Callable[[str, dict[str, bytes], int, int, str], bool]
 
 
-class _Stream(NamedTuple):
-    name: str
-    mesh: FlexMesh
-    encoder: DeformableEncoder
+class Bending(NamedTuple):
+    """A mesh whose vertices move. `vertices` gives those of now, (n, 3) [m], world frame."""
+
+    stream: str
+    topology: DeformableTopology
+    vertices: Callable[[], NDArray[np.floating]]
+
+
+class _Stream:
+    def __init__(self, mesh: Bending) -> None:
+        self.mesh = mesh
+        self.encoder = DeformableEncoder(mesh.topology, BOUND_M)
+        self.sent_ns = 0
 
 
 class DeformableStreams:
-    """The flexes of one world at a time. `publish` hands a frame to the front."""
+    """What bends in one scene at a time. `publish` hands a frame to the front."""
 
-    def __init__(self, world: World, publish: Publish) -> None:
+    def __init__(self, meshes: Sequence[Bending], publish: Publish) -> None:
         self._publish = publish
-        self.use(world)
+        self.use(meshes)
 
-    def use(self, world: World) -> None:
-        """Another world from now on."""
-        self._world = world
-        meshes = [flex_mesh(world.model, index) for index in range(world.model.nflex)]
-        self._streams = [
-            _Stream(stream_name(i), mesh, DeformableEncoder(mesh.topology, BOUND_M)) for i, mesh in enumerate(meshes)
-        ]
+    def use(self, meshes: Sequence[Bending]) -> None:
+        """Those of another scene from now on."""
+        self._streams = [_Stream(mesh) for mesh in meshes]
         self._epoch = -1
 
     def send(self, scene_epoch: int, end_ns: int) -> None:
@@ -49,8 +60,21 @@ class DeformableStreams:
             for stream in self._streams:
                 stream.encoder.reset()
         for stream in self._streams:
-            frames = stream.encoder.encode(self._world.data.flexvert_xpos[stream.mesh.vertices])
-            if frames is not None and not self._publish(
-                stream.name, frames, end_ns, scene_epoch, MediaEncoding.DEFORMABLE
-            ):
+            if end_ns - stream.sent_ns >= REPEAT_NS:  # whatever the rate of the state is
+                stream.encoder.reset()
+            frames = stream.encoder.encode(stream.mesh.vertices())
+            if frames is None:
+                continue
+            stream.sent_ns = end_ns
+            if not self._publish(stream.mesh.stream, frames, end_ns, scene_epoch, MediaEncoding.DEFORMABLE):
                 stream.encoder.reset()  # nobody got it: the next one is sent whatever it is
+
+
+def flexes(world: World) -> list[Bending]:
+    """The flexes of a world."""
+    meshes = [flex_mesh(world.model, index) for index in range(world.model.nflex)]
+    return [Bending(stream_name(index), mesh.topology, _of(world, mesh.vertices)) for index, mesh in enumerate(meshes)]
+
+
+def _of(world: World, rows: NDArray[np.int64]) -> Callable[[], NDArray[np.floating]]:
+    return lambda: world.data.flexvert_xpos[rows]

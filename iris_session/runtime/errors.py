@@ -4,7 +4,8 @@ SessionError
 ├── ConfigError          a value in the configuration cannot be used
 ├── StartError           a process of the session did not come up (port in use, unwritable folder)
 ├── ResumeError          a recording that the session cannot go on from
-└── OwnershipError       the call does not fit the way this session is driven
+├── OwnershipError       the call does not fit the way this session is driven
+└── PublishError         what a publisher was given cannot be shown
 """
 
 from __future__ import annotations
@@ -28,3 +29,7 @@ class ResumeError(SessionError):
 
 class OwnershipError(SessionError):
     """The call does not fit the way this session is driven."""
+
+
+class PublishError(SessionError):
+    """What a publisher was given cannot be shown; nothing has changed."""

@@ -13,7 +13,7 @@ import logging
 import math
 import secrets
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -35,7 +35,7 @@ from iris_session.recording.versions import boot_id, environment
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.continuation import Continuation, wait_until_free
 from iris_session.runtime.core import SessionCore
-from iris_session.runtime.deformables import DeformableStreams
+from iris_session.runtime.deformables import Bending, DeformableStreams, flexes
 from iris_session.runtime.errors import StartError
 from iris_session.runtime.neighbours import Neighbours
 from iris_session.runtime.report import Reporter
@@ -43,6 +43,7 @@ from iris_session.runtime.resume_note import Listening, NoteKeeper, ResumeNote, 
 from iris_session.runtime.shared_scene import SharedScenes
 from iris_session.runtime.stepper import NextPatch, NextScene, ResumedFrom, Stepper
 from iris_session.runtime.supervision import Backoff, RecorderSupervisor, replaced
+from iris_session.scene.composed import ComposedScene
 from iris_session.transport import FrontConfig, FrontError, FrontProcess, addresses_of
 from iris_session.transport.sockets import host_in_address
 
@@ -62,8 +63,18 @@ ENDING_S: Final = 0.2
 _log = logging.getLogger(__name__)
 
 
+class Composed(NamedTuple):
+    """A scene whose world is not MuJoCo's: what clients draw, and what bends in it."""
+
+    scene: ComposedScene
+    bending: tuple[Bending, ...]
+
+
 class SessionProcesses:
-    """Front and recorder of one session. `start` raises `StartError` with one line."""
+    """Front and recorder of one session. `start` raises `StartError` with one line.
+
+    `composed`: the scene of `core`, where it cannot be read off its model.
+    """
 
     def __init__(
         self,
@@ -71,6 +82,7 @@ class SessionProcesses:
         core: SessionCore,
         origin_ns: int,
         past: Continuation | None = None,
+        composed: Composed | None = None,
     ) -> None:
         self._config = config
         self._origin_ns = origin_ns
@@ -83,7 +95,8 @@ class SessionProcesses:
         self._in_use: RecordingLock | None = None
         self._keeper: NoteKeeper | None = None
         self._core, self._tick_period_ns = core, core.world.tick_period_ns
-        self.scenes = SharedScenes(config.assets, config.name)
+        self._bending = None if composed is None else composed.bending
+        self.scenes = SharedScenes(config.assets, config.name, None if composed is None else composed.scene)
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None
@@ -206,7 +219,8 @@ class SessionProcesses:
         front, feed = self.front.link, self.feed
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.on_scene.append(self._scene_changed)
-        self._deformables = DeformableStreams(core.world, self.front.publish_media)
+        bending = flexes(core.world) if self._bending is None else self._bending
+        self._deformables = DeformableStreams(bending, self.front.publish_media)
         stepper.beside_state.append(self._deformables.send)
         return stepper
 
@@ -214,7 +228,7 @@ class SessionProcesses:
         if self.front is not None:
             self.front.set_scene(scene.shown.info)
         if self._deformables is not None and isinstance(scene, NextScene):
-            self._deformables.use(scene.plant.world)
+            self._deformables.use(flexes(scene.plant.world))
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(

@@ -17,6 +17,7 @@ from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, encode_scene
 from iris_session.protocol.scene_patch import MAX_OPS, MAX_PATCHES, PatchOp, merged, patched
 from iris_session.scene import AssetStore, Hold, SceneBuildError
+from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.transport import SceneInfo
 
@@ -34,14 +35,15 @@ class SharedScenes:
 
     `where`: True for the store of this user, a folder for another one, False for none: clients then get bodies and
     poses, nothing to draw them with. `lock`: held while a scene or patch takes its place in the order of both, which is
-    short; `newest`: the last one that did.
+    short; `newest`: the last one that did. `composed`: the scene of every world, which then is not read off its model.
     """
 
-    def __init__(self, where: bool | str | Path, name: str) -> None:
+    def __init__(self, where: bool | str | Path, name: str, composed: ComposedScene | None = None) -> None:
         self.notes: list[str] = []
         self.lock = threading.RLock()
         self.newest: Shown | None = None
         self._name = name
+        self._composed = composed
         self._holds: list[Hold] = []
         self._store: AssetStore | None = None
         if where is not False:
@@ -61,7 +63,9 @@ class SharedScenes:
         if store is None:
             return Shown(plain)
         try:
-            parsed = parse_mujoco(world.model, store, data=world.initial_data(initial_state), name=self._name)
+            parsed = self._composed or parse_mujoco(
+                world.model, store, data=world.initial_data(initial_state), name=self._name
+            )
             shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
             self._without(str(error))

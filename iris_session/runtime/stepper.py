@@ -256,6 +256,11 @@ class Stepper:
             return
         # Aims at a fixed rate; after a long gap it starts over instead of sending a burst.
         self._next_state_ns = max(self._next_state_ns + self._state_period_ns, end_ns)
+        self.publish_now(end_ns)
+
+    def publish_now(self, end_ns: int) -> None:
+        """Sends the rigid state, for somebody who keeps the rate himself. A step must have been taken."""
+        assert self.last is not None
         decision, world = self.last.decision, self.core.world
         world.poses(self._poses)
         applied = tuple(s.applied for s in self.last.status if s.applied is not None)

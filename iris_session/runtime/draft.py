@@ -1,0 +1,169 @@
+"""What a publisher has set so far: poses, joints and vertices, checked when they are set, taken together as one frame.
+
+Whatever is wrong is said to whoever sets it, as `PublishError`, and changes nothing. From any thread.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anchors.pose import compose
+from iris_session.protocol.common import Pose
+from iris_session.runtime.errors import PublishError
+from iris_session.scene import SceneBuildError
+from iris_session.scene.composed import ComposedScene
+
+#: Farthest coordinate [m]. What is beyond is a mistake of units, and exact to less than the stream's bound.
+FARTHEST_M: Final = 1e6
+#: How far a quaternion may be from unit length to be taken for a rounded one, which is normalised.
+UNIT: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of the world. `capture_ns`: in session time; `poses`: (n, 7) `x y z qw qx qy qz`; `vertices`: by name
+    of the deformable. `anew`: what was before has nothing to do with it."""
+
+    capture_ns: int
+    time_s: float
+    poses: NDArray[np.float64]
+    vertices: Mapping[str, NDArray[np.float32]]
+    anew: bool = False
+
+
+class SceneDraft:
+    """The moving things of a composed scene, as they will be published next."""
+
+    def __init__(self, scene: ComposedScene) -> None:
+        self._lock = threading.Lock()
+        self._scene = scene
+        self._rows = {name: row for row, name in enumerate(scene.moving)}
+        self._poses = np.array([(*pose.p, *pose.q) for pose in scene.poses]).reshape(-1, 7)
+        self._roots = {name: one.T_world_root for name, one in scene.articulations.items()}
+        self._joints: dict[str, dict[str, float]] = {name: {} for name in scene.articulations}
+        self._vertices = {name: one.vertices for name, one in scene.deformables.items()}
+
+    def frame(self, capture_ns: int, time_s: float, anew: bool) -> Frame:
+        """Everything as it is set now."""
+        with self._lock:
+            return Frame(capture_ns, time_s, self._poses.copy(), dict(self._vertices), anew)
+
+    def set_pose(self, name: str, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        pose = Pose(_position(position, name), _unit(quaternion, name))
+        with self._lock:
+            if name in self._roots:
+                self._roots[name] = pose
+                self._place(name)
+            else:
+                self._poses[self._row(name)] = (*pose.p, *pose.q)
+
+    def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
+        p = _finite(positions, (len(names), 3), "positions")
+        q = _finite(quaternions, (len(names), 4), "quaternions")
+        lengths = np.sqrt(np.einsum("ij,ij->i", q, q))
+        if len(names) and (np.abs(p).max() > FARTHEST_M or np.abs(lengths - 1.0).max() > UNIT):
+            for row, name in enumerate(names):  # one of them is wrong, and this says which
+                _position(p[row].tolist(), name)
+                _unit(q[row].tolist(), name)
+        with self._lock:
+            rows = [self._row(name) for name in names]
+            self._poses[rows, :3] = p
+            self._poses[rows, 3:] = q / lengths[:, None]
+
+    def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
+        articulation = self._scene.articulations.get(name)
+        if articulation is None:
+            raise PublishError(f"{name!r} has no joints in this scene; {_nearest(name, self._roots, 'articulations')}")
+        try:
+            given = {joint: float(position) for joint, position in positions.items()}
+            articulation.check(given)
+        except (SceneBuildError, TypeError, ValueError, AttributeError) as error:
+            raise PublishError(f"set_joints({name!r}): {error}") from error
+        with self._lock:
+            self._joints[name].update(given)
+            self._place(name)
+
+    def set_vertices(self, name: str, vertices: ArrayLike) -> None:
+        before = self._vertices.get(name)
+        if before is None:
+            near = _nearest(name, self._vertices, "deformables")
+            raise PublishError(f"{name!r} is no deformable of this scene; {near}")
+        taken = _finite(vertices, before.shape, f"vertices of {name!r}").astype(np.float32)
+        if np.abs(taken).max(initial=0.0) > FARTHEST_M:
+            raise PublishError(f"vertices of {name!r} are more than 1,000 km away: metres are expected")
+        taken.flags.writeable = False
+        with self._lock:
+            self._vertices[name] = taken
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _row(self, name: str) -> int:
+        row = self._rows.get(name)
+        if row is None:
+            if name in self._vertices:
+                raise PublishError(f"{name!r} bends, it has no pose: use set_vertices")
+            if name in self._roots:
+                raise PublishError(f"{name!r} is an articulation: move its root with set_pose")
+            known = (*self._rows, *self._roots)
+            raise PublishError(f"nothing that moves is called {name!r} in this scene; {_nearest(name, known, 'names')}")
+        return row
+
+    def _place(self, name: str) -> None:
+        root = self._roots[name]
+        for body, pose in self._scene.articulations[name].poses(self._joints[name]).items():
+            p, q = compose((root.p, root.q), (pose.p, pose.q))
+            self._poses[self._rows[body]] = (*p, *q)
+
+
+def _position(given: Sequence[float], name: str) -> tuple[float, float, float]:
+    x, y, z = _numbers(given, 3, f"position of {name!r}")
+    if not (abs(x) <= FARTHEST_M and abs(y) <= FARTHEST_M and abs(z) <= FARTHEST_M):
+        raise PublishError(f"position of {name!r} is ({x:g}, {y:g}, {z:g}): within 1,000 km, in metres, is expected")
+    return x, y, z
+
+
+def _unit(given: Sequence[float], name: str) -> tuple[float, float, float, float]:
+    w, x, y, z = _numbers(given, 4, f"quaternion of {name!r}")
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not abs(length - 1.0) <= UNIT:
+        raise PublishError(f"quaternion of {name!r} has length {length:g}: a unit one (w, x, y, z) is expected")
+    return w / length, x / length, y / length, z / length
+
+
+def _numbers(given: Sequence[float], n: int, what: str) -> list[float]:
+    try:
+        numbers = [float(number) for number in given]
+    except (TypeError, ValueError) as error:
+        raise PublishError(f"{what} is {given!r}: {n} numbers are expected") from error
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise PublishError(f"{what} is {given!r}: {n} finite numbers are expected")
+    return numbers
+
+
+def _finite(given: ArrayLike, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PublishError(f"{what}: an array of shape {shape} is expected ({error})") from error
+    if array.shape != shape:
+        raise PublishError(f"{what} have shape {array.shape}: {shape} is expected")
+    if not np.isfinite(array).all():
+        raise PublishError(f"{what} hold numbers that are not finite")
+    return array
+
+
+def _nearest(name: object, known: Iterable[str], what: str) -> str:
+    names = sorted(known)
+    near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4)
+    if near:
+        return f"nearest: {', '.join(map(repr, near))}"
+    listed = ", ".join(map(repr, names[:8])) + (", ..." if len(names) > 8 else "")
+    return f"{what}: {listed or 'none'}"
