@@ -9,7 +9,7 @@ frame right-handed, Z up; metres, radians where nothing else is said; colours ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 import msgspec
 
@@ -18,6 +18,7 @@ from iris_session.protocol.decoding import Bytes, decoder
 from iris_session.protocol.scene_looks import (
     Address,
     HeightField,
+    Int32,
     Material,
     Mesh,
     Ref,
@@ -71,7 +72,7 @@ class Visual(msgspec.Struct, frozen=True):
     body: Count
     name: Text
     T_body_visual: Pose
-    group: int
+    group: Int32
     geometry: Geometry
     material: Ref
     rgba: Rgba
@@ -120,7 +121,7 @@ class Camera(msgspec.Struct, frozen=True):
     orthographic: bool = False
     focal: Vec2 = (0.0, 0.0)
     principal: Vec2 = (0.0, 0.0)
-    resolution: tuple[int, int] = (1, 1)
+    resolution: tuple[Int32, Int32] = (1, 1)
     follow: Name = Follow.FIXED
     target: Ref = -1
 
@@ -132,7 +133,7 @@ class Site(msgspec.Struct, frozen=True):
     body: Count
     name: Text
     T_body_site: Pose
-    group: int
+    group: Int32
     geometry: Geometry
     material: Ref
     rgba: Rgba
@@ -142,7 +143,7 @@ class Tendon(msgspec.Struct, frozen=True):
     """A cable, drawn on request as straight pieces of radius `width` [m] through `sites`, ids; wrapping is left out."""
 
     name: Text
-    group: int
+    group: Int32
     width: float
     sites: tuple[Count, ...]
     material: Ref
@@ -159,7 +160,7 @@ class Deformable(msgspec.Struct, frozen=True):
 
     name: Text
     dim: Count
-    group: int
+    group: Int32
     vertices: Count
     elements: Count
     radius: float
@@ -232,12 +233,19 @@ class SceneSpec(msgspec.Struct, frozen=True):
     tendons: tuple[Tendon, ...] = ()
     deformables: tuple[Deformable, ...] = ()
     environment: Environment = Environment()
-    groups_shown: tuple[int, ...] = (0, 1, 2)
+    groups_shown: Annotated[tuple[Int32, ...], msgspec.Meta(max_length=256)] = (0, 1, 2)
     totals: Totals = Totals()
 
 
 class SceneError(ValueError):
     """The bytes are no scene specification that this package reads; the text says why."""
+
+
+class Identified(Protocol):
+    """What is told apart by its number."""
+
+    @property
+    def id(self) -> int: ...
 
 
 class Placed(Protocol):
@@ -291,19 +299,21 @@ def asset_addresses(spec: SceneSpec) -> dict[str, int]:
 
 def check_scene(spec: SceneSpec) -> None:
     """Raises `SceneError` unless every reference has its target, and no id occurs twice."""
-    bodies = {body.id for body in spec.bodies}
-    if len(bodies) != len(spec.bodies):
-        raise SceneError("two bodies have the same id")
+    bodies, sites = _ids("bodies", spec.bodies), _ids("sites", spec.sites)
+    _ids("visuals", spec.visuals)
     before = {-1}
     for body in spec.bodies:
         if body.parent not in before:  # so there is no cycle either
             raise SceneError(f"body {body.id} has the parent {body.parent}, which is not listed before it")
         before.add(body.id)
-    sites = {site.id for site in spec.sites}
     _on_bodies("visual", spec.visuals, bodies)
     _on_bodies("site", spec.sites, bodies)
     _on_bodies("light", spec.lights, bodies)
     _on_bodies("camera", spec.cameras, bodies)
+    watchers: tuple[Light | Camera, ...] = (*spec.lights, *spec.cameras)
+    for watcher in watchers:
+        if watcher.target not in bodies and watcher.target != -1:
+            raise SceneError(f"{watcher.name!r} looks at body {watcher.target}: no such body")
     for geometry in (*(visual.geometry for visual in spec.visuals), *(site.geometry for site in spec.sites)):
         _refer("mesh", geometry.mesh, len(spec.meshes))
         _refer("height field", geometry.hfield, len(spec.hfields))
@@ -321,6 +331,13 @@ def check_scene(spec: SceneSpec) -> None:
             raise SceneError(f"tendon {tendon.name!r} runs through a site that is not there")
     if not (all(mesh.levels for mesh in spec.meshes) and all(texture.levels for texture in spec.textures)):
         raise SceneError("a mesh or texture has no level")
+
+
+def _ids(what: str, things: Sequence[Identified]) -> set[int]:
+    found = {thing.id for thing in things}
+    if len(found) != len(things):
+        raise SceneError(f"two {what} have the same id")
+    return found
 
 
 def _on_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
@@ -13,6 +13,10 @@ from iris_session.protocol.scene_names import AssetEncoding, TextureRole
 Address = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 #: Index into a list of the specification, or -1 for none.
 Ref = Annotated[int, msgspec.Meta(ge=-1, le=2**31 - 1)]
+#: A small number: of a group, of pixels.
+Int32 = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
+#: Levels of detail of a mesh or texture: each halves the sides, so 32 are more than any image has.
+MAX_LEVELS: Final = 32
 Rgb = tuple[float, float, float]
 Rgba = tuple[float, float, float, float]
 Vec2 = tuple[float, float]
@@ -41,7 +45,7 @@ class Material(msgspec.Struct, frozen=True):
     reflectance: float = 0.0
     metallic: float = -1.0
     roughness: float = -1.0
-    textures: tuple[TextureUse, ...] = ()
+    textures: Annotated[tuple[TextureUse, ...], msgspec.Meta(max_length=16)] = ()
     repeat: Vec2 = (1.0, 1.0)
     uniform: bool = False
 
@@ -62,7 +66,7 @@ class TextureLevel(msgspec.Struct, frozen=True):
     encoding: Name
     width: Count
     height: Count
-    max_error: int = 0
+    max_error: Int32 = 0
 
 
 class Texture(msgspec.Struct, frozen=True):
@@ -76,7 +80,7 @@ class Texture(msgspec.Struct, frozen=True):
     height: Count
     channels: Count
     colorspace: Name
-    levels: tuple[TextureLevel, ...]
+    levels: Annotated[tuple[TextureLevel, ...], msgspec.Meta(max_length=MAX_LEVELS)]
 
 
 class MeshLevel(msgspec.Struct, frozen=True):
@@ -99,7 +103,7 @@ class Mesh(msgspec.Struct, frozen=True):
     low: Vec3
     high: Vec3
     textured: bool
-    levels: tuple[MeshLevel, ...]
+    levels: Annotated[tuple[MeshLevel, ...], msgspec.Meta(max_length=MAX_LEVELS)]
 
 
 class HeightField(msgspec.Struct, frozen=True):

@@ -13,7 +13,7 @@ import msgspec
 
 from iris_session.protocol.common import Count, Pose
 from iris_session.protocol.scene import SceneError, SceneSpec, Visual, check_scene
-from iris_session.protocol.scene_looks import Material, Mesh, Ref, Rgba
+from iris_session.protocol.scene_looks import Int32, Material, Mesh, Ref, Rgba
 
 #: Operations of one patch, and all that a scene may have had since it was loaded.
 MAX_OPS: Final = 64
@@ -25,7 +25,7 @@ class SetVisual(msgspec.Struct, frozen=True, tag_field="op", tag="set_visual"):
 
     visual: Count
     rgba: Rgba | None = None
-    group: int | None = None
+    group: Int32 | None = None
     material: Ref | None = None
     T_body_visual: Pose | None = None
 

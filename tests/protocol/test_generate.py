@@ -10,7 +10,17 @@ from typing import get_args
 import msgspec
 import pytest
 
-from iris_session.protocol import client_messages, codec, names, server_messages
+from iris_session.protocol import (
+    arrays,
+    client_messages,
+    codec,
+    names,
+    scene,
+    scene_looks,
+    scene_names,
+    scene_patch,
+    server_messages,
+)
 from iris_session.protocol.generate import __main__ as generate
 from iris_session.protocol.generate import csharp, schema, tables, typescript
 
@@ -59,7 +69,7 @@ def test_generator_needs_a_checkout_and_its_markers(tmp_path: Path, capsys: pyte
 def test_every_struct_is_in_the_schema() -> None:
     """A struct that is defined for the wire and not listed would be missing in every generated file."""
     listed = {struct.name for struct in schema.all_structs()}
-    for module in (client_messages, server_messages):
+    for module in (client_messages, server_messages, scene, scene_looks, scene_patch, arrays):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, msgspec.Struct) and value.__module__ == module.__name__:
                 assert name in listed | {"Message", "EventBody"}, name
@@ -70,7 +80,8 @@ def test_open_enumerations_are_explained_whole() -> None:
     """Not up to the first line, which may end within a sentence."""
     for name in schema.enums():
         doc = schema.enum_doc(name)
-        assert doc.split() == (getattr(names, name).__doc__ or "").split()
+        kind = getattr(names, name, None) or getattr(scene_names, name)
+        assert doc.split() == (kind.__doc__ or "").split()
         assert not doc or doc.endswith("."), name
     document = (ROOT / "docs/protocol.md").read_text()
     alarms = " ".join(document.split("#### AlarmKind\n")[1].split("\n#### ")[0].split())
@@ -94,6 +105,12 @@ def test_schema_follows_the_definitions() -> None:
     assert by_name["ClientEnvelope"].fields[3].type == schema.Type("union", name="ClientMessage")
     assert by_name["Pose"].array_like
     assert by_name["Feedback"].fields[-1].default == {}
+    visual = {field.name: field for field in by_name["Visual"].fields}
+    assert visual["material"].type == schema.Type("int", minimum=-1, maximum=2**31 - 1)
+    level = {field.name: field for field in by_name["MeshLevel"].fields}
+    assert level["address"].type == schema.Type("str", pattern="^[0-9a-f]{64}$")
+    change = {field.name: field for field in by_name["SetVisual"].fields}
+    assert (by_name["SetVisual"].tag_field, change["group"].type.optional) == ("op", True)
 
 
 def test_enumerations_of_fields_exist() -> None:
@@ -123,6 +140,32 @@ def test_csharp_has_every_message_field_and_tag() -> None:
             assert re.search(rf"public \S+(, long>)? {csharp.pascal(field.name, struct.name)} = ", body[1]), field.name
     for value in (value for values in schema.enums().values() for value in values.values()):
         assert f'= "{value}";' in text
+
+
+def test_csharp_reads_within_the_bounds_of_the_schema() -> None:
+    text = csharp.csharp()
+    for line in (
+        "value.Material = reader.ReadLong(-1, 2147483647);",
+        "value.Resolution = reader.ReadLongs(2, 0, -2147483648, 2147483647);",
+        "value.GroupsShown = reader.ReadLongs(0, 256, -2147483648, 2147483647);",
+        "value.Address = reader.ReadAddress();",
+        "value.Levels = reader.ReadArray(Protocol.MeshLevel.Read, 32);",
+        "value.Group = reader.TryReadNil() ? (long?)null : reader.ReadLong(-2147483648, 2147483647);",
+        "value.Rgba = reader.TryReadNil() ? null : reader.ReadDoubles(4, 0);",
+        "value.RequestId = reader.ReadLong(0, long.MaxValue);",
+        "value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);",
+        "value.Devices = reader.ReadStrings(32, 64);",
+        'string tag = reader.PeekTag("op");',
+    ):
+        assert line in text, line
+
+
+def test_typescript_has_the_defaults_of_maps_without_a_tag() -> None:
+    text = typescript.typescript().split("export const VALUE_DEFAULTS")[1]
+    light = text.split("  Light: {\n")[1].split("  },")[0]
+    assert '    follow: "fixed",\n' in light
+    assert "    attenuation: [1.0, 0.0, 0.0],\n" in light
+    assert '    headlight: {"active": true, ' in text
 
 
 def test_csharp_names() -> None:

@@ -103,6 +103,14 @@ public sealed class WireReader
         throw Unexpected("an integer", code);
     }
 
+    /// <summary>An integer from low to high.</summary>
+    public long ReadLong(long low, long high)
+    {
+        long value = ReadLong();
+        if (value < low || value > high) throw new WireException(value + " is not from " + low + " to " + high);
+        return value;
+    }
+
     public double ReadDouble()
     {
         byte code = Next();
@@ -130,13 +138,36 @@ public sealed class WireReader
         catch (ArgumentException) { throw new WireException("a string that is not UTF-8"); }
     }
 
+    /// <summary>A string of at most so many characters (code points); 0: of any length.</summary>
+    public string ReadString(int most)
+    {
+        string value = ReadString();
+        if (most == 0 || value.Length <= most) return value;
+        int pairs = 0;
+        foreach (char unit in value) if (char.IsLowSurrogate(unit)) pairs++;
+        if (value.Length - pairs > most) throw new WireException("a string of more than " + most + " characters");
+        return value;
+    }
+
+    /// <summary>The address of an asset: 64 digits 0-9, a-f.</summary>
+    public string ReadAddress()
+    {
+        string value = ReadString();
+        bool good = value.Length == 64;
+        foreach (char unit in value) good &= unit >= '0' && unit <= '9' || unit >= 'a' && unit <= 'f';
+        if (!good) throw new WireException("a string that is no address");
+        return value;
+    }
+
     static readonly Encoding Utf8 = new UTF8Encoding(false, true);
 
-    public byte[] ReadBytes()
+    /// <summary>At most so many bytes; 0: any number.</summary>
+    public byte[] ReadBytes(int most)
     {
         byte code = Next();
         if (code < 0xc4 || code > 0xc6) throw Unexpected("bytes", code);
         long count = (long)Big(1 << (code - 0xc4));
+        if (most != 0 && count > most) throw new WireException("more than " + most + " bytes");
         int start = Take(count);
         byte[] value = new byte[count];
         Buffer.BlockCopy(data, start, value, 0, (int)count);
@@ -204,35 +235,42 @@ public sealed class WireReader
         }
     }
 
-    /// <summary>Numbers; length 0: any number of them.</summary>
-    public double[] ReadDoubles(int length)
+    // Of arrays: exactly length elements, and at most so many; 0: any number.
+
+    public double[] ReadDoubles(int length, int most)
     {
-        int n = ReadArrayHeader();
-        if (length != 0 && n != length) throw new WireException("expected " + length + " numbers, found " + n);
-        double[] values = new double[n];
-        for (int i = 0; i < n; i++) values[i] = ReadDouble();
+        double[] values = new double[ReadLength(length, most)];
+        for (int i = 0; i < values.Length; i++) values[i] = ReadDouble();
         return values;
     }
 
-    public long[] ReadLongs()
+    public long[] ReadLongs(int length, int most, long low, long high)
     {
-        long[] values = new long[ReadArrayHeader()];
-        for (int i = 0; i < values.Length; i++) values[i] = ReadLong();
+        long[] values = new long[ReadLength(length, most)];
+        for (int i = 0; i < values.Length; i++) values[i] = ReadLong(low, high);
         return values;
     }
 
-    public string[] ReadStrings()
+    public string[] ReadStrings(int most, int characters)
     {
-        string[] values = new string[ReadArrayHeader()];
-        for (int i = 0; i < values.Length; i++) values[i] = ReadString();
+        string[] values = new string[ReadLength(0, most)];
+        for (int i = 0; i < values.Length; i++) values[i] = ReadString(characters);
         return values;
     }
 
-    public T[] ReadArray<T>(Func<WireReader, T> read)
+    public T[] ReadArray<T>(Func<WireReader, T> read, int most)
     {
-        T[] values = new T[ReadArrayHeader()];
+        T[] values = new T[ReadLength(0, most)];
         for (int i = 0; i < values.Length; i++) values[i] = read(this);
         return values;
+    }
+
+    int ReadLength(int length, int most)
+    {
+        int n = ReadArrayHeader();
+        if (length != 0 && n != length) throw new WireException("expected " + length + " elements, found " + n);
+        if (most != 0 && n > most) throw new WireException("at most " + most + " elements, found " + n);
+        return n;
     }
 
     public Dictionary<string, long> ReadCounts()

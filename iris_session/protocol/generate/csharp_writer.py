@@ -149,6 +149,12 @@ public sealed class WireWriter
         if (value.HasValue) Write(value.Value);
         else WriteNil();
     }
+
+    public void Write(long? value)
+    {
+        if (value.HasValue) Write(value.Value);
+        else WriteNil();
+    }
 }
 
 /// <summary>Anything that is a MessagePack map or array of its own.</summary>

@@ -13,7 +13,21 @@ from typing import Any, Final, get_args
 
 import msgspec
 
-from iris_session.protocol import assets, client_messages, common, discovery, media, names, server_messages, status
+from iris_session.protocol import (
+    arrays,
+    assets,
+    client_messages,
+    common,
+    discovery,
+    media,
+    names,
+    scene,
+    scene_looks,
+    scene_names,
+    scene_patch,
+    server_messages,
+    status,
+)
 
 
 @dataclass(frozen=True)
@@ -21,7 +35,7 @@ class Type:
     """Type of a field. `base`: bool, int, float, str, bytes, array, map, struct, union.
 
     `item`: of an array, or the value of a map. `length`: of an array of fixed length. `max_length`: 0 for no limit.
-    `name`: of a struct or union. `optional`: may be null. `minimum`: of an int.
+    `name`: of a struct or union. `optional`: may be null. `minimum`, `maximum`: of an int. `pattern`: of a str.
     """
 
     base: str
@@ -31,6 +45,8 @@ class Type:
     name: str = ""
     optional: bool = False
     minimum: int | None = None
+    maximum: int | None = None
+    pattern: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,6 +78,7 @@ UNIONS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
     "ClientMessage": get_args(client_messages.ClientMessage),
     "ServerMessage": get_args(server_messages.ServerMessage),
     "EventKind": get_args(server_messages.EventKind),
+    "PatchOp": get_args(scene_patch.PatchOp),
 }
 
 #: Groups of structs in the order of the document.
@@ -106,6 +123,29 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         discovery.Beacon,
         discovery.Introduction,
     ),
+    "scene": (
+        scene.SceneSpec,
+        scene.Body,
+        scene.Visual,
+        scene.Geometry,
+        scene_looks.Material,
+        scene_looks.TextureUse,
+        scene_looks.Texture,
+        scene_looks.TextureLevel,
+        scene_looks.Mesh,
+        scene_looks.MeshLevel,
+        scene_looks.HeightField,
+        scene.Light,
+        scene.Camera,
+        scene.Site,
+        scene.Tendon,
+        scene.Deformable,
+        scene.Environment,
+        scene.Headlight,
+        scene.Totals,
+    ),
+    "arrays": (arrays.ArrayHeader, arrays.ArrayInfo),
+    "patch": UNIONS["PatchOp"],
 }
 
 #: Which open enumeration a field takes its values from.
@@ -158,7 +198,24 @@ _ENUMS: Final[dict[str, str]] = {
     "RobotReport.mode": "LeaseMode",
     "RobotReport.state": "CommandKind",
     "RobotReport.hold_reason": "HoldReason",
+    "Geometry.kind": "GeometryKind",
+    "TextureUse.role": "TextureRole",
+    "Texture.kind": "TextureKind",
+    "Texture.colorspace": "ColorSpace",
+    "TextureLevel.encoding": "AssetEncoding",
+    "MeshLevel.encoding": "AssetEncoding",
+    "HeightField.encoding": "AssetEncoding",
+    "Light.kind": "LightKind",
+    "Light.follow": "Follow",
+    "Camera.follow": "Follow",
+    "Deformable.encoding": "AssetEncoding",
+    "ArrayHeader.kind": "ArrayKind",
+    "ArrayInfo.filter": "ArrayFilter",
+    "ArrayInfo.codec": "ArrayCodec",
 }
+
+#: Modules of open enumerations, in the order of the document.
+_NAMES: Final = (names, scene_names)
 
 _SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {
     msgspec.inspect.BoolType: "bool",
@@ -178,16 +235,24 @@ def all_structs() -> tuple[Struct, ...]:
 
 def enums() -> dict[str, dict[str, str]]:
     """Open enumerations: name -> constant -> value, in the order of their definition."""
-    found = {}
-    for name, value in vars(names).items():
-        if isinstance(value, type) and value.__module__ == names.__name__:
-            found[name] = {key: text for key, text in vars(value).items() if key.isupper() and isinstance(text, str)}
-    return found
+    return {
+        name: {key: text for key, text in vars(kind).items() if key.isupper() and isinstance(text, str)}
+        for name, kind in _enum_classes().items()
+    }
 
 
 def enum_doc(name: str) -> str:
     """The docstring of an open enumeration, unindented, or empty."""
-    return inspect.getdoc(getattr(names, name)) or ""
+    return inspect.getdoc(_enum_classes()[name]) or ""
+
+
+def _enum_classes() -> dict[str, type]:
+    return {
+        name: value
+        for module in _NAMES
+        for name, value in vars(module).items()
+        if isinstance(value, type) and value.__module__ == module.__name__
+    }
 
 
 def _struct(cls: type[msgspec.Struct]) -> Struct:
@@ -224,9 +289,9 @@ def _type(node: msgspec.inspect.Type) -> Type:
         return Type(scalar)
     match node:
         case msgspec.inspect.IntType():
-            return Type("int", minimum=node.ge)
+            return Type("int", minimum=node.ge, maximum=node.le)
         case msgspec.inspect.StrType():
-            return Type("str", max_length=node.max_length or 0)
+            return Type("str", max_length=node.max_length or 0, pattern=node.pattern or "")
         case msgspec.inspect.BytesType():
             return Type("bytes", max_length=node.max_length or 0)
         case msgspec.inspect.TupleType():

@@ -8,13 +8,12 @@ from typing import Any
 import msgspec
 
 from iris_session.protocol import assets, limits
-from iris_session.protocol.generate.schema import Field, Struct, Type, enum_doc, enums, structs
+from iris_session.protocol.generate.schema import GROUPS, Field, Struct, Type, enum_doc, enums, structs
 
 
 def sections() -> dict[str, str]:
     """Section name -> markdown, for `<!-- generated:NAME -->` ... `<!-- end:NAME -->` in docs/protocol.md."""
-    groups = {group: _group(group) for group in ("values", "client", "server", "events", "frames")}
-    return {**groups, "names": _names(), "limits": _limits()}
+    return {**{group: _group(group) for group in GROUPS}, "names": _names(), "limits": _limits()}
 
 
 def _group(group: str) -> str:
@@ -45,7 +44,9 @@ def _type(field: Field) -> str:
 def _kind(kind: Type) -> str:
     match kind.base:
         case "int":
-            return "uint63" if kind.minimum == 0 else "int64"
+            return _integer(kind)
+        case "str" if kind.pattern:
+            return f"string `{kind.pattern}`"
         case "str" | "bytes":
             unit = "bytes" if kind.base == "bytes" else "characters"
             name = "bytes" if kind.base == "bytes" else "string"
@@ -66,9 +67,23 @@ def _kind(kind: Type) -> str:
     return "float64" if kind.base == "float" else kind.base
 
 
+def _integer(kind: Type) -> str:
+    match kind.minimum, kind.maximum:
+        case (0, None) | (0, 0x7FFF_FFFF_FFFF_FFFF):
+            return "uint63"
+        case (None, None) | (-0x8000_0000_0000_0000, 0x7FFF_FFFF_FFFF_FFFF):
+            return "int64"
+        case (-0x8000_0000, 0x7FFF_FFFF):
+            return "int32"
+        case low, high:
+            return f"int, {low} to {high}"
+
+
 def _default(field: Field) -> str:
     if field.required:
         return "required"
+    if isinstance(field.default, msgspec.Struct) and field.default == type(field.default)():
+        return "`{}`"  # its own defaults
     return f"`{_json(field.default)}`"
 
 

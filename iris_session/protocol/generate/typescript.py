@@ -12,16 +12,19 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.protocol import server_messages
+from iris_session.protocol import arrays, server_messages
 from iris_session.protocol.generate import rigid_reference
 from iris_session.protocol.generate.schema import UNIONS, Field, Struct, Type, all_structs, enum_doc, enums
 from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.scene import MAX_SCENE_BYTES
+from iris_session.protocol.scene_names import SCENE_VERSION
 
 HEAD: Final = """\
 // Messages of the iris-session protocol. Written by `python -m iris_session.protocol.generate typescript`: do not edit.
 //
 // Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
 // enumerations may be others than those listed.
+// Some types are called like those of three.js and of browsers: `import type * as wire` keeps them apart.
 """
 
 _SCALARS: Final = {"bool": "boolean", "int": "number", "float": "number", "str": "string", "bytes": "Uint8Array"}
@@ -32,7 +35,7 @@ def typescript() -> str:
     parts = [HEAD.rstrip("\n"), _constants(), *_enums()]
     parts.extend(_tuple(struct) if struct.array_like else _interface(struct) for struct in all_structs())
     parts.extend(_union(name, members) for name, members in UNIONS.items())
-    parts.append(_defaults())
+    parts += [_defaults(), _value_defaults()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -47,6 +50,9 @@ def _constants() -> str:
             f"export const RIGID_LATTICE_M = {rigid_reference.LATTICE_M!r};",
             f"export const RIGID_POSITION_BITS = {rigid_reference.POSITION_BITS};",
             f"export const RIGID_ROTATION_CENTRE = {rigid_reference.ROTATION_CENTRE};",
+            f"export const SCENE_VERSION = {SCENE_VERSION};",
+            f"export const MAX_SCENE_BYTES = {MAX_SCENE_BYTES};",
+            f'export const ARRAYS_MAGIC = "{arrays.MAGIC.decode()}";',
         ]
     )
 
@@ -117,18 +123,31 @@ def _union(name: str, members: tuple[type[msgspec.Struct], ...]) -> str:
 
 
 def _defaults() -> str:
-    """Defaults of the optional fields of every message and event, by tag."""
+    """Defaults of the optional fields of every message, event and operation, by tag."""
     rows = []
     for struct in all_structs():
         if struct.tag:
             values = {field.name: field.default for field in struct.fields if not field.required}
             inner = ", ".join(f"{name}: {_value(value)}" for name, value in values.items())
             rows.append(f"  {struct.tag}: {{ {inner} }}," if inner else f"  {struct.tag}: {{}},")
-    doc = _doc("Values of the fields that a message or event may leave out, by its tag.")
+    doc = _doc("Values of the fields that a message, event or operation may leave out, by its tag.")
     return "\n".join([*doc, "export const DEFAULTS = {", *rows, "} as const;"])
+
+
+def _value_defaults() -> str:
+    """Defaults of the optional fields of maps without a tag, by name."""
+    rows = []
+    for struct in all_structs():
+        values = {field.name: field.default for field in struct.fields if not field.required}
+        if values and not struct.tag and not struct.array_like:
+            rows.append(f"  {struct.name}: {{")
+            rows.extend(f"    {name}: {_value(value)}," for name, value in values.items())
+            rows.append("  },")
+    doc = _doc("Values of the fields that other maps may leave out, by the name of their type.")
+    return "\n".join([*doc, "export const VALUE_DEFAULTS = {", *rows, "} as const;"])
 
 
 def _value(value: Any) -> str:
     if isinstance(value, bytes):
         return "new Uint8Array()"
-    return json.dumps(value)
+    return json.dumps(msgspec.to_builtins(value))

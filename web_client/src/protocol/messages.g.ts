@@ -2,6 +2,7 @@
 //
 // Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
 // enumerations may be others than those listed.
+// Some types are called like those of three.js and of browsers: `import type * as wire` keeps them apart.
 
 export const PROTOCOL_VERSION = 1;
 export const TOPIC_RIGID = "rigid";
@@ -11,6 +12,9 @@ export const RIGID_FORMAT = 2;
 export const RIGID_LATTICE_M = 6.103515625e-05;
 export const RIGID_POSITION_BITS = 18;
 export const RIGID_ROTATION_CENTRE = 8191;
+export const SCENE_VERSION = 1;
+export const MAX_SCENE_BYTES = 32000000;
+export const ARRAYS_MAGIC = "IRA1";
 
 /** What a participant may do. Reserved for later message types: `camera`, `source`. */
 export const Role = {
@@ -192,6 +196,7 @@ export const DenialReason = {
   USER_OWNED: "user_owned",
   POLICY: "policy",
   INVALID: "invalid",
+  TOO_FAR: "too_far",
 } as const;
 export type DenialReason = (typeof DenialReason)[keyof typeof DenialReason] | (string & {});
 
@@ -298,6 +303,102 @@ export const LateCause = {
   OWNER: "owner",
 } as const;
 export type LateCause = (typeof LateCause)[keyof typeof LateCause] | (string & {});
+
+/** Shape of a visual. Sizes are those of `Geometry.size`. */
+export const GeometryKind = {
+  PLANE: "plane",
+  HFIELD: "hfield",
+  SPHERE: "sphere",
+  CAPSULE: "capsule",
+  ELLIPSOID: "ellipsoid",
+  CYLINDER: "cylinder",
+  BOX: "box",
+  MESH: "mesh",
+  SDF: "sdf",
+} as const;
+export type GeometryKind = (typeof GeometryKind)[keyof typeof GeometryKind] | (string & {});
+
+/** How a texture covers what wears it. */
+export const TextureKind = {
+  IMAGE: "2d",
+  CUBE: "cube",
+  SKYBOX: "skybox",
+} as const;
+export type TextureKind = (typeof TextureKind)[keyof typeof TextureKind] | (string & {});
+
+/** What a texture gives to a material. `rgb`, `rgba`: its colour, the only one that every client must draw. */
+export const TextureRole = {
+  RGB: "rgb",
+  OCCLUSION: "occlusion",
+  ROUGHNESS: "roughness",
+  METALLIC: "metallic",
+  NORMAL: "normal",
+  OPACITY: "opacity",
+  EMISSIVE: "emissive",
+  RGBA: "rgba",
+  ORM: "orm",
+  USER: "user",
+} as const;
+export type TextureRole = (typeof TextureRole)[keyof typeof TextureRole] | (string & {});
+
+/** How the numbers of a texture are meant. `auto`: as they are, without conversion. */
+export const ColorSpace = {
+  AUTO: "auto",
+  LINEAR: "linear",
+  SRGB: "srgb",
+} as const;
+export type ColorSpace = (typeof ColorSpace)[keyof typeof ColorSpace] | (string & {});
+
+export const LightKind = {
+  SPOT: "spot",
+  DIRECTIONAL: "directional",
+  POINT: "point",
+  IMAGE: "image",
+} as const;
+export type LightKind = (typeof LightKind)[keyof typeof LightKind] | (string & {});
+
+/** How a light or camera moves. Unknown values: like `fixed`. */
+export const Follow = {
+  FIXED: "fixed",
+  TRACK: "track",
+  TRACK_COM: "trackcom",
+  TARGET_BODY: "targetbody",
+  TARGET_BODY_COM: "targetbodycom",
+} as const;
+export type Follow = (typeof Follow)[keyof typeof Follow] | (string & {});
+
+/** What the bytes of an asset are. */
+export const AssetEncoding = {
+  ARRAYS: "arrays",
+  PNG: "png",
+  JPEG: "jpeg",
+  OPAQUE: "opaque",
+} as const;
+export type AssetEncoding = (typeof AssetEncoding)[keyof typeof AssetEncoding] | (string & {});
+
+/** What the arrays of an asset are together. */
+export const ArrayKind = {
+  MESH: "mesh",
+  IMAGE: "image",
+  GRID: "grid",
+  DEFORMABLE: "deformable",
+} as const;
+export type ArrayKind = (typeof ArrayKind)[keyof typeof ArrayKind] | (string & {});
+
+/** What was done to an array before it was compressed. */
+export const ArrayFilter = {
+  NONE: "none",
+  SHUFFLE: "shuffle",
+  DELTA: "delta",
+  UP: "up",
+} as const;
+export type ArrayFilter = (typeof ArrayFilter)[keyof typeof ArrayFilter] | (string & {});
+
+export const ArrayCodec = {
+  NONE: "none",
+  ZSTD: "zstd",
+} as const;
+export type ArrayCodec = (typeof ArrayCodec)[keyof typeof ArrayCodec] | (string & {});
 
 /** A rigid transform `T_a_b`: position `p` [m] of frame b in a, rotation `q` `[w, x, y, z]` from b to a. */
 export type Pose = [
@@ -759,12 +860,17 @@ export interface Align {
   participant?: string;
 }
 
-/** A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it. */
+/**
+ * A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+ *
+ * `force`: also when it is further than 5 m from where it was, which is more often a wrong number than meant.
+ */
 export interface MoveAnchor {
   type: "move_anchor";
   request_id: number;
   anchor_id: string;
   T_world_anchor: Pose;
+  force?: boolean;
 }
 
 /** The tracking frame jumped (recentre, lost tracking): every earlier alignment of this participant is void. */
@@ -857,7 +963,11 @@ export interface ClientReport {
   media_limit_mbit_per_s?: number;
 }
 
-/** Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once. */
+/**
+ * Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
+ *
+ * `tick_period_ns`: of the scene as it is now; another one that is loaded may have another (`SceneChanged`).
+ */
 export interface Welcome {
   type: "welcome";
   session_id: string;
@@ -943,7 +1053,8 @@ export interface Event {
 /**
  * Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
  *
- * In the step of a reset `tick` and `sim_time` are still those before it. Bulk frame 1 (added by the front): float64
+ * In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
+ * `Welcome`. Bulk frame 1 (added by the front): float64
  * (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
  */
 export interface Snapshot {
@@ -964,6 +1075,7 @@ export interface Snapshot {
   estop?: boolean;
   episode?: EpisodeChanged | null;
   state_seq?: number;
+  tick_period_ns?: number;
 }
 
 /**
@@ -1159,6 +1271,7 @@ export interface HeadsetsCompared {
  * `cause`: reset, new_scene, patch, external (the user's loop went back in time).
  *
  * `scene_hash`: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
+ * `tick_period_ns`: of the new scene; 0: as it was.
  */
 export interface SceneChanged {
   event: "scene_changed";
@@ -1166,6 +1279,7 @@ export interface SceneChanged {
   scene_revision: number;
   cause: string;
   scene_hash?: string;
+  tick_period_ns?: number;
 }
 
 export interface EStopChanged {
@@ -1404,6 +1518,351 @@ export interface Introduction {
   participants?: number;
 }
 
+/**
+ * A whole scene. `bodies`: parents before their children. `source`: what it was made from, for people.
+ *
+ * `groups_shown`: visuals, sites, tendons and deformables of other groups are hidden at first.
+ */
+export interface SceneSpec {
+  version?: number;
+  name?: string;
+  source?: string;
+  bodies?: Body[];
+  visuals?: Visual[];
+  materials?: Material[];
+  textures?: Texture[];
+  meshes?: Mesh[];
+  hfields?: HeightField[];
+  lights?: Light[];
+  cameras?: Camera[];
+  sites?: Site[];
+  tendons?: Tendon[];
+  deformables?: Deformable[];
+  environment?: Environment;
+  groups_shown?: number[];
+  totals?: Totals;
+}
+
+/**
+ * One rigid body. `id`: that of `BodyInfo` in the state stream; 0 is the world, which is not streamed.
+ *
+ * `T_parent_body`: rest pose in the parent's frame. `T_world_body`: rest pose in the world, of the initial state. A
+ * body that is not `moving` stays there for good.
+ */
+export interface Body {
+  id: number;
+  name: string;
+  parent: number;
+  T_parent_body: Pose;
+  T_world_body: Pose;
+  moving: boolean;
+}
+
+/**
+ * A shape on a body. `id`: the simulator's number of it (MuJoCo geom). `rgba` is what to draw: a colour of its own,
+ * or the material's; 0 alpha is drawn by nobody. `group`: see `SceneSpec.groups_shown`.
+ */
+export interface Visual {
+  id: number;
+  body: number;
+  name: string;
+  T_body_visual: Pose;
+  group: number;
+  geometry: Geometry;
+  material: number;
+  rgba: [number, number, number, number];
+}
+
+/**
+ * A shape, centred in its own frame. `kind` of `GeometryKind`; draw what you do not know as a box of `size`.
+ *
+ * `size` [m]: half lengths along x, y, z of what the shape extends over. plane: half lengths x, y, 0 is without end;
+ * its normal is +z, z is the spacing of grid lines. sphere: radius three times. capsule, cylinder: radius, radius,
+ * half length along z, of a capsule without its caps. hfield: half x, half y, height of elevation 1. mesh, sdf: what
+ * generated texture coordinates are measured by (see docs/scene.md); the vertices are in metres as they are.
+ */
+export interface Geometry {
+  kind: GeometryKind;
+  size: [number, number, number];
+  mesh?: number;
+  hfield?: number;
+}
+
+/**
+ * How a surface looks, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
+ *
+ * `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not say. The
+ * texture's colour multiplies that of the visual. `repeat`: times that a 2d texture is laid over the shape, or over
+ * one metre when `uniform` (docs/scene.md, texture coordinates).
+ */
+export interface Material {
+  name: string;
+  rgba: [number, number, number, number];
+  emission?: number;
+  specular?: number;
+  shininess?: number;
+  reflectance?: number;
+  metallic?: number;
+  roughness?: number;
+  textures?: TextureUse[];
+  repeat?: [number, number];
+  uniform?: boolean;
+}
+
+/** A texture in one `TextureRole`. */
+export interface TextureUse {
+  role: TextureRole;
+  texture: number;
+}
+
+/**
+ * An image. `height` of cube and skybox is that of one face; their assets hold six, one below the other, in the
+ * order right, left, up, down, front, back. Level 0 is the whole image, each further one has half its sides.
+ */
+export interface Texture {
+  name: string;
+  kind: TextureKind;
+  width: number;
+  height: number;
+  channels: number;
+  colorspace: ColorSpace;
+  levels: TextureLevel[];
+}
+
+/** One size of a texture. `max_error`: largest difference of a channel to the exact pixels of this size, 0..255. */
+export interface TextureLevel {
+  address: string;
+  bytes: number;
+  encoding: AssetEncoding;
+  width: number;
+  height: number;
+  max_error?: number;
+}
+
+/** Triangles. Level 0 is exact, each further one coarser. `low`, `high`: the box around it in its frame [m]. */
+export interface Mesh {
+  name: string;
+  low: [number, number, number];
+  high: [number, number, number];
+  textured: boolean;
+  levels: MeshLevel[];
+}
+
+/**
+ * One level of detail. `max_error_m`: how far its points lie from the exact mesh at most [m], 0: exact. Parts of
+ * the exact mesh that are smaller than this may be missing.
+ */
+export interface MeshLevel {
+  address: string;
+  bytes: number;
+  encoding: AssetEncoding;
+  vertices: number;
+  triangles: number;
+  max_error_m?: number;
+}
+
+/**
+ * Elevations on a grid, rows along y, columns along x, in 0..1.
+ *
+ * `size` [m]: half length along x, along y, height of elevation 1, depth of the base below 0.
+ */
+export interface HeightField {
+  name: string;
+  rows: number;
+  columns: number;
+  size: [number, number, number, number];
+  address: string;
+  bytes: number;
+  encoding?: AssetEncoding;
+}
+
+/**
+ * A light on a body, shining along `direction`, a unit vector in the body's frame.
+ *
+ * `attenuation`: constant, linear [1/m], quadratic [1/m^2]. `cutoff`: half angle of a spot [deg], `exponent`: of the
+ * cosine within it. `intensity` [cd]: 0 where the scene does not say. `range` [m]: 0 for no end.
+ */
+export interface Light {
+  name: string;
+  kind: LightKind;
+  body: number;
+  p_body: [number, number, number];
+  direction_body: [number, number, number];
+  ambient: [number, number, number];
+  diffuse: [number, number, number];
+  specular: [number, number, number];
+  attenuation?: [number, number, number];
+  cutoff?: number;
+  exponent?: number;
+  range?: number;
+  intensity?: number;
+  bulb_radius?: number;
+  texture?: number;
+  castshadow?: boolean;
+  active?: boolean;
+  follow?: Follow;
+  target?: number;
+}
+
+/**
+ * A camera on a body: looks along -z of its own frame, y is up.
+ *
+ * `fovy`: vertical field of view [deg], of an orthographic camera the height of what it sees [m]. `focal`,
+ * `principal`: in pixels, `principal` from the centre of the picture, x right, y up; 0 where only `fovy` counts.
+ * `resolution`: pixels, 1 x 1 where the scene does not say.
+ */
+export interface Camera {
+  name: string;
+  body: number;
+  T_body_camera: Pose;
+  fovy: number;
+  orthographic?: boolean;
+  focal?: [number, number];
+  principal?: [number, number];
+  resolution?: [number, number];
+  follow?: Follow;
+  target?: number;
+}
+
+/** A marked place on a body, drawn as a shape on request. */
+export interface Site {
+  id: number;
+  body: number;
+  name: string;
+  T_body_site: Pose;
+  group: number;
+  geometry: Geometry;
+  material: number;
+  rgba: [number, number, number, number];
+}
+
+/** A cable, drawn on request as straight pieces of radius `width` [m] through `sites`, ids; wrapping is left out. */
+export interface Tendon {
+  name: string;
+  group: number;
+  width: number;
+  sites: number[];
+  material: number;
+  rgba: [number, number, number, number];
+}
+
+/**
+ * A mesh whose vertices move: ropes (`dim` 1), cloths (2), surfaces of soft bodies (3).
+ *
+ * The asset has the elements (edges for `dim` 1, triangles else), texture coordinates, and the vertices of the initial
+ * state, in the world. `stream`: of the media channel, whose frames hold the vertices in the same order. `radius` [m]:
+ * half the thickness. `flat`: one normal per triangle.
+ */
+export interface Deformable {
+  name: string;
+  dim: number;
+  group: number;
+  vertices: number;
+  elements: number;
+  radius: number;
+  flat: boolean;
+  material: number;
+  rgba: [number, number, number, number];
+  stream: string;
+  address: string;
+  bytes: number;
+  encoding?: AssetEncoding;
+}
+
+/** What surrounds the scene. `skybox`: a texture. Lengths [m]. Haze blends the skybox's horizon, fog all. */
+export interface Environment {
+  headlight?: Headlight;
+  skybox?: number;
+  haze_rgba?: [number, number, number, number];
+  haze?: number;
+  fog_rgba?: [number, number, number, number];
+  fog_start?: number;
+  fog_end?: number;
+  znear?: number;
+  zfar?: number;
+  extent?: number;
+  center?: [number, number, number];
+}
+
+/** A light without shadow at the viewer's head that shines where it looks. */
+export interface Headlight {
+  active?: boolean;
+  ambient?: [number, number, number];
+  diffuse?: [number, number, number];
+  specular?: [number, number, number];
+}
+
+/**
+ * What the scene costs with everything exact: each asset once, triangles as often as they are drawn.
+ *
+ * `objects`, `triangles`: of the groups that are shown at first. `texture_memory`: bytes on a graphics card.
+ */
+export interface Totals {
+  objects?: number;
+  triangles?: number;
+  mesh_bytes?: number;
+  texture_bytes?: number;
+  texture_memory?: number;
+  asset_bytes?: number;
+}
+
+/** The header. `kind` of `ArrayKind`; `max_error`: stated bound on the values, in their unit, 0: exact. */
+export interface ArrayHeader {
+  kind: ArrayKind;
+  arrays: ArrayInfo[];
+  max_error?: number;
+}
+
+/**
+ * One array. `dtype`: `u1`, `i1`, `u2`, `u4`, `f4`, little-endian. `shape`: C order.
+ *
+ * `bytes`: of its compressed form. Values are `offset + scale * stored`, per entry of the last axis, where `scale`
+ * is not empty.
+ */
+export interface ArrayInfo {
+  name: string;
+  dtype: string;
+  shape: number[];
+  bytes: number;
+  filter?: ArrayFilter;
+  codec?: ArrayCodec;
+  scale?: number[];
+  offset?: number[];
+}
+
+/** Changes how a visual is drawn; what is not given stays. `rgba` with alpha 0 hides it. */
+export interface SetVisual {
+  op: "set_visual";
+  visual: number;
+  rgba?: [number, number, number, number] | null;
+  group?: number | null;
+  material?: number | null;
+  T_body_visual?: Pose | null;
+}
+
+/** Decoration on a body (0: the world). Its `id` must be free. */
+export interface AddVisual {
+  op: "add_visual";
+  visual: Visual;
+}
+
+export interface RemoveVisual {
+  op: "remove_visual";
+  visual: number;
+}
+
+/** At the end of the list, for visuals that come after it. */
+export interface AddMesh {
+  op: "add_mesh";
+  mesh: Mesh;
+}
+
+/** At the end of the list, for visuals that come after it. */
+export interface AddMaterial {
+  op: "add_material";
+  material: Material;
+}
+
 export type ClientMessage =
   | Hello
   | Bye
@@ -1473,7 +1932,14 @@ export type EventKind =
   | Notice
   | Audited;
 
-/** Values of the fields that a message or event may leave out, by its tag. */
+export type PatchOp =
+  | SetVisual
+  | AddVisual
+  | RemoveVisual
+  | AddMesh
+  | AddMaterial;
+
+/** Values of the fields that a message, event or operation may leave out, by its tag. */
 export const DEFAULTS = {
   hello: { software: "", devices: [], capabilities: [], alignment: "measured", secret: new Uint8Array(), resume_token: new Uint8Array(), join_code: "" },
   bye: { reason: "" },
@@ -1492,7 +1958,7 @@ export const DEFAULTS = {
   observation: { viewpoint_id: 0, size_m: 0.0, quality: 1.0, device: "head", covariance: [] },
   place_alignment: { offset: false },
   align: { participant: "" },
-  move_anchor: {},
+  move_anchor: { force: false },
   tracking_epoch: {},
   episode: { label: "" },
   estop: { reason: "" },
@@ -1510,7 +1976,7 @@ export const DEFAULTS = {
   reply: { denial: null, leases: [] },
   feedback: { hold_reason: "", contact_n: 0.0, limits: [], rejected: {} },
   event: {},
-  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0 },
+  snapshot: { robots: [], bodies: [], paused: false, estop: false, episode: null, state_seq: 0, tick_period_ns: 0 },
   paired: { roles: [] },
   status_report: { tick: 0, tick_period_ns: 0, paused: false, estop: false, stalled: false, scheduling: "", late_share: 0.0, late_share_total: 0.0, lateness: null, late_causes: {}, step_to_publish: null, cpu_share: 0.0, load: 0.0, cpus: 0, memory_bytes: 0, participants: [], robots: [], recorder: null, drops: {}, restarts: {}, connections: 0, entries_per_s: 0.0, warnings: [], authority_silent_ns: -1, media: [], anchors: [], cross_checks: [], assets: null },
   delivery_budget: { mbit_per_s: 0.0, reason: "", streams: [] },
@@ -1527,7 +1993,7 @@ export const DEFAULTS = {
   alignment_alarmed: { beside: [] },
   anchor_moved: { by: "" },
   headsets_compared: {},
-  scene_changed: { scene_hash: "" },
+  scene_changed: { scene_hash: "", tick_period_ns: 0 },
   estop_changed: { reason: "" },
   pause_changed: { participant: "" },
   episode_changed: { label: "", participant: "" },
@@ -1538,4 +2004,243 @@ export const DEFAULTS = {
   gap: { rows: 0 },
   notice: { participant: "", reason: "" },
   audited: { subject: "", name: "", address: "", detail: "", count: 1 },
+  set_visual: { rgba: null, group: null, material: null, T_body_visual: null },
+  add_visual: {},
+  remove_visual: {},
+  add_mesh: {},
+  add_material: {},
+} as const;
+
+/** Values of the fields that other maps may leave out, by the name of their type. */
+export const VALUE_DEFAULTS = {
+  Lease: {
+    expires_ns: 0,
+    queue: [],
+    sub_holders: [],
+    weights: [],
+    scale: 1.0,
+  },
+  Denial: {
+    advice: "",
+    target: "",
+    holder: "",
+    holder_name: "",
+  },
+  Alignment: {
+    tracking_epoch: 0,
+    covariance: [],
+    error_at_anchor_m: 0.0,
+    error_at_robot_m: 0.0,
+    offset: false,
+  },
+  Endpoints: {
+    state: 0,
+    media: 0,
+    assets: 0,
+    web: 0,
+    media_ingest: 0,
+  },
+  ParticipantInfo: {
+    devices: [],
+    worn: true,
+    tracking_epoch: 0,
+    alignment: null,
+  },
+  StreamBudget: {
+    budget_class: "full",
+    mbit_per_s: 0.0,
+  },
+  AlignmentReport: {
+    version: 0,
+    running: true,
+    offset: false,
+    error_at_anchor_m: 0.0,
+    error_at_robot_m: 0.0,
+    residual_tilt_rad: 0.0,
+    observations: 0,
+    viewpoints: 0,
+    unusable: 0,
+    pending_m: 0.0,
+    pending_rad: 0.0,
+    advice: "",
+    alarm: "",
+    alarm_size_m: 0.0,
+    alarm_ns: -1,
+    seen: [],
+  },
+  CrossCheckReport: {
+    n: 0,
+  },
+  AnchorReport: {
+    size_m: 0.0,
+  },
+  ParticipantReport: {
+    address: "",
+    software: "",
+    worn: true,
+    heard_ns: -1,
+    alignment: "none",
+    alignment_age_ns: -1,
+    alignment_void_ns: -1,
+    alignment_error_m: 0.0,
+    tracking_epoch: 0,
+    holds: [],
+    waits_for: [],
+    samples_per_s: 0.0,
+    capture_to_receive: null,
+    state_age: null,
+    missed_share: 0.0,
+    rtt_ms: 0.0,
+    bytes_per_s: 0.0,
+    budget_class: "",
+    rejected: {},
+    drops: 0,
+    reported: false,
+    lost: "",
+    media: [],
+    media_bytes_per_s: 0.0,
+    media_drops: 0,
+    alignment_report: null,
+  },
+  RobotReport: {
+    holder: "",
+    holder_name: "",
+    state: "",
+    hold_reason: "",
+    receive_to_step: null,
+    queue: [],
+  },
+  RecorderReport: {
+    state: "off",
+    path: "",
+    bytes_written: 0,
+    disk_free_bytes: 0,
+    lost_rows: 0,
+    spilled_bytes: 0,
+    text: "",
+  },
+  MediaStreamReport: {
+    hz: 0.0,
+    mbit_per_s: 0.0,
+    source: "",
+    subscribers: 0,
+  },
+  AssetsReport: {
+    served: 0,
+    bytes_sent: 0,
+    requests: 0,
+    refusals: 0,
+    waiting: 0,
+  },
+  Beacon: {
+    key_fingerprint: "",
+  },
+  Introduction: {
+    server_key: "",
+    pairing: false,
+    participants: 0,
+  },
+  SceneSpec: {
+    version: 1,
+    name: "",
+    source: "",
+    bodies: [],
+    visuals: [],
+    materials: [],
+    textures: [],
+    meshes: [],
+    hfields: [],
+    lights: [],
+    cameras: [],
+    sites: [],
+    tendons: [],
+    deformables: [],
+    environment: {"headlight": {"active": true, "ambient": [0.1, 0.1, 0.1], "diffuse": [0.4, 0.4, 0.4], "specular": [0.5, 0.5, 0.5]}, "skybox": -1, "haze_rgba": [1.0, 1.0, 1.0, 1.0], "haze": 0.3, "fog_rgba": [0.0, 0.0, 0.0, 1.0], "fog_start": 0.0, "fog_end": 0.0, "znear": 0.01, "zfar": 50.0, "extent": 1.0, "center": [0.0, 0.0, 0.0]},
+    groups_shown: [0, 1, 2],
+    totals: {"objects": 0, "triangles": 0, "mesh_bytes": 0, "texture_bytes": 0, "texture_memory": 0, "asset_bytes": 0},
+  },
+  Geometry: {
+    mesh: -1,
+    hfield: -1,
+  },
+  Material: {
+    emission: 0.0,
+    specular: 0.5,
+    shininess: 0.5,
+    reflectance: 0.0,
+    metallic: -1.0,
+    roughness: -1.0,
+    textures: [],
+    repeat: [1.0, 1.0],
+    uniform: false,
+  },
+  TextureLevel: {
+    max_error: 0,
+  },
+  MeshLevel: {
+    max_error_m: 0.0,
+  },
+  HeightField: {
+    encoding: "arrays",
+  },
+  Light: {
+    attenuation: [1.0, 0.0, 0.0],
+    cutoff: 45.0,
+    exponent: 10.0,
+    range: 0.0,
+    intensity: 0.0,
+    bulb_radius: 0.0,
+    texture: -1,
+    castshadow: true,
+    active: true,
+    follow: "fixed",
+    target: -1,
+  },
+  Camera: {
+    orthographic: false,
+    focal: [0.0, 0.0],
+    principal: [0.0, 0.0],
+    resolution: [1, 1],
+    follow: "fixed",
+    target: -1,
+  },
+  Deformable: {
+    encoding: "arrays",
+  },
+  Environment: {
+    headlight: {"active": true, "ambient": [0.1, 0.1, 0.1], "diffuse": [0.4, 0.4, 0.4], "specular": [0.5, 0.5, 0.5]},
+    skybox: -1,
+    haze_rgba: [1.0, 1.0, 1.0, 1.0],
+    haze: 0.3,
+    fog_rgba: [0.0, 0.0, 0.0, 1.0],
+    fog_start: 0.0,
+    fog_end: 0.0,
+    znear: 0.01,
+    zfar: 50.0,
+    extent: 1.0,
+    center: [0.0, 0.0, 0.0],
+  },
+  Headlight: {
+    active: true,
+    ambient: [0.1, 0.1, 0.1],
+    diffuse: [0.4, 0.4, 0.4],
+    specular: [0.5, 0.5, 0.5],
+  },
+  Totals: {
+    objects: 0,
+    triangles: 0,
+    mesh_bytes: 0,
+    texture_bytes: 0,
+    texture_memory: 0,
+    asset_bytes: 0,
+  },
+  ArrayHeader: {
+    max_error: 0.0,
+  },
+  ArrayInfo: {
+    filter: "none",
+    codec: "none",
+    scale: [],
+    offset: [],
+  },
 } as const;
