@@ -1,8 +1,9 @@
 """Assets on this machine's disk, by the SHA-256 of their bytes: kept across sessions, shared by all processes.
 
 Layout: `FOLDER/ab/abcd...`, and `abcd....part` beside it while bytes of it come. A file has its final name only once
-its bytes have been hashed; a part that was left goes on where it ends. Who writes a part holds a lock of the system on
-it; another process that fetches the same asset meanwhile writes one of its own.
+its bytes have been hashed, so no session can put others under a name; a part that was left goes on where it ends, and
+is thrown away when what it becomes has another hash. Who writes a part holds a lock of the system on it; another
+process that fetches the same asset meanwhile writes one of its own.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import hashlib
 import mmap
 import os
+import threading
 import time
 from pathlib import Path
 from typing import Final
@@ -24,8 +26,9 @@ except ImportError:  # a system without such locks: every process writes parts o
     fcntl = None  # type: ignore[assignment]
 
 DEFAULT_MAX_BYTES: Final = 4 << 30
-#: What was used so lately is not taken away, however full the cache is.
+#: What was used so lately is not taken away. Where that alone is twice what the cache may hold, nothing more is stored.
 IN_USE_S: Final = 600.0
+FULL: Final = 2
 #: A part that nobody has written to for so long is of no use.
 STALE_PART_S: Final = 7 * 86_400.0
 #: The folder is looked through after so many bytes were stored.
@@ -42,13 +45,16 @@ def default_folder() -> Path:
 class AssetCache:
     """A folder, made when something is first stored. Any thread may use it; raises `AssetError` when it cannot be used.
 
-    Above `max_bytes` the assets that were used longest ago are taken away.
+    Above `max_bytes` the assets that were used longest ago are taken away; twice as many are never stored.
     """
 
     def __init__(self, folder: str | os.PathLike[str] | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         self.folder = default_folder() if folder is None else Path(folder)
         self.max_bytes = max_bytes
-        self._stored = TRIM_EVERY  # so the first that is stored looks through what is there
+        self._lock = threading.Lock()  # of the three below
+        self._trimming = False
+        self._unlooked = TRIM_EVERY  # so the first that is stored looks through what is there
+        self._held = 0
 
     def path(self, address: str) -> Path:
         """Where an asset lies, or would. Raises `ValueError` for what is no address."""
@@ -56,36 +62,30 @@ class AssetCache:
             raise ValueError(f"{address[:80]!r} is no address of an asset: 64 digits 0-9, a-f")
         return self.folder / address[:2] / address
 
-    def find(self, address: str) -> int | None:
-        """Bytes of an asset that is here, after hashing it; `None` when it is not. A damaged one is taken away."""
+    def find(self, address: str) -> memoryview | None:
+        """An asset that is here, mapped and hashed; `None` when it is not. A damaged one is taken away."""
         path = self.path(address)
         try:
-            with path.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            if digest == address:
+            view, status = _mapped(path)
+            if hashlib.sha256(view).hexdigest() == address:
                 os.utime(path)
-                return size
-            path.unlink(missing_ok=True)
+                return view
+            if os.path.samestat(status, os.stat(path)):  # nobody has put a good one there meanwhile
+                path.unlink(missing_ok=True)
         except FileNotFoundError:
             return None
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise _unusable(self.folder, error) from error
         return None
 
     def read(self, address: str) -> bytes:
         """The bytes of an asset that `find` found, or that was stored. Raises `AssetError` when they are gone."""
-        try:
-            return self.path(address).read_bytes()
-        except OSError as error:
-            raise AssetError(address, "gone", f"asset {address} is not in {self.folder}: fetch it again") from error
+        return bytes(self.view(address))
 
     def view(self, address: str) -> memoryview:
         """As `read`, mapped instead of copied."""
         try:
-            with self.path(address).open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                return memoryview(mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ)) if size else memoryview(b"")
+            return _mapped(self.path(address))[0]
         except OSError as error:
             raise AssetError(address, "gone", f"asset {address} is not in {self.folder}: fetch it again") from error
 
@@ -93,17 +93,30 @@ class AssetCache:
         """The part of an asset that is here already, to be gone on with. Raises `AssetError`."""
         path = self.path(address)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return Part(self, address, *_open_part(path))
+            try:
+                return Part(self, address, *_open_part(path))
+            except FileNotFoundError:  # the first asset that begins like this
+                path.parent.mkdir(parents=True, exist_ok=True)
+                return Part(self, address, *_open_part(path))
         except OSError as error:
             raise _unusable(self.folder, error) from error
 
     def stored(self, size: int) -> None:
-        """An asset was stored: makes room now and then."""
-        self._stored += size
-        if self._stored >= TRIM_EVERY:
-            self._stored = 0
-            self.trim()
+        """So many bytes were written: makes room now and then. Raises `AssetError` when there is none."""
+        most = FULL * self.max_bytes
+        with self._lock:
+            self._unlooked += size
+            self._held += size
+            look = not self._trimming and (self._unlooked >= TRIM_EVERY or self._held > most)
+            if look:
+                self._trimming, self._unlooked = True, 0
+        if look:
+            held = self.trim()
+            with self._lock:
+                self._trimming, self._held = False, held + self._unlooked
+        if self._held > most:
+            text = f"the cache of assets {self.folder} is full: {self._held >> 20} MiB were used in the last minutes"
+            raise AssetError("", "cache", f"{text}; give another folder, or more than {self.max_bytes >> 20} MiB")
 
     def trim(self) -> int:
         """Takes away what is too much, the longest unused first. The bytes that stay."""
@@ -112,17 +125,16 @@ class AssetCache:
         for path in self.folder.glob("??/*"):
             with contextlib.suppress(OSError):
                 status = path.stat()
-                if path.name.endswith(PART) and now - status.st_mtime > STALE_PART_S:
-                    path.unlink()
-                else:
-                    found.append((status.st_mtime, status.st_size, path))
+                found.append((status.st_mtime, status.st_size, path))
         total = sum(size for _, size, _ in found)
         for used, size, path in sorted(found):
-            if total <= self.max_bytes or now - used < IN_USE_S:
-                break
+            stale = path.name.endswith(PART) and now - used > STALE_PART_S
+            if not stale and (total <= self.max_bytes or now - used < IN_USE_S):
+                continue
             with contextlib.suppress(OSError):
-                path.unlink()
-                total -= size
+                if not (path.name.endswith(PART) and _is_written(path)):
+                    path.unlink()
+                    total -= size
         return total
 
 
@@ -136,9 +148,10 @@ class Part:
         self._file = os.fdopen(descriptor, "r+b", buffering=0)
         self._hash = hashlib.sha256()
         self.offset = 0
-        while block := self._file.read(1 << 20):
-            self._hash.update(block)
-            self.offset += len(block)
+        if os.fstat(descriptor).st_size:
+            while block := self._file.read(1 << 20):
+                self._hash.update(block)
+                self.offset += len(block)
 
     def append(self, data: bytes | memoryview) -> None:
         """The next bytes. Raises `AssetError` when they cannot be written."""
@@ -150,6 +163,7 @@ class Part:
             raise _unusable(self._cache.folder, error) from error
         self._hash.update(data)
         self.offset += len(data)
+        self._cache.stored(len(data))
 
     def finish(self) -> bool:
         """Stores what is here as the asset. False when these are not its bytes: it begins anew then."""
@@ -161,7 +175,6 @@ class Part:
             self._file.close()
         except OSError as error:
             raise _unusable(self._cache.folder, error) from error
-        self._cache.stored(self.offset)
         return True
 
     def restart(self) -> None:
@@ -182,23 +195,58 @@ class Part:
         self._file.close()
 
 
+def _mapped(path: Path) -> tuple[memoryview, os.stat_result]:
+    """The bytes of a file without copying them: other processes that read it share the pages."""
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        status = os.fstat(descriptor)
+        size = status.st_size
+        mapped = memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ) if size else b"")
+        return mapped, status
+    finally:
+        os.close(descriptor)
+
+
 def _open_part(path: Path) -> tuple[Path, int]:
-    """A part that nobody else writes: the common one, or else one of our own."""
+    """A part that nobody else writes: the common one, or else one of our own. Raises `OSError`."""
     common = path.with_name(path.name + PART)
     if fcntl is not None:
-        descriptor = os.open(common, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = -1
         try:
+            descriptor = os.open(common, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # It may have been finished, and so renamed, between opening and locking.
             if os.path.samestat(os.fstat(descriptor), os.stat(common)):
                 return common, descriptor
+        except FileNotFoundError:
+            if descriptor < 0:
+                raise  # there is no such folder
         except OSError:
             pass  # somebody else's, or a file system without locks
-        os.close(descriptor)
+        if descriptor >= 0:
+            os.close(descriptor)
     own = path.with_name(f"{path.name}.{os.getpid()}-{os.urandom(4).hex()}{PART}")
-    return own, os.open(own, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o600)
+    descriptor = os.open(own, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o600)
+    if fcntl is not None:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return own, descriptor
 
 
-def _unusable(folder: Path, error: OSError) -> AssetError:
-    text = f"the cache of assets {folder} cannot be used: {error.strerror or error}; give another folder"
-    return AssetError("", "cache", text)
+def _is_written(path: Path) -> bool:
+    """Whether somebody holds the lock of a part. Raises `OSError`."""
+    written = False
+    if fcntl is not None:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            written = True
+        finally:
+            os.close(descriptor)
+    return written
+
+
+def _unusable(folder: Path, error: OSError | ValueError) -> AssetError:
+    why = getattr(error, "strerror", None) or error
+    return AssetError("", "cache", f"the cache of assets {folder} cannot be used: {why}; give another folder")

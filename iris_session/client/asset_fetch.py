@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from iris_session.client.asset_cache import AssetCache
@@ -71,14 +71,24 @@ class AssetFetch:
             self._done[address], self._sizes[address] = size, total
             self.bytes_received += received
 
-    def found(self, address: str, size: int, decoded: Any, *, fetched: bool) -> None:
-        """An asset is here."""
-        if address in self.pending:
-            self._done[address] = self._sizes[address] = size
-            self.cached += not fetched
-            if self.decode is not None:
-                self.decoded[address] = decoded
-            del self.pending[address]
+    def found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+        """An asset is here; what functions made of it. Still pending, if ours was not among them."""
+        if address not in self.pending:
+            return
+        value: Any = None
+        if self.decode is not None:
+            found = [made for decode, made in decoded if decode == self.decode]
+            if not found:
+                return
+            value = found[0]
+        if isinstance(value, AssetError):
+            self.fail(address, value)
+            return
+        self._done[address] = self._sizes[address] = size
+        self.cached += not fetched
+        if self.decode is not None:
+            self.decoded[address] = value
+        del self.pending[address]
 
     def fail(self, address: str, error: AssetError) -> None:
         """An asset will not come."""

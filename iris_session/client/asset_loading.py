@@ -4,7 +4,8 @@
                                                `--drop
 
 Answers come in the order of the requests, so of one asset the bytes come in order too; whatever does not continue what
-is there is passed over, and asked for again. A window bounds what was asked for and is not stored yet.
+is there is passed over, and asked for again. A window bounds what was asked for and is not stored yet. Chunks are as
+large as the link is fast.
 """
 
 from __future__ import annotations
@@ -12,12 +13,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from iris_session.protocol.assets import MAX_ASSET_REQUESTS, AssetChunk, AssetRefused
+from iris_session.protocol.assets import (
+    MAX_ASSET_BYTES,
+    MAX_ASSET_CHUNK_BYTES,
+    MAX_ASSET_REQUESTS,
+    AssetChunk,
+    AssetRefused,
+)
 from iris_session.protocol.names import AssetRefusal
 
 CHUNK_BYTES: Final = 512 << 10
-#: Half of what a session allows: enough for 250 Mbit/s and 100 ms.
-WINDOW_BYTES: Final = 4 << 20
+#: What a chunk may become. A whole window in less time than `FAST_NS` doubles it: each costs as much work, whatever its
+#: size. One that takes longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
+MIN_CHUNK_BYTES: Final = 64 << 10
+MAX_CHUNK_BYTES: Final = MAX_ASSET_CHUNK_BYTES
+FAST_NS: Final = 100_000_000
+SLOW_NS: Final = 2_000_000_000
+#: Less than a session allows: enough for 400 Mbit/s and 100 ms.
+WINDOW_BYTES: Final = 6 << 20
 WINDOW_REQUESTS: Final = MAX_ASSET_REQUESTS // 2
 #: Assets that are looked up, received or hashed at once: small ones must not wait for each other's round trips.
 AT_ONCE: Final = 32
@@ -46,15 +59,23 @@ class Failed(NamedTuple):
 
 
 class _Item:
-    """One asset. `got`: bytes that came; `asked`: bytes that came or were asked for; `total` -1: not known yet."""
+    """One asset. `got`: bytes that came; `asked`: bytes that came or were asked for; `total` -1: not known yet. `told`:
+    what whoever wants it takes for its size, -1 if nothing: it decides how much is asked for first."""
 
-    __slots__ = ("address", "anew", "asked", "got", "total")
+    __slots__ = ("address", "anew", "asked", "got", "told", "total")
 
-    def __init__(self, address: str, got: int) -> None:
+    def __init__(self, address: str, got: int, told: int) -> None:
         self.address = address
         self.got = self.asked = got
+        self.told = told
         self.total = -1
         self.anew = False
+
+    def next_bytes(self, most: int) -> int:
+        """How much to ask for next."""
+        if self.total >= 0:
+            return min(most, self.total - self.asked)
+        return min(most, self.told - self.asked) if self.told > self.asked else most
 
     @property
     def open(self) -> bool:
@@ -66,10 +87,11 @@ class AssetLoader:
     """`now_ns` are of one monotonic clock."""
 
     def __init__(self) -> None:
-        self._wanted: dict[str, None] = {}  # not looked up yet
-        self._busy: dict[str, None] = {}  # in the hands of the workers
+        self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
+        self._busy: dict[str, int] = {}  # in the hands of the workers
         self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
-        self._asked: dict[int, Ask] = {}
+        self._asked: dict[int, tuple[Ask, int]] = {}  # with the time
+        self._chunk_bytes = CHUNK_BYTES
         self._unstored = 0
         self._next_id = 0
         self._pause_ns = self._paused_until_ns = 0
@@ -85,26 +107,24 @@ class AssetLoader:
         """Whether bytes are to come over the network."""
         return bool(self._items)
 
-    def want(self, address: str) -> bool:
-        """Adds an asset at the end of the order. False: it is on its way already."""
+    def want(self, address: str, size: int = -1) -> bool:
+        """Adds an asset at the end of the order; its size, if that is known. False: it is on its way already."""
         if address in self._wanted or address in self._busy or address in self._items:
             return False
-        self._wanted[address] = None
+        self._wanted[address] = size
         return True
 
     def to_look(self) -> Iterator[str]:
         """Assets to be looked up in the cache now."""
         while self._wanted and len(self._busy) + len(self._items) < AT_ONCE:
             address = next(iter(self._wanted))
-            del self._wanted[address]
-            self._busy[address] = None
+            self._busy[address] = self._wanted.pop(address)
             yield address
 
     def missing(self, address: str, offset: int) -> None:
         """It is not in the cache, but its first `offset` bytes are."""
         if address in self._busy:
-            del self._busy[address]
-            self._items[address] = _Item(address, offset)
+            self._items[address] = _Item(address, offset, self._busy.pop(address))
 
     def again(self, address: str) -> bool:
         """The bytes that came were not those of the asset: from the beginning. False: that was the second time."""
@@ -113,7 +133,7 @@ class AssetLoader:
         if item is not None and item.anew:
             self.drop(address)
             return False
-        fresh = self._items[address] = _Item(address, 0)
+        fresh = self._items[address] = _Item(address, 0, -1)
         fresh.anew = True
         return True
 
@@ -128,33 +148,42 @@ class AssetLoader:
             return
         for item in list(self._items.values()):
             while item.open:
-                length = CHUNK_BYTES if item.total < 0 else min(CHUNK_BYTES, item.total - item.asked)
+                length = item.next_bytes(self._chunk_bytes)
                 if len(self._asked) >= WINDOW_REQUESTS or self._outstanding + length > WINDOW_BYTES:
                     return
                 if not self._asked:
                     self._progress_ns = now_ns
                 self._next_id += 1
-                ask = self._asked[self._next_id] = Ask(self._next_id, item.address, item.asked, length)
+                ask = Ask(self._next_id, item.address, item.asked, length)
+                self._asked[self._next_id] = ask, now_ns
                 item.asked += length
                 yield ask
 
     @property
     def _outstanding(self) -> int:
-        return self._unstored + sum(ask.length for ask in self._asked.values())
+        return self._unstored + sum(ask.length for ask, _ in self._asked.values())
 
-    def chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | Failed:
-        """`size` bytes came. True: they are the next ones, to be stored (then call `stored`)."""
-        ask = self._asked.pop(chunk.request_id, None)
-        if ask is None:
+    def chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | Failed | None:
+        """`size` bytes came. True: they are the next ones, to be stored (then call `stored`). None: they are of no use
+        any more. False: nobody asked for them."""
+        ask, asked_ns = self._asked.pop(chunk.request_id, (None, 0))
+        if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
             return False
         self._progress_ns, self._pause_ns = now_ns, 0
+        self._suit(ask, size, now_ns - asked_ns)
         item = self._items.get(ask.address)
-        if item is None or chunk.offset != item.got or ask.offset != chunk.offset or chunk.address != ask.address:
-            return False
+        if item is None or chunk.offset != item.got:
+            if item is not None and item.got < chunk.offset < item.asked:
+                item.asked = chunk.offset  # something before it did not come
+            return None
         expected = min(ask.length, chunk.total - chunk.offset)
         if item.total not in (-1, chunk.total) or size > ask.length or (size == 0 and expected):
             self.drop(ask.address)
             return Failed(ask.address, "protocol", f"the session contradicts itself about asset {ask.address}")
+        if chunk.total > MAX_ASSET_BYTES:
+            self.drop(ask.address)
+            text = f"asset {ask.address} is said to have {chunk.total} bytes: at most {MAX_ASSET_BYTES} are fetched"
+            return Failed(ask.address, "protocol", text)
         item.total = chunk.total
         item.got += size
         if size < expected:
@@ -162,6 +191,15 @@ class AssetLoader:
         item.asked = max(item.got, min(item.asked, item.total))
         self._unstored += size
         return True
+
+    def _suit(self, ask: Ask, size: int, took_ns: int) -> None:
+        """Larger chunks for a fast link, smaller ones for a slow one: whole chunks tell."""
+        if size != self._chunk_bytes or size != ask.length:
+            return
+        if took_ns < FAST_NS:
+            self._chunk_bytes = min(2 * size, MAX_CHUNK_BYTES)
+        elif took_ns > SLOW_NS:
+            self._chunk_bytes = max(size // 2, MIN_CHUNK_BYTES)
 
     def whole(self, address: str) -> bool:
         """Whether all its bytes came."""
@@ -175,7 +213,7 @@ class AssetLoader:
     def refused(self, refused: AssetRefused, now_ns: int) -> Failed | str:
         """A request was refused. A `Failed` when the asset will not come; an address when it is to begin anew, after
         its part was thrown away (then call `missing` with 0); else empty: it is asked for again after a pause."""
-        ask = self._asked.pop(refused.request_id, None)
+        ask, _ = self._asked.pop(refused.request_id, (None, 0))
         if ask is None:
             return ""
         self._progress_ns = now_ns
@@ -189,7 +227,7 @@ class AssetLoader:
             return ""
         self.drop(ask.address)
         if refused.reason == AssetRefusal.BAD_RANGE and item.got and not item.anew:
-            self._busy[ask.address] = None  # our part is longer than the asset: it was of something else
+            self._busy[ask.address] = -1  # our part is longer than the asset: it was of something else
             return ask.address
         text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
         return Failed(ask.address, refused.reason, text)

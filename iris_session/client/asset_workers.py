@@ -1,29 +1,37 @@
 """Two threads that read, hash and write assets, and decode them for the application.
 
 An asset belongs to one of them, so what is asked for one asset happens in that order. What became of it is taken by
-`results` in the thread that polls.
+`results` in the thread that polls. On Linux they have a lower priority than the thread that polls: state comes first.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import queue
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 from iris_session.client.asset_cache import AssetCache, Part
 from iris_session.client.errors import AssetError
 
 THREADS: Final = 2
+#: Nice value of the threads above that of the process: a third of the weight. Not less, as they hold Python's lock for
+#: moments, and whoever polls then waits for them.
+NICER: Final = 5
+#: Who polls is woken after so many bytes: what comes next wakes it as well.
+WAKE_BYTES: Final = 1 << 20
 Decode = Callable[[str, memoryview], Any]
 
 
 class Found(NamedTuple):
-    """An asset is in the cache, decoded where that was asked for. `fetched`: it was stored just now."""
+    """An asset is in the cache. `decoded`: functions, with what each made of it, or the `AssetError` that it ended
+    with. `fetched`: it was stored just now."""
 
     address: str
     size: int
-    decoded: Any
+    decoded: tuple[tuple[Decode, Any], ...]
     fetched: bool
 
 
@@ -55,6 +63,7 @@ class Broken(NamedTuple):
 
 
 Result = Found | Missing | Stored | Wrong | Broken
+_Job = tuple[str, Callable[[], Result], int]
 
 
 class AssetWorkers:
@@ -64,23 +73,29 @@ class AssetWorkers:
     def __init__(self, cache: AssetCache, wake: Callable[[], None]) -> None:
         self.cache = cache
         self._wake = wake
-        self._pools = [ThreadPoolExecutor(1, f"iris-assets-{n}") for n in range(THREADS)]
         self._parts: dict[str, Part] = {}
         self._closing = False
         self._results: queue.SimpleQueue[Result] = queue.SimpleQueue()
+        self._jobs: list[queue.SimpleQueue[_Job | None]] = [queue.SimpleQueue() for _ in range(THREADS)]
+        self._threads = [
+            threading.Thread(target=self._run, args=(jobs,), name=f"iris-assets-{n}", daemon=True)
+            for n, jobs in enumerate(self._jobs)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def results(self) -> Iterator[Result]:
         """What was done since the last time."""
         while not self._results.empty():
             yield self._results.get_nowait()
 
-    def look(self, address: str, decode: Decode | None) -> None:
+    def look(self, address: str, decodes: Iterable[Decode]) -> None:
         """`Found` or `Missing`."""
 
         def work() -> Result:
-            size = self.cache.find(address)
-            if size is not None:
-                return self._found(address, size, decode, fetched=False)
+            view = self.cache.find(address)
+            if view is not None:
+                return _found(address, view, decodes, fetched=False)
             part = self._parts[address] = self.cache.begin(address)
             return Missing(address, part.offset)
 
@@ -97,7 +112,7 @@ class AssetWorkers:
 
         self._submit(address, work, len(data))
 
-    def finish(self, address: str, decode: Decode | None) -> None:
+    def finish(self, address: str, decodes: Iterable[Decode]) -> None:
         """All bytes were written: `Found` or `Wrong`."""
 
         def work() -> Result:
@@ -106,7 +121,7 @@ class AssetWorkers:
             if not part.finish():
                 return Wrong(address, size)
             del self._parts[address]
-            return self._found(address, size, decode, fetched=True)
+            return _found(address, self.cache.view(address), decodes, fetched=True)
 
         self._submit(address, work)
 
@@ -131,45 +146,66 @@ class AssetWorkers:
     def close(self) -> None:
         """Waits for what is being done, writes what has come, and leaves parts for another time."""
         self._closing = True
-        for pool in self._pools:
-            pool.shutdown()
+        for jobs in self._jobs:
+            jobs.put(None)
+        for thread in self._threads:
+            thread.join()
         for address in list(self._parts):
             self._close(address)
+
+    # --- the threads --------------------------------------------------------------------------------------------------
+
+    def _run(self, jobs: queue.SimpleQueue[_Job | None]) -> None:
+        _give_way()
+        untold = 0
+        while (job := jobs.get()) is not None:
+            address, work, size = job
+            if self._closing and not size:
+                continue  # only bytes are worth it
+            result = self._done(address, work, size)
+            self._results.put(result)
+            untold += size
+            if not isinstance(result, Stored) or untold >= WAKE_BYTES or jobs.empty():
+                untold = 0
+                self._wake()
+
+    def _done(self, address: str, work: Callable[[], Result], size: int) -> Result:
+        try:
+            return work()
+        except AssetError as error:
+            failure = error
+        except Exception as error:  # a fault of ours: it must not leave somebody waiting
+            failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
+            failure.__cause__ = error
+        self._close(address)
+        if size:
+            self._results.put(Stored(size))
+        return Broken(failure, address)
 
     def _close(self, address: str) -> None:
         part = self._parts.pop(address, None)
         if part is not None:
             part.close()
 
-    def _found(self, address: str, size: int, decode: Decode | None, *, fetched: bool) -> Result:
-        decoded: Any = None
-        if decode is not None:
-            try:
-                decoded = decode(address, self.cache.view(address))
-            except Exception as error:  # of the application: whatever it is belongs to this asset
-                text = f"asset {address} could not be decoded: {type(error).__name__}: {error}"
-                failure = AssetError(address, "decode", text)
-                failure.__cause__ = error
-                return Broken(failure, address)
-        return Found(address, size, decoded, fetched)
-
     def _submit(self, address: str, work: Callable[[], Result], size: int = 0) -> None:
-        def job() -> None:
-            if self._closing and not size:
-                return  # only bytes are worth it
-            try:
-                result = work()
-            except AssetError as error:
-                self._close(address)
-                self._results.put(Broken(error, address))
-                result = Stored(size)
-            except Exception as error:  # a fault of ours: it must not leave somebody waiting
-                self._close(address)
-                failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
-                failure.__cause__ = error
-                self._results.put(Broken(failure, address))
-                result = Stored(size)
-            self._results.put(result)
-            self._wake()
+        self._jobs[int(address[:8], 16) % THREADS].put((address, work, size))
 
-        self._pools[int(address[:8], 16) % THREADS].submit(job)
+
+def _found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched: bool) -> Result:
+    decoded: list[tuple[Decode, Any]] = []
+    for decode in decodes:
+        try:
+            decoded.append((decode, decode(address, view)))
+        except Exception as error:  # of the application: whatever it is belongs to this asset
+            text = f"asset {address} could not be decoded: {type(error).__name__}: {error}"
+            failure = AssetError(address, "decode", text)
+            failure.__cause__ = error
+            decoded.append((decode, failure))
+    return Found(address, len(view), tuple(decoded), fetched)
+
+
+def _give_way() -> None:
+    """Lowers the priority of this thread, where threads have one (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        nice = min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)

@@ -51,8 +51,9 @@ class Assets:
         of connections. With sizes (a mapping), `bytes_total` is known from the beginning.
 
         `on_progress(fetch)`: called from `poll` when something has come. `decode(address, bytes)`: called in another
-        thread with every asset when it is there (once, where two fetches want the same); what it returns is in
-        `AssetFetch.decoded`, what it raises is an `AssetError`. Raises `InvalidMessageError` for what is no address.
+        thread with every asset when it is there (once for one function, however many fetches have it); what it returns
+        is in `AssetFetch.decoded`, what it raises is an `AssetError`. Raises `InvalidMessageError` for what is no
+        address, `AssetError` when `asset_cache` was exchanged while something was on its way.
 
             fetch = client.fetch_assets([scene_hash])
             client.wait_for(lambda c: fetch.done, 30.0)
@@ -65,16 +66,33 @@ class Assets:
         with self._lock:
             if self.connection.phase is Phase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            fetch = AssetFetch(self.asset_cache, addresses, sizes, on_progress, decode)
-            self._fetches.append(fetch)
             if self._workers is None or self._workers.cache is not self.asset_cache:
+                if any(fetch.pending for fetch in self._fetches):
+                    raise AssetError(
+                        "", "cache", "asset_cache was exchanged while assets were on their way into another"
+                    )
                 self._end_workers()
                 self._workers = AssetWorkers(self.asset_cache, self._sockets.wake)
                 self._sockets.wake_anybody()
+            fetch = AssetFetch(self.asset_cache, addresses, sizes, on_progress, decode)
+            self._fetches.append(fetch)
             for address in fetch.addresses:
-                self._loader.want(address)
+                self._loader.want(address, sizes.get(address, -1))
             self._sockets.wake()
             return fetch
+
+    def cancel_assets(self, fetch: AssetFetch) -> None:
+        """What `fetch` still waits for is not wanted any more: it has `failed`, as `cancelled`. What has come of it
+        stays in the cache, to be gone on with. Does nothing when it is done."""
+        with self._lock:
+            for address in list(fetch.pending):
+                error = AssetError(address, "cancelled", f"asset {address} was not waited for")
+                fetch.fail(address, error)
+                if not any(address in other.pending for other in self._fetches):
+                    self._loader.drop(address)
+                    if self._workers is not None:
+                        self._workers.leave(address)
+            self._sockets.wake()
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -91,7 +109,7 @@ class Assets:
             self._take_result(result)
             progressed = True
         for address in loader.to_look():
-            workers.look(address, self._decode_of(address))
+            workers.look(address, self._decodes_of(address))
         if loader.needs_link and self.connection.joined:
             progressed |= self._exchange(workers)
         elif not loader.needs_link:
@@ -143,14 +161,14 @@ class Assets:
             self._fail(taken.address, AssetError(*taken))
             return
         if not taken:
-            self.assets_malformed += 1
+            self.assets_malformed += taken is False
             return
         workers.write(chunk.address, data)
         for fetch in self._fetches:
             fetch.has(chunk.address, chunk.offset + len(data), chunk.total, len(data))
         self._tell(chunk.address)
         if loader.whole(chunk.address):
-            workers.finish(chunk.address, self._decode_of(chunk.address))
+            workers.finish(chunk.address, self._decodes_of(chunk.address))
 
     def _take_result(self, result: Result) -> None:
         loader = self._loader
@@ -161,6 +179,8 @@ class Assets:
             self._tell(result.address)
             for fetch in self._fetches:
                 fetch.found(result.address, result.size, result.decoded, fetched=result.fetched)
+            if any(result.address in fetch.pending for fetch in self._fetches):
+                loader.want(result.address, result.size)  # somebody came meanwhile who wants it decoded otherwise
         elif isinstance(result, Missing):
             loader.missing(result.address, result.offset)
         elif isinstance(result, Broken):
@@ -180,10 +200,13 @@ class Assets:
     def _tell(self, address: str) -> None:
         self._news += [fetch for fetch in self._fetches if address in fetch.pending and fetch not in self._news]
 
-    def _decode_of(self, address: str) -> Decode | None:
-        """Of the fetches that wait for an asset, the first that wants it decoded."""
-        found = (fetch.decode for fetch in self._fetches if address in fetch.pending)
-        return next((decode for decode in found if decode is not None), None)
+    def _decodes_of(self, address: str) -> list[Decode]:
+        """What the fetches that wait for an asset want to be made of it, each once."""
+        found: list[Decode] = []
+        for fetch in self._fetches:
+            if address in fetch.pending and fetch.decode is not None and fetch.decode not in found:
+                found.append(fetch.decode)
+        return found
 
     def _drop_asset_link(self) -> None:
         self._sockets.close_assets()

@@ -86,7 +86,7 @@ class AssetError(ClientError):
     """An asset could not be fetched. `address`: empty when it concerns all of them.
 
     `reason`: an `AssetRefusal`, `hash` (twice the bytes were others than its address says), `protocol`, `decode`,
-    `cache` (the folder of the cache cannot be used), `gone` (taken away since), `no_channel` or `closed`.
+    `cache` (the folder of the cache cannot be used), `gone` (taken away since), `no_channel`, `cancelled` or `closed`.
     """
 
     def __init__(self, address: str, reason: str, text: str) -> None:

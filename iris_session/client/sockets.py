@@ -17,6 +17,7 @@ import zmq
 
 from iris_session.client.errors import IdentityError
 from iris_session.keys import KeysError, load_public, load_secret
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 
 STATE_HWM: Final = 2
@@ -27,7 +28,9 @@ CONTROL_HWM: Final = 64
 MEDIA_RCVBUF: Final = 131_072
 MEDIA_HWM: Final = 2
 #: More than may be asked for at once.
-ASSETS_HWM: Final = 128
+ASSETS_SEND_HWM: Final = 128
+#: Chunks that wait to be looked at: more wait in the session.
+ASSETS_HWM: Final = 16
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 MAX_DRAIN: Final = 64  # messages taken in one go; more than the queues hold
 LINGER_MS: Final = 200
@@ -169,7 +172,8 @@ class ClientSockets:
         """Connects to the assets channel, if it is not."""
         if self._assets is None:
             assets = self._assets = self._new_socket(zmq.DEALER)
-            assets.setsockopt(zmq.SNDHWM, ASSETS_HWM)
+            assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
+            assets.setsockopt(zmq.SNDHWM, ASSETS_SEND_HWM)
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
             assets.setsockopt(zmq.RECONNECT_IVL, 50)
             assets.setsockopt(zmq.RECONNECT_IVL_MAX, 500)

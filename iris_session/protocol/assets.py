@@ -16,6 +16,8 @@ from iris_session.protocol.common import Count, Name, Text
 
 #: Bytes of one chunk at most. Smaller ones share a link more fairly, larger ones cost less per byte.
 MAX_ASSET_CHUNK_BYTES: Final = 1 << 20
+#: Bytes of one asset at most, the largest array and its header: whoever is told of more fetches nothing of it.
+MAX_ASSET_BYTES: Final = (1 << 30) + (1 << 20)
 #: What a client may have asked for and not been sent yet, at most, by one connection to the channel.
 MAX_ASSET_REQUESTS: Final = 64
 MAX_ASSET_WINDOW_BYTES: Final = 8 << 20

@@ -25,12 +25,12 @@ def test_what_was_stored_is_found_and_read(tmp_path: Path) -> None:
     assert cache.find(ADDRESS) is None
     part.append(DATA[60_000:])
     assert part.finish()
-    assert cache.find(ADDRESS) == len(DATA)
+    assert cache.find(ADDRESS) == DATA
     assert cache.read(ADDRESS) == bytes(cache.view(ADDRESS)) == DATA
     assert [path.name for path in tmp_path.glob("??/*")] == [ADDRESS]
     empty = hashlib.sha256(b"").hexdigest()
     assert cache.begin(empty).finish()
-    assert (cache.find(empty), cache.read(empty), bytes(cache.view(empty))) == (0, b"", b"")
+    assert (cache.find(empty), cache.read(empty), bytes(cache.view(empty))) == (b"", b"", b"")
 
 
 def test_a_part_that_was_left_goes_on(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_another_process_at_the_same_asset_does_no_harm(tmp_path: Path) -> None:
     late = cache.begin(ADDRESS)  # what the dead one left is nobody's
     assert late.offset == len(b"of somebody else")
     late.close()
-    assert cache.find(ADDRESS) == len(DATA)
+    assert cache.find(ADDRESS) == DATA
 
 
 def test_above_its_bound_the_longest_unused_goes(tmp_path: Path) -> None:
@@ -112,10 +112,77 @@ def test_above_its_bound_the_longest_unused_goes(tmp_path: Path) -> None:
     old.append(b"x")
     old.close()
     os.utime(tmp_path / "00" / ("0" * 64 + ".part"), (1, 1))
-    assert cache.find(addresses[0]) == 10_000  # used now
+    assert cache.find(addresses[0]) == bytes(10_000)  # used now
     assert cache.trim() == 20_000
     assert [cache.path(a).exists() for a in addresses] == [True, False, False, True]
     assert not (tmp_path / "00" / ("0" * 64 + ".part")).exists()
+
+
+def stored(cache: AssetCache, data: bytes) -> str:
+    address = hashlib.sha256(data).hexdigest()
+    part = cache.begin(address)
+    part.append(data)
+    assert part.finish()
+    return address
+
+
+def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) -> None:
+    """A link that stood still for longer than assets are kept: what then comes is not lost."""
+    cache = AssetCache(tmp_path, max_bytes=100_000)
+    parts = [cache.begin(ADDRESS), cache.begin(ADDRESS)]  # the common one, and one of our own
+    left = cache.begin("1" * 64)
+    for part in (*parts, left):
+        part.append(DATA[:40_000])
+    left.close()
+    for path in tmp_path.glob("??/*.part"):
+        os.utime(path, (1, 1))
+    assert cache.trim() == 80_000
+    for part in parts:
+        part.append(DATA[40_000:])
+        assert part.finish()
+    assert cache.find(ADDRESS) == DATA
+
+
+def test_more_than_twice_its_bound_is_never_stored(tmp_path: Path) -> None:
+    """All of it was used just now: a session cannot fill the disk by naming ever more."""
+    cache = AssetCache(tmp_path, max_bytes=1 << 20)
+    for i in range(2):
+        stored(cache, bytes([i]) * (1 << 20))
+    part = cache.begin(ADDRESS)
+    with pytest.raises(AssetError, match=r"full.*more than 1 MiB") as caught:
+        part.append(DATA)
+    assert caught.value.reason == "cache"
+    part.close()
+    for path in tmp_path.glob("??/*"):
+        os.utime(path, (1, 1))
+    assert stored(cache, DATA[:-1]) != ADDRESS, "there is room again"
+
+
+def test_what_another_session_left_under_a_name_costs_one_more_fetch_and_no_more(tmp_path: Path) -> None:
+    """A session that sends other bytes than those of the address, and is left in the middle of them."""
+    for lie in (b"x" * 40_000, DATA[:-1] + b"?", DATA + b"longer than the asset"):
+        part = AssetCache(tmp_path).begin(ADDRESS)
+        part.append(lie)
+        part.close()
+        again = AssetCache(tmp_path).begin(ADDRESS)
+        assert again.offset == len(lie)
+        again.append(DATA[again.offset :])
+        assert not again.finish()
+        assert again.offset == 0
+        assert AssetCache(tmp_path).find(ADDRESS) is None
+        again.close()
+    assert stored(AssetCache(tmp_path), DATA) == ADDRESS
+
+
+def test_parts_of_other_people_in_a_shared_folder_do_no_harm(tmp_path: Path) -> None:
+    """Nor do links that somebody put there: nothing is written where they lead."""
+    cache, elsewhere = AssetCache(tmp_path / "cache"), tmp_path / "elsewhere"
+    elsewhere.write_bytes(b"precious")
+    path = cache.path(ADDRESS)
+    path.parent.mkdir(parents=True)
+    path.with_name(path.name + ".part").symlink_to(elsewhere)
+    assert stored(cache, DATA) == ADDRESS
+    assert elsewhere.read_bytes() == b"precious"
 
 
 def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:

@@ -9,15 +9,19 @@ import pytest
 from iris_session.client.asset_loading import (
     AT_ONCE,
     CHUNK_BYTES,
+    FAST_NS,
     FIRST_PAUSE_NS,
+    MAX_CHUNK_BYTES,
+    MIN_CHUNK_BYTES,
     PATIENCE_NS,
+    SLOW_NS,
     WINDOW_BYTES,
     WINDOW_REQUESTS,
     Ask,
     AssetLoader,
     Failed,
 )
-from iris_session.protocol.assets import AssetChunk, AssetRefused
+from iris_session.protocol.assets import MAX_ASSET_BYTES, AssetChunk, AssetRefused
 from iris_session.protocol.names import AssetRefusal
 
 
@@ -30,7 +34,8 @@ def started(*addresses: str, offset: int = 0) -> AssetLoader:
     return loader
 
 
-def answer(loader: AssetLoader, ask: Ask, total: int, size: int = -1, now_ns: int = 0) -> bool | Failed:
+def answer(loader: AssetLoader, ask: Ask, total: int, size: int = -1, now_ns: int = FAST_NS) -> bool | Failed | None:
+    """By default as fast as leaves the size of chunks as it is."""
     size = max(0, min(ask.length, total - ask.offset)) if size < 0 else size
     return loader.chunk(AssetChunk(1, ask.request_id, ask.address, ask.offset, total), size, now_ns)
 
@@ -65,6 +70,57 @@ def test_the_window_is_of_bytes_that_are_not_stored_yet() -> None:
     assert list(loader.requests(0)) == []
     loader.stored(CHUNK_BYTES)
     assert len(list(loader.requests(0))) == 1
+
+
+def test_chunks_are_as_large_as_the_link_is_fast() -> None:
+    loader = started("a")
+    now_ns, lengths = 0, []
+    for took_ns in (1, 1, FAST_NS, *[SLOW_NS + 1] * 6, 1):
+        ask = next(iter(loader.requests(now_ns)))
+        lengths.append(ask.length)
+        now_ns += took_ns
+        assert answer(loader, ask, 100 * WINDOW_BYTES, now_ns=now_ns) is True
+        loader.stored(ask.length)
+        loader.cut_off()
+    assert lengths[:4] == [CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_CHUNK_BYTES]
+    assert lengths[4:8] == [MAX_CHUNK_BYTES >> n for n in range(1, 5)]
+    assert lengths[8:] == [MIN_CHUNK_BYTES] * 2
+    (ask,) = list(loader.requests(now_ns))[:1]
+    assert ask.length == 2 * MIN_CHUNK_BYTES
+
+
+def test_known_sizes_are_all_that_is_asked_for() -> None:
+    loader = AssetLoader()
+    for name in "abc":
+        loader.want(name, 1000)
+    for name in loader.to_look():
+        loader.missing(name, 400 if name == "b" else 2000 if name == "c" else 0)
+    a, b, c = loader.requests(0)
+    assert [(ask.offset, ask.length) for ask in (a, b)] == [(0, 1000), (400, 600)]
+    assert (c.offset, c.length) == (2000, CHUNK_BYTES), "it was said to have less than is here: the session decides"
+    assert answer(loader, a, 3000, 1000) is True, "so does it where there is more"
+    (rest,) = loader.requests(0)
+    assert (rest.offset, rest.length) == (1000, 2000)
+
+
+def test_an_asset_larger_than_any_is_not_begun() -> None:
+    loader = started("a", "b")
+    a, b = loader.requests(0)
+    failed = answer(loader, a, MAX_ASSET_BYTES + 1)
+    assert isinstance(failed, Failed)
+    assert failed.reason == "protocol"
+    assert answer(loader, b, MAX_ASSET_BYTES) is True
+
+
+def test_answers_in_another_order_leave_no_gap() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    answer(loader, ask, 4 * CHUNK_BYTES)
+    first, second, third = loader.requests(0)
+    assert answer(loader, third, 4 * CHUNK_BYTES) is None
+    assert answer(loader, first, 4 * CHUNK_BYTES) is True
+    assert answer(loader, second, 4 * CHUNK_BYTES) is True
+    assert [ask.offset for ask in loader.requests(0)] == [third.offset]
 
 
 def test_small_ones_are_bounded_by_number() -> None:
@@ -112,7 +168,7 @@ def test_one_refusal_in_the_middle_leaves_no_gap() -> None:
     first, second, third = loader.requests(0)
     assert answer(loader, first, 4 * CHUNK_BYTES) is True
     assert refuse(loader, second, AssetRefusal.RATE) == ""
-    assert answer(loader, third, 4 * CHUNK_BYTES) is False  # there is a gap before it
+    assert answer(loader, third, 4 * CHUNK_BYTES) is None  # there is a gap before it
     again = list(loader.requests(FIRST_PAUSE_NS))
     assert [ask.offset for ask in again] == [second.offset, third.offset]
     assert [answer(loader, ask, 4 * CHUNK_BYTES) for ask in again] == [True, True]
@@ -125,7 +181,7 @@ def test_a_chunk_that_is_shorter_than_asked_leaves_no_gap() -> None:
     answer(loader, ask, 3 * CHUNK_BYTES)
     first, second = loader.requests(0)
     assert answer(loader, first, 3 * CHUNK_BYTES, 10) is True
-    assert answer(loader, second, 3 * CHUNK_BYTES) is False
+    assert answer(loader, second, 3 * CHUNK_BYTES) is None
     assert next(iter(loader.requests(0))).offset == CHUNK_BYTES + 10
 
 

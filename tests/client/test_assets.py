@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -198,3 +199,62 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
     fetch = client.fetch_assets(store.addresses[:2])
     until_done(client, fetch)
     fetch.check()
+
+
+def test_what_is_cancelled_is_not_fetched_any_more_and_goes_on_later(store: Store, join: Callable[..., Client]) -> None:
+    client = join()
+    large, small = store.addresses[1], store.addresses[0]
+    fetch = client.fetch_assets([large, small])
+    shared = client.fetch_assets([small])
+    assert client.wait_for(lambda _: fetch.bytes_done >= MIB, DEADLINE_S)
+    client.cancel_assets(fetch)
+    assert fetch.done
+    assert fetch.failed[large].reason == "cancelled"
+    until_done(client, shared)
+    assert shared.read(small) == store.data[small], "another still waits for it"
+    again = client.fetch_assets([large])
+    until_done(client, again)
+    assert again.read(large) == store.data[large]
+    assert 0 < again.bytes_received <= len(store.data[large]) - MIB
+    client.cancel_assets(again)
+    assert again.failed == {}
+    assert client.assets_malformed == 0
+
+
+def test_each_fetch_gets_what_its_own_function_makes_of_an_asset(store: Store, join: Callable[..., Client]) -> None:
+    client = join()
+    address = store.addresses[0]
+
+    def failing(_address: str, _data: memoryview) -> None:
+        raise ZeroDivisionError("of the application")
+
+    begun = threading.Event()
+    late: list[AssetFetch] = []
+
+    def slow(_address: str, data: memoryview) -> int:
+        begun.set()
+        assert waited.wait(DEADLINE_S)
+        return len(data)
+
+    waited = threading.Event()
+    fetches = [client.fetch_assets([address], decode=d) for d in (slow, lambda *_: "b", failing, None)]
+    assert client.wait_for(lambda _: begun.is_set(), DEADLINE_S)
+    late.append(client.fetch_assets([address], decode=lambda *_: "late"))
+    waited.set()
+    for fetch in (*fetches, *late):
+        until_done(client, fetch)
+    assert [fetch.decoded.get(address) for fetch in (*fetches, *late)] == [1000, "b", None, None, "late"]
+    assert [[error.reason for error in fetch.failed.values()] for fetch in fetches] == [[], [], ["decode"], []]
+
+
+def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
+    store: Store, join: Callable[..., Client], tmp_path: Path
+) -> None:
+    client = join()
+    fetch = client.fetch_assets(store.addresses)
+    client.asset_cache = AssetCache(tmp_path / "another")
+    with pytest.raises(AssetError, match="exchanged"):
+        client.fetch_assets(store.addresses[:1])
+    until_done(client, fetch)
+    fetch.check()
+    assert {address: fetch.read(address) for address in store.addresses} == store.data
