@@ -22,6 +22,7 @@ from iris_session import Session, SessionConfig
 from iris_session.cli.main import build_parser
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol import names
+from iris_session.runtime.demo import DemoResult
 from tests.models import BESIDE
 
 ROOT = Path(__file__).parents[1]
@@ -381,6 +382,13 @@ def test_all_tables_of_reasons_are_there() -> None:
         "FaultCode",
         "LateCause",
     }
+
+
+def test_every_key_of_a_demos_result_is_explained() -> None:
+    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"<!-- fields: demo -->\n(.*?)<!-- end -->", page, re.DOTALL)
+    keys = [key for row in re.findall(r"^\| (`.+?) \|", table, re.MULTILINE) for key in re.findall(r"`(\w+)`", row)]
+    assert sorted(keys) == sorted(DemoResult.__struct_fields__)
 
 
 def test_roles_modes_and_policies_are_in_the_guide() -> None:

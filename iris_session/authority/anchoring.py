@@ -71,6 +71,10 @@ def move_anchor(ctx: Context, p: Participant, m: MoveAnchor) -> None:
     if not alignment.is_pose(ctx, m.T_world_anchor):
         text = f"the pose is not finite with a unit quaternion, or further than {ctx.config.reach_m:g} m away"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "", m.anchor_id))
+    away_m, most_m = math.dist(m.T_world_anchor.p, ctx.state.anchors[m.anchor_id].p), ctx.config.max_anchor_move_m
+    if away_m > most_m and not m.force:
+        text = f"anchor {m.anchor_id} would be moved by {away_m:.1f} m; more than {most_m:g} m needs --force (`force`)"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.TOO_FAR, text, "poses are in metres", m.anchor_id))
     _move(ctx, {**ctx.state.anchors, m.anchor_id: corrections.clean(m.T_world_anchor)}, p.id)
     return ctx.accept(p, m.request_id)
 

@@ -49,6 +49,7 @@ POSITIVE: Final = (
     "max_sub_holders",
     "max_step_ticks",
     "contact_step_n",
+    "max_anchor_move_m",
     "slide_ns",
     "slide_m_per_s",
     "slide_rad_per_s",
@@ -95,6 +96,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
     min_change_rad: float = 0.002
+    max_anchor_move_m: float = 5.0  # at once, without being told that it is meant: wrong units are seen by it
     anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
     settle_ns: int = 15 * SECOND  # after the first alignment of a run; from then on corrections come gently
     slide_ns: int = 500 * MS  # between two parts of a correction that slides in

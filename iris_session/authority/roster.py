@@ -247,4 +247,5 @@ def snapshot(ctx: Context, request_id: int) -> Snapshot:
         paused=state.paused,
         estop=state.estop,
         episode=state.episode,
+        tick_period_ns=ctx.view.tick_period_ns,
     )

@@ -74,7 +74,8 @@ def new_scene(ctx: Context, cause: str) -> None:
     engagement.rearm_all(ctx, HoldReason.SCENE_CHANGED)
     for lease in ctx.state.objects.values():
         lease.lead = 0
-    ctx.emit(SceneChanged(ctx.state.scene_epoch, ctx.state.scene_revision, cause))
+    period_ns = ctx.view.tick_period_ns if cause == "new_scene" else 0
+    ctx.emit(SceneChanged(ctx.state.scene_epoch, ctx.state.scene_revision, cause, tick_period_ns=period_ns))
 
 
 def gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
 EVERYBODY: Final = "all"
-#: Further than this nobody carries a sheet: a wrong unit or digit.
-FAR_M: Final = 5.0
 #: Sheets that are told of per headset, those seen last first.
 MAX_SEEN: Final = 8
 
@@ -97,7 +95,7 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
         "move",
         help="say where an anchor of the session is",
         description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
-        f"what is measured. Further than {FAR_M:g} m only with --force. Joins as a director.",
+        "what is measured. Further than 5 m only with --force. Joins as a director.",
         epilog="examples:\n"
         "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
         "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
@@ -105,7 +103,7 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     )
     one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
     add_pose(one, "T_world_anchor")
-    one.add_argument("--force", action="store_true", help=f"also further than {FAR_M:g} m from where it is")
+    one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
     add_way_to_session(one, option=True)
     add_json(one)
     one.set_defaults(run=run_move)
@@ -176,12 +174,7 @@ def run_move(arguments: argparse.Namespace) -> int:
         report = client.status()
         was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
         away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
-        if away_m > FAR_M and not arguments.force:
-            raise CommandError(
-                f"anchor '{arguments.anchor}' would be moved by {away_m:.1f} m; more than {FAR_M:g} m needs --force "
-                "(poses are in metres)"
-            )
-        client.move_anchor(arguments.anchor, arguments.pose)
+        client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
     aligned = [p for p in headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
     stay = {p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := stays(p, arguments.anchor))}
     follow = [p for p in aligned if p.id not in stay]

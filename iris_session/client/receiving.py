@@ -192,12 +192,8 @@ class Receiving:
             self.counters.malformed += 1
             return
         self.counters.snapshots += 1
-        known = self.mirror.event_seq
-        events = self.mirror.apply_snapshot(snapshot)
-        if 0 < known < snapshot.event_seq:
-            self._deliver(Missed(known + 1, snapshot.event_seq))
-        for event in events:
-            self._deliver(event)
+        for told in self.mirror.apply_snapshot(snapshot):
+            self._deliver(told)
         if self.mirror.estop:
             self.stop.withdraw()
         self.stream.scene_epoch = self.mirror.scene_epoch
@@ -213,6 +209,17 @@ class Receiving:
         if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
             self.stream.forget_presence(message.body.participant)
         if len(self.inbox) >= MAX_INBOX:
-            self.inbox.popleft()
-            self.counters.inbox_dropped += 1
+            self._make_room()
         self.inbox.append(message)
+
+    def _make_room(self) -> None:
+        """Nobody takes what waits: the oldest goes, and one note at the front says which events went with it."""
+        lost: Missed | None = None
+        while len(self.inbox) >= MAX_INBOX - (lost is not None):
+            gone = self.inbox.popleft()
+            self.counters.inbox_dropped += not isinstance(gone, Missed)
+            if isinstance(gone, Event | Missed):
+                first, last = gone if isinstance(gone, Missed) else (gone.event_seq, gone.event_seq)
+                lost = Missed(first if lost is None else lost.first, last)
+        if lost is not None:
+            self.inbox.appendleft(lost)

@@ -175,9 +175,12 @@ class Requests:
         """
         self.request(Align(0, action, participant))
 
-    def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike) -> None:
-        """Director: says where an anchor of the session is; the scene moves for everyone who is aligned to it."""
-        self.request(MoveAnchor(0, anchor_id, pose_of("T_world_anchor", T_world_anchor)))
+    def move_anchor(self, anchor_id: str, T_world_anchor: PoseLike, *, force: bool = False) -> None:
+        """Director: says where an anchor of the session is; the scene moves for everyone who is aligned to it.
+
+        `force`: also further than 5 m from where it was. Raises `DeniedError` (`too_far`) without it.
+        """
+        self.request(MoveAnchor(0, anchor_id, pose_of("T_world_anchor", T_world_anchor), force))
 
     def estop(self, reason: object = "") -> bool:
         """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop.

@@ -44,6 +44,13 @@ class SceneView:
         return self._state
 
     @property
+    def tick_period_ns(self) -> int:
+        """Simulated time of one tick of the present scene [ns], 0 before the first welcome. Another scene that is
+        loaded may have another."""
+        welcome = self.connection.welcome
+        return self.connection.mirror.tick_period_ns or (0 if welcome is None else welcome.tick_period_ns)
+
+    @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:
         """Heads and hands of everyone who is connected by `(participant, device)`, as they are now."""
         with self._lock:

@@ -39,7 +39,7 @@ _encoder = msgspec.msgpack.Encoder(order="deterministic")
 
 
 class Missed(NamedTuple):
-    """Events `first` to `last` that were not handed over: a snapshot tells what came of them, not what they were."""
+    """Events `first` to `last` that will not be handed over: a snapshot tells what came of them, not what they were."""
 
     first: int
     last: int
@@ -62,10 +62,12 @@ class SessionMirror:
     def reset(self) -> None:
         """Forgets the session, keeps the counters."""
         self.synced = False
+        self._begun = False  # a snapshot has come
         self.event_seq = 0
         self.scene_epoch = 0
         self.scene_revision = 0
         self.scene_hash = ""
+        self.tick_period_ns = 0
         self.paused = False
         self.estop = False
         self.episode: EpisodeChanged | None = None
@@ -77,18 +79,24 @@ class SessionMirror:
         self.index_of_id: dict[int, int] = {}
         self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
 
-    def apply_snapshot(self, snapshot: Snapshot) -> list[Event]:
-        """Takes over a snapshot and the held events after it. Returns those events in order.
+    def apply_snapshot(self, snapshot: Snapshot) -> list[Event | Missed]:
+        """Takes over a snapshot and the held events after it. Returns, in order, the events since the last one that was
+        applied: each one that came, and for those that did not come that they are missed. What was before the first
+        snapshot is neither.
 
         An older snapshot than what is already known (`event_seq`) is discarded unless a gap is open.
         """
         if self.synced and snapshot.event_seq < self.event_seq:
             self.discarded += 1
             return []
+        held = {event.event_seq: event for event in self._held}
+        self._held = deque(maxlen=MAX_HELD_EVENTS)
+        told = self._covered(held, snapshot.event_seq) if self._begun else []
         self.event_seq = snapshot.event_seq
         self.scene_epoch = snapshot.scene_epoch
         self.scene_revision = snapshot.scene_revision
         self.scene_hash = snapshot.scene_hash
+        self.tick_period_ns = snapshot.tick_period_ns
         self.paused = snapshot.paused
         self.estop = snapshot.estop
         self.episode = snapshot.episode
@@ -98,9 +106,22 @@ class SessionMirror:
         self.bodies = snapshot.bodies
         self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
         self.index_of_id = {body.id: i for i, body in enumerate(snapshot.bodies)}
-        self.synced = True
-        held, self._held = self._held, deque(maxlen=MAX_HELD_EVENTS)
-        return [event for event in held if self.apply_event(event)]
+        self.synced = self._begun = True
+        self.discarded += 0 if told else sum(seq <= snapshot.event_seq for seq in held)
+        return told + [held[seq] for seq in sorted(held) if seq > snapshot.event_seq and self.apply_event(held[seq])]
+
+    def _covered(self, held: dict[int, Event], last: int) -> list[Event | Missed]:
+        """What is to be told of the events up to `last`, which a snapshot contains."""
+        told: list[Event | Missed] = []
+        next_seq = self.event_seq + 1
+        for seq in sorted(seq for seq in held if next_seq <= seq <= last):
+            if seq > next_seq:
+                told.append(Missed(next_seq, seq - 1))
+            told.append(held[seq])
+            next_seq = seq + 1
+        if next_seq <= last:
+            told.append(Missed(next_seq, last))
+        return told
 
     def apply_event(self, event: Event) -> bool:
         """Applies the next event. False: it was discarded, or held until a snapshot comes (`synced` is then false)."""
@@ -149,6 +170,7 @@ class SessionMirror:
             self.scene_epoch,
             self.scene_revision,
             self.scene_hash,
+            self.tick_period_ns,
             self.paused,
             self.estop,
             self.episode,
@@ -179,10 +201,11 @@ class SessionMirror:
                 info_or_none = self.participants.get(name)
                 if info_or_none is not None:
                     self.participants[name] = msgspec.structs.replace(info_or_none, alignment=alignment)
-            case SceneChanged(scene_epoch=epoch, scene_revision=revision, cause=cause, scene_hash=scene_hash):
+            case SceneChanged(epoch, revision, cause, scene_hash, period_ns):
                 self.scene_epoch = epoch
                 self.scene_revision = revision
                 self.scene_hash = scene_hash or self.scene_hash
+                self.tick_period_ns = period_ns or self.tick_period_ns
                 self.synced = cause in SAME_BODIES
             case EStopChanged(active=active):
                 self.estop = active

@@ -1,6 +1,7 @@
 """The pacing of our own loop as pure arithmetic on session time: no clock is read here.
 
-Tick k (1, 2, ...) is due at `start + k * period`, a grid that is never moved except by `resume`. A tick
+Tick k (1, 2, ...) is due at `start + k * period`, a grid that is never moved except by `resume` and, when another scene
+has another timestep, by `change_period`. A tick
 is late when it finishes more than one period after it was due; one that never ran is late too.
 
 Falling behind: overdue ticks are run one after the other, each still late by its own deadline, so a short hiccup is
@@ -91,6 +92,21 @@ class Pacer:
             self.paused = False
             self._start_ns = now_ns
             self._done = 0
+
+    def change_period(self, period_ns: int, began_ns: int, now_ns: int) -> None:
+        """A scene with ticks of `period_ns` was taken in the tick from `began_ns` to `now_ns`: a new grid from its end.
+
+        By the old grid this tick is as late as it began, so that taking the scene makes nothing late; what else was
+        overdue then by more than a period is missing for good. While paused no tick is accounted.
+        """
+        if not 0 < period_ns <= self.max_backlog_ns:
+            raise ValueError(f"period {period_ns} ns must be positive and at most the backlog {self.max_backlog_ns} ns")
+        if not self.paused:
+            self.finished(began_ns)
+            self._missing += self._overdue(began_ns)
+        self.period_ns = period_ns
+        self._start_ns = now_ns
+        self._done = 0
 
     def _overdue(self, now_ns: int) -> int:
         """Ticks that can only be late now: due more than a period ago and not done."""

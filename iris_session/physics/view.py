@@ -48,6 +48,8 @@ class LiveView:
         self._quat = np.empty(4)
         self._tick = 0
         self._forces: tuple[float, ...] = (0.0,) * len(robots)
+        #: Simulated time of one tick [ns].
+        self.tick_period_ns = round(float(model.opt.timestep) * 1e9)
         self._tips: dict[str, Pose] = {}
         self._contacts: tuple[ObjectContact, ...] | None = None
 

@@ -108,7 +108,7 @@ class World:
         #: Rows of `xpos` to stream: a slice unless flexes lie between the bodies, which is much cheaper to copy.
         self._rows: Any = slice(ids[0], ids[0] + len(ids)) if whole else np.array(ids, np.int64)
         self.robot_infos = tuple(_robot_info(model, spec) for spec in robots)
-        self.tick_period_ns = round(float(model.opt.timestep) * 1e9)
+        self.tick_period_ns = self._view.tick_period_ns
         #: BLAKE2b of the model bytes, 32 hex characters.
         self.scene_hash = scene_hash(model_bytes(model))
         self._tick = 0

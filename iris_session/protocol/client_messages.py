@@ -200,11 +200,15 @@ class Align(Message, frozen=True, tag="align"):
 
 
 class MoveAnchor(Message, frozen=True, tag="move_anchor"):
-    """A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it."""
+    """A director says where an anchor of the session is: the shared scene moves for everyone who is aligned to it.
+
+    `force`: also when it is further than 5 m from where it was, which is more often a wrong number than meant.
+    """
 
     request_id: Count
     anchor_id: Name
     T_world_anchor: Pose
+    force: bool = False
 
 
 class TrackingEpoch(Message, frozen=True, tag="tracking_epoch"):

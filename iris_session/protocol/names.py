@@ -210,6 +210,7 @@ class DenialReason:
     USER_OWNED: Final = "user_owned"  # e.g. pause or reset of a loop that the user drives
     POLICY: Final = "policy"  # the assignment policy leaves this to the configuration or a director
     INVALID: Final = "invalid"  # values out of range (non-finite pose, n_ticks < 1, ...)
+    TOO_FAR: Final = "too_far"  # more often a wrong number than meant: say that it is
 
 
 class RefusalCode:

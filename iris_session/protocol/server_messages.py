@@ -44,7 +44,10 @@ class Endpoints(msgspec.Struct, frozen=True):
 
 
 class Welcome(Message, frozen=True, tag="welcome"):
-    """Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once."""
+    """Answer to an accepted `hello`. `resume_token` is bound to the key and may be used once.
+
+    `tick_period_ns`: of the scene as it is now; another one that is loaded may have another (`SceneChanged`).
+    """
 
     session_id: Name
     session_name: Name
@@ -217,12 +220,14 @@ class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
     """`cause`: reset, new_scene, patch, external (the user's loop went back in time).
 
     `scene_hash`: after a patch, the address of the scene's specification as it is now; fetch that. Else empty.
+    `tick_period_ns`: of the new scene; 0: as it was.
     """
 
     scene_epoch: Count
     scene_revision: Count
     cause: Name
     scene_hash: Name = ""
+    tick_period_ns: Nanoseconds = 0
 
 
 class EStopChanged(EventBody, frozen=True, tag="estop_changed"):
@@ -335,7 +340,8 @@ class Event(Message, frozen=True, tag="event"):
 class Snapshot(Message, frozen=True, tag="snapshot"):
     """Everything a late joiner needs; events with `event_seq` at or below its own are to be discarded.
 
-    In the step of a reset `tick` and `sim_time` are still those before it. Bulk frame 1 (added by the front): float64
+    In the step of a reset `tick` and `sim_time` are still those before it. `tick_period_ns`: of this scene; 0: that of
+    `Welcome`. Bulk frame 1 (added by the front): float64
     (n_bodies, 7) world poses `x y z qw qx qy qz` of `bodies` at `state_seq`.
     """
 
@@ -355,6 +361,7 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     estop: bool = False
     episode: EpisodeChanged | None = None
     state_seq: Count = 0
+    tick_period_ns: Nanoseconds = 0
 
 
 ServerMessage = (

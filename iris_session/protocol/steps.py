@@ -137,6 +137,9 @@ class WorldView(Protocol):
     @property
     def sim_time(self) -> float: ...
 
+    @property
+    def tick_period_ns(self) -> int: ...
+
     def tip_pose(self, robot: str) -> Pose: ...
 
     def joints(self, robot: str) -> tuple[float, ...]: ...
@@ -168,6 +171,7 @@ class FixedView(msgspec.Struct, frozen=True):
     objects: Mapping[str, Pose] = {}
     contacts: tuple[ObjectContact, ...] = ()
     forces: Mapping[str, float] = {}
+    tick_period_ns: int = 2_000_000
 
     def tip_pose(self, robot: str) -> Pose:
         return self.tips[robot]

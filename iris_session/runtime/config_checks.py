@@ -34,6 +34,9 @@ UNIT_TOLERANCE: Final = 1e-3
 #: Millimetres in a field of metres are a mistake, not a sheet.
 SMALLEST_SHEET_M: Final = 0.01
 LARGEST_SHEET_M: Final = 5.0
+#: Of one tick, where our loop takes them: below, no computer keeps up; above, samples could not be held for a tick.
+SHORTEST_TICK_S: Final = 1e-5
+LONGEST_TICK_S: Final = 0.1
 
 
 def check_types(config: Any) -> None:
@@ -76,6 +79,16 @@ def check_anchors(anchors: Mapping[str, Any], sizes: Mapping[str, Any]) -> None:
             raise ConfigError(f"{where} holds a number that is not finite")
         if abs(math.hypot(*q) - 1.0) > UNIT_TOLERANCE:
             raise ConfigError(f"{where}: the quaternion (w, x, y, z) has length {math.hypot(*q):.3g}, it must be 1")
+
+
+def check_timestep(model: mujoco.MjModel) -> None:
+    """Raises `ConfigError` for a timestep that our loop cannot keep. In a user's loop any will do."""
+    timestep = float(model.opt.timestep)
+    if not SHORTEST_TICK_S <= timestep <= LONGEST_TICK_S:
+        raise ConfigError(
+            f"the model has a timestep of {timestep:g} s, run() takes {SHORTEST_TICK_S:g} to {LONGEST_TICK_S:g} s: "
+            '<option timestep="0.002"/>'
+        )
 
 
 def check_arguments(model: object, data: object, config: object) -> None:

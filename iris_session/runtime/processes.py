@@ -94,7 +94,7 @@ class SessionProcesses:
         self.recording = config.recording_path() if past is None else past.recording
         self._in_use: RecordingLock | None = None
         self._keeper: NoteKeeper | None = None
-        self._core, self._tick_period_ns = core, core.world.tick_period_ns
+        self._core = core
         self._bending = None if composed is None else composed.bending
         self.scenes = SharedScenes(config.assets, config.name, None if composed is None else composed.scene)
         self.state_period_ns = round(1e9 / config.state_hz)
@@ -190,7 +190,6 @@ class SessionProcesses:
             session_id=self.session_id,
             session_name=self.name,
             origin_ns=self._origin_ns,
-            tick_period_ns=self._tick_period_ns,
             state_period_ns=self.state_period_ns,
             curve=config.curve,
             curve_secret_file=config.curve_key,
@@ -235,7 +234,7 @@ class SessionProcesses:
             session_id=self.session_id,
             session_name=self.name,
             recording_class=recording_class,
-            tick_period_ns=self._tick_period_ns,
+            tick_period_ns=core.world.tick_period_ns,
             config=msgspec.msgpack.encode(core.as_it_is()),
             model=pack_model(core.world.model_bytes()),
             scene_hash=core.world.scene_hash,

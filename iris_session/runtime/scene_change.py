@@ -12,7 +12,7 @@ import msgspec
 import mujoco
 
 from iris_session.authority.config import check_config
-from iris_session.physics import find_objects, find_robots
+from iris_session.physics import Pacer, find_objects, find_robots
 from iris_session.physics.load import load_model, model_bytes, scene_hash
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, ScenePatched, decode_entry, encode_entry
 from iris_session.protocol.scene import SceneError, SceneSpec
@@ -20,11 +20,14 @@ from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.config_checks import check_timestep
 from iris_session.runtime.core import SessionCore, make_plant, plant_state
+from iris_session.runtime.deformables import flexes
 from iris_session.runtime.errors import ConfigError, OwnershipError
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.shared_scene import SharedScenes
 from iris_session.runtime.stepper import NextPatch, NextScene, Stepper
+from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
 
 
@@ -89,8 +92,9 @@ class SceneChanges(ScenePatches):
         Arguments as of `Session`. Who holds a robot whose name the new scene has too keeps it and must clutch again;
         other leases end. The model is compiled and prepared in a thread while the session goes on with the old scene;
         the future is done when the new one waits for the next step, and raises what would be wrong with it:
-        `ModelNotFoundError`, `ModelInvalidError`, `AmbiguousModelError`, `ControlError`, `ConfigError` for another
-        timestep than the session's.
+        `ModelNotFoundError`, `ModelInvalidError`, `AmbiguousModelError`, `ControlError`, `ConfigError` for a timestep
+        that no loop can keep. It may be another one than the session's: ticks are of that length from then on, and
+        clients are told.
 
         Raises `OwnershipError` at once in a user's loop, whose model is not ours, and before `run()`.
         """
@@ -127,6 +131,17 @@ class SceneChanges(ScenePatches):
         self.robots, self.objects = plant.scene.robots, plant.scene.objects
 
 
+def follow_timestep(stepper: Stepper, pacer: Pacer, times: TickTimes, began_ns: int) -> bool:
+    """Whether the step that began at `began_ns` has taken a scene with another timestep: the loop then keeps that, and
+    the tick is accounted."""
+    period_ns = stepper.core.world.tick_period_ns
+    if period_ns == pacer.period_ns:
+        return False
+    pacer.change_period(period_ns, began_ns, stepper.clock())
+    times.change_period(period_ns)
+    return True
+
+
 def load_model_of(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
     """A compiled model of either."""
     return load_model(model) if isinstance(model, str | Path) else model
@@ -152,11 +167,7 @@ def prepare(
         check_config(msgspec.structs.replace(core.config.authority, assignments={}), found, things)
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    check_timestep(model)
     plant = make_plant(model, scene, core.config.control)
-    now_ns, then_ns = core.world.tick_period_ns, plant.world.tick_period_ns
-    if now_ns != then_ns:
-        raise ConfigError(
-            f"the scene has a timestep of {then_ns * 1e-6:g} ms, the session one of {now_ns * 1e-6:g} ms: "
-            f'set <option timestep="{now_ns * 1e-9:g}"/>'
-        )
-    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), scenes.make(plant.world, state))
+    shown = scenes.make(plant.world, state)
+    return NextScene(plant, scene.model_hash, pack_model(bytes(binary)), shown, flexes(plant.world))

@@ -35,12 +35,13 @@ from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import blas
 from iris_session.runtime.config import SessionConfig
+from iris_session.runtime.config_checks import check_timestep
 from iris_session.runtime.continuation import begin
 from iris_session.runtime.core import SessionCore, core_of
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.owner import Owner
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.scene_change import SceneChanges
+from iris_session.runtime.scene_change import SceneChanges, follow_timestep
 from iris_session.runtime.scheduling import quiet_collector, tick_priority
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
 from iris_session.runtime.tick_times import TickTimes
@@ -131,6 +132,7 @@ class Session(Owner, SceneChanges):
 
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
         """
+        check_timestep(self.model)
         blas.use_one_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
         with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
@@ -144,7 +146,7 @@ class Session(Owner, SceneChanges):
                     break
                 times.lap(LateCause.OWNER)
                 if stepper.paused:
-                    self._paused_step(stepper, pacer)
+                    self._paused_step(stepper, pacer, times)
                     times.idle()
                 else:
                     self._tick(stepper, pacer, times)
@@ -170,12 +172,14 @@ class Session(Owner, SceneChanges):
             times.woke(pacer.next_deadline_ns)
         else:
             times.gave_up(pacer.skip_backlog(now_ns))
+        began_ns = max(now_ns, pacer.next_deadline_ns)
         stepper.step(1)
-        lateness_ns = pacer.finished(self.clock())
-        times.finished(lateness_ns)
-        stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
+        if not follow_timestep(stepper, pacer, times, began_ns):
+            lateness_ns = pacer.finished(self.clock())
+            times.finished(lateness_ns)
+            stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
 
-    def _paused_step(self, stepper: Stepper, pacer: Pacer) -> None:
+    def _paused_step(self, stepper: Stepper, pacer: Pacer, times: TickTimes) -> None:
         """Zero ticks, or some of those that a director asked for: few, so that an e-stop never waits for many."""
         assert stepper.last is not None
         pacer.pause(self.clock())
@@ -186,6 +190,7 @@ class Session(Owner, SceneChanges):
         n_ticks = min(self._asked_ticks, PAUSED_STEP_TICKS)
         self._asked_ticks -= n_ticks
         stepper.step(n_ticks)
+        follow_timestep(stepper, pacer, times, self.clock())
 
     # --- the user's loop ---------------------------------------------------------------------------------------------
 

@@ -58,7 +58,9 @@ class SharedScenes:
         thread."""
         poses = np.zeros((len(world.bodies), 7))
         world.poses(poses)
-        plain = SceneInfo(world.scene_hash, world.robot_infos, world.bodies, poses.tobytes())
+        plain = SceneInfo(
+            world.scene_hash, world.robot_infos, world.bodies, poses.tobytes(), tick_period_ns=world.tick_period_ns
+        )
         store = self._store
         if store is None:
             return Shown(plain)

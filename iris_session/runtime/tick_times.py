@@ -49,20 +49,29 @@ class TickTimes:
     """
 
     def __init__(self, period_ns: int, clock: Callable[[], int], delayed: Callable[[], int] | None = None) -> None:
-        self._period_ns = period_ns
         self._clock = clock
         self._delayed = delayed or run_delay()
         self._last_ns = clock()
         self._spent = dict.fromkeys(CAUSES, 0)
-        self._usual = dict.fromkeys(CAUSES, 0.0)
         self._delayed_ns = self._delayed()
         self._chain = 0
-        self._ticks = 0
-        size = min(MAX_WINDOW_TICKS, max(1, WINDOW_S * 1_000_000_000 // period_ns))
-        self._lateness = array("q", bytes(8 * size))
+        self._begin(period_ns)
         self._causes = dict.fromkeys((*CAUSES, SKIPPED), 0)
         #: Once a second: ticks and late ones so far, and the causes so far.
         self._marks: deque[tuple[int, int, dict[str, int]]] = deque(maxlen=WINDOW_S + 1)
+
+    def _begin(self, period_ns: int) -> None:
+        """Nothing is usual yet, no tick was measured."""
+        self._period_ns = period_ns
+        self._usual = dict.fromkeys(CAUSES, 0.0)
+        self._ticks = 0
+        size = min(MAX_WINDOW_TICKS, max(1, WINDOW_S * 1_000_000_000 // period_ns))
+        self._lateness = array("q", bytes(8 * size))
+
+    def change_period(self, period_ns: int) -> None:
+        """Ticks are those of another scene from here on, with other costs: a new chain. Causes and marks stay."""
+        self._begin(period_ns)
+        self.idle()
 
     def lap(self, cause: str) -> None:
         """What was done since the last lap was `cause`."""

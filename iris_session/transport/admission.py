@@ -192,8 +192,9 @@ class Admission:
             )
         return participant_id
 
-    def welcome(self, admitted: Admitted, now_ns: int) -> None:
-        """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over."""
+    def welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
+        """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over. `tick_period_ns`: of
+        the present scene."""
         connection = self._clients.by_number.get(admitted.connection)
         if connection is None:
             return
@@ -219,7 +220,7 @@ class Admission:
                 admitted.resumed,
                 now_ns,
                 config.heartbeat_ns,
-                config.tick_period_ns,
+                tick_period_ns,
                 config.state_period_ns,
                 Endpoints(
                     self._ports.state,

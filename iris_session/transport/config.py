@@ -62,7 +62,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
 
 class SceneInfo(msgspec.Struct, frozen=True):
     """What the front adds to every `Snapshot`. `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, little-endian,
-    used until the first state frame.
+    used until the first state frame. `tick_period_ns`: simulated time of one tick.
 
     `asset_root`: folder of a store (`ROOT/ab/abcd...`) that holds the `assets`, by address, which clients may fetch as
     long as this scene or the next one is the present one; empty for none.
@@ -74,6 +74,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     poses: bytes = b""
     asset_root: str = ""
     assets: tuple[str, ...] = ()
+    tick_period_ns: int = 2 * MILLISECOND
 
 
 class FrontConfig(msgspec.Struct, frozen=True):
@@ -111,7 +112,6 @@ class FrontConfig(msgspec.Struct, frozen=True):
     stall_ns: int = 100 * MILLISECOND
     presence_period_ns: int = SECOND // 60
     proposal_period_ns: int = SECOND // 5
-    tick_period_ns: int = 2 * MILLISECOND
     state_period_ns: int = SECOND // 60
     limits: FrontLimits = FrontLimits()
     curve: bool = False

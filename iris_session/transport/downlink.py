@@ -114,7 +114,7 @@ class Downlink:
         """Welcomes, answers, events, then snapshots: those are of the end of the step, with its events. Who takes part
         already gets the events first, because a client passes over those that its snapshot contains."""
         for admitted in decided.admitted:
-            self._admission.welcome(admitted, self._session_ns())
+            self._admission.welcome(admitted, self._session_ns(), self._publisher.scene.tick_period_ns)
         snapshots = [outgoing for outgoing in decided.outgoing if isinstance(outgoing.message, Snapshot)]
         for outgoing in decided.outgoing:
             if not isinstance(outgoing.message, Snapshot):

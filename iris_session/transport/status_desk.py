@@ -173,7 +173,6 @@ class StatusDesk:
             half,
             session_id=config.session_id,
             session_name=config.session_name,
-            tick_period_ns=config.tick_period_ns,
             stalled=telling.stalled,
             step_to_publish=quantiles(telling.publish_delays_ns),
             participants=tuple(self._row(row, by_participant.get(row.id), now_ns) for row in half.participants),

@@ -162,6 +162,26 @@ def test_only_a_director_moves_anchors_and_only_to_poses() -> None:
     assert t.since(AnchorMoved) == []
 
 
+def test_an_anchor_moves_far_only_where_that_is_said_to_be_meant() -> None:
+    t = Table(CONFIG)
+    boss = t.join("director", alignment="not_needed")
+    near, far = Pose((0.0, 4.5, 0.0), IDENTITY.q), Pose((0.0, -450.45, 0.0), IDENTITY.q)
+    denial = boss.asks(MoveAnchor(1, "table", far)).denial
+    assert denial is not None
+    assert (denial.reason, denial.target) == ("too_far", "table")
+    assert denial.message == "anchor table would be moved by 450.0 m; more than 5 m needs --force (`force`)"
+    assert denial.advice == "poses are in metres"
+    assert boss.asks(MoveAnchor(1, "table", near)).ok, "4.95 m"
+    assert boss.denied(MoveAnchor(1, "table", Pose((0.0, -1.0, 0.0), IDENTITY.q))) == "too_far", "from where it is now"
+    assert boss.asks(MoveAnchor(1, "table", far, force=True)).ok
+    assert t.authority.anchors["table"] == far
+    wide = Table(AuthorityConfig(anchors={"table": TABLE}, max_anchor_move_m=500.0))
+    wide.step(wide.host(MoveAnchor(1, "table", far)))
+    assert wide.authority.anchors["table"] == far
+    with pytest.raises(ValueError, match="max_anchor_move_m is 0"):
+        Authority(AuthorityConfig(max_anchor_move_m=0.0), (), ())
+
+
 def test_what_was_measured_to_the_old_place_counts_no_more() -> None:
     t = Table(CONFIG)
     anna = t.operator("left")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
@@ -28,8 +29,9 @@ def test_who_holds_a_robot_that_the_new_scene_has_keeps_it_and_must_clutch_again
     ann = t.operator("left")
     ann.engage("left")
     version = t.authority._ctx.state.robots["left"].version
+    t.view = msgspec.structs.replace(t.view, tick_period_ns=1_000_000)
     load(t, other("third", "left"))
-    assert t.since(SceneChanged) == [SceneChanged(2, 0, "new_scene")]
+    assert t.since(SceneChanged) == [SceneChanged(2, 0, "new_scene", tick_period_ns=1_000_000)]
     assert [c.robot for c in t.decision.commands] == ["third", "left"]
     assert (t.hold("left"), t.hold("third")) == ("scene_changed", "no_lease")
     ann.engage("left")

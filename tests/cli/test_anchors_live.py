@@ -147,7 +147,9 @@ class Session:
     def place_alignment(self, participant: str, pose: Any, *, offset: bool) -> None:
         self.asked.append((participant, pose, offset))
 
-    def move_anchor(self, anchor_id: str, pose: Any) -> None:
+    def move_anchor(self, anchor_id: str, pose: Any, *, force: bool) -> None:
+        if anchor_id in self.denies and not force:
+            raise DeniedError(Denial("too_far", f"anchor {anchor_id} would be moved by 450.0 m: --force"))
         self.asked.append((anchor_id, pose))
 
     def status(self) -> StatusReport:
@@ -252,9 +254,10 @@ def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: 
 
 def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     far = ["anchors", "move", "table", "--pose", "450,-0.45,0,1,0,0,0"]
+    session.denies = {"table"}
     assert main(far) == 2
     assert session.asked == []
-    assert "'table' would be moved by 450.0 m; more than 5 m needs --force" in capsys.readouterr().err
+    assert "denied (too_far): anchor table would be moved by 450.0 m: --force" in capsys.readouterr().err
     assert main([*far, "--force"]) == 0
     assert [asked[0] for asked in session.asked] == ["table"]
 

@@ -342,7 +342,20 @@ def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
     for i in range(MAX_INBOX + 10):
         wire.get(Event(i + 1, 0, 0, Notice("info", "x")), MS)
     assert len(wire.connection.inbox) == MAX_INBOX
-    assert wire.connection.counters.inbox_dropped == 10
+    assert wire.connection.counters.inbox_dropped == 11
+    first, second = wire.connection.inbox[0], wire.connection.inbox[1]
+    assert first == Missed(1, 11), "and the application is told"
+    assert isinstance(second, Event)
+    assert second.event_seq == 12
+
+
+def test_events_held_while_a_snapshot_came_are_handed_out_and_not_told_as_missed(wire: Wire) -> None:
+    wire.join()
+    for seq in (1, 3, 5, 6):
+        wire.get(Event(seq, 0, 0, Notice("info", "x")), MS)
+    wire.snapshot(2 * MS, event_seq=5)
+    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
+    assert told == [1, Missed(2, 2), 3, Missed(4, 4), 5, 6]
 
 
 @pytest.mark.parametrize("data", [b"", b"12345678", b"\0" * (3 * 56)])

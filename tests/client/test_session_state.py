@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client import SessionMirror
+from iris_session.client.session_state import Missed
 from iris_session.protocol.common import IDENTITY, Alignment, Lease
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
@@ -38,7 +39,7 @@ bodies = st.one_of(
     st.builds(lambda p, v: LeaseChanged(Lease("left", "robot", "exclusive", p, v), "acquired"), names, counts),
     st.builds(lambda p, v: AlignmentChanged(p, Alignment(v, "measured", IDENTITY)), names, counts),
     st.builds(ScaleChanged, st.sampled_from(["left", "gone"]), st.sampled_from([0.1, 1.0]), names),
-    st.builds(SceneChanged, counts, counts, st.just("reset")),
+    st.builds(SceneChanged, counts, counts, st.just("reset"), tick_period_ns=st.sampled_from([0, 1_000_000])),
     st.builds(EStopChanged, flags, names),
     st.builds(PauseChanged, flags),
     st.builds(EpisodeChanged, counts, st.sampled_from(["running", "success"])),
@@ -57,7 +58,7 @@ def snapshot(mirror: SessionMirror | None = None) -> Snapshot:
     return Snapshot(
         0, mirror.event_seq, mirror.scene_epoch, mirror.scene_revision, mirror.scene_hash, 0, 0.0, 0,
         tuple(mirror.participants.values()), tuple(mirror.leases.values()), tuple(mirror.robots.values()),
-        mirror.bodies, mirror.paused, mirror.estop, mirror.episode,
+        mirror.bodies, mirror.paused, mirror.estop, mirror.episode, tick_period_ns=mirror.tick_period_ns,
     )  # fmt: skip
 
 
@@ -115,10 +116,39 @@ def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None
     mirror.apply_event(events[3])
     for one in events[:3]:
         truth.apply_event(one)
-    assert [e.event_seq for e in mirror.apply_snapshot(snapshot(truth))] == [4]
+    told = mirror.apply_snapshot(snapshot(truth))
+    assert told == [Missed(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
     assert mirror.synced
     assert mirror.event_seq == 4
-    assert mirror.discarded == 1  # event 3 was in the snapshot
+    assert mirror.discarded == 0
+
+
+@given(st.lists(st.sampled_from(["come", "lost", "twice", "snapshot"]), max_size=60), st.integers(0, 5))
+@settings(max_examples=300, deadline=None)
+def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fates: list[str], before: int) -> None:
+    """Exactly once, in order, whatever is lost or comes again, and whenever a snapshot comes."""
+    mirror, truth = SessionMirror(), synced()
+    told: list[Event | Missed] = []
+
+    def come(one: Event) -> None:
+        if mirror.apply_event(one):
+            told.append(one)
+
+    for i, fate in enumerate([*["come"] * before, "snapshot", *fates, "snapshot"]):
+        if fate == "snapshot":
+            told += mirror.apply_snapshot(snapshot(truth))
+            continue
+        one = event(truth.event_seq + 1, Notice("info", str(i)))
+        truth.apply_event(one)
+        for _ in range({"come": 1, "twice": 2, "lost": 0}[fate]):
+            come(one)
+    seqs = [
+        seq for one in told for seq in (range(one.first, one.last + 1) if isinstance(one, Missed) else (one.event_seq,))
+    ]
+    assert seqs == list(range(before + 1, truth.event_seq + 1))
+    lost = {seq for one in told if isinstance(one, Missed) for seq in range(one.first, one.last + 1)}
+    numbers = [i for i, fate in enumerate([f for f in fates if f != "snapshot"], before + 1) if fate == "lost"]
+    assert lost == set(numbers), "what came is handed out"
 
 
 def test_an_older_snapshot_is_discarded() -> None:
@@ -134,9 +164,12 @@ def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
     mirror = synced()
     mirror.apply_event(event(1, SceneChanged(2, 0, "reset")))
     assert mirror.synced
-    mirror.apply_event(event(2, SceneChanged(3, 0, "new_scene")))
+    mirror.apply_event(event(2, SceneChanged(3, 0, "new_scene", tick_period_ns=1_000_000)))
     assert not mirror.synced
-    assert mirror.scene_epoch == 3
+    assert (mirror.scene_epoch, mirror.tick_period_ns) == (3, 1_000_000)
+    mirror.apply_snapshot(Snapshot(0, 2, 3, 0, "other", 0, 0.0, 0, (), (), tick_period_ns=1_000_000))
+    mirror.apply_event(event(3, SceneChanged(4, 0, "reset")))
+    assert mirror.tick_period_ns == 1_000_000, "0: as it was"
 
 
 def test_hash_tells_different_states_apart_and_ignores_order() -> None:

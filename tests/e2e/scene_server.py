@@ -21,17 +21,17 @@ from iris_session.protocol.scene_patch import AddVisual, SetVisual
 RED = (1.0, 0.0, 0.0, 1.0)
 
 
-def slow() -> mujoco.MjModel:
-    """A scene with another timestep."""
-    spec = n_arms_scene(2)
-    spec.option.timestep = 0.004
+def with_timestep(n_arms: int, timestep: float) -> mujoco.MjModel:
+    """The first scene of the session has 2 ms."""
+    spec = n_arms_scene(n_arms)
+    spec.option.timestep = timestep
     return spec.compile()
 
 
 SCENES: dict[str, Callable[[], Any]] = {
     "table": lambda: n_arms_scene(2, objects=3).compile(),
-    "three": lambda: n_arms_scene(3).compile(),
-    "slow": slow,
+    "three": lambda: with_timestep(3, 0.001),
+    "slow": lambda: with_timestep(2, 0.25),
     "missing": lambda: "no/such/scene.xml",
 }
 

@@ -147,6 +147,69 @@ def test_accounting_matches_a_plain_reckoning(costs: list[int], start: int) -> N
     assert (stats.ticks, stats.late) == (len(costs) + len(never_ran), late + len(never_ran))
 
 
+spells = st.tuples(st.sampled_from([MS // 2, MS, PERIOD, 5 * MS]), st.lists(st.integers(0, 12 * MS), max_size=40))
+
+
+@settings(max_examples=80)
+@given(st.lists(spells, min_size=1, max_size=6), st.integers(0, 10**12), st.integers(0, 50 * MS))
+def test_accounting_matches_a_plain_reckoning_across_other_periods(
+    parts: list[tuple[int, list[int]]], start: int, swap_ns: int
+) -> None:
+    """Every part is a grid of its own; the tick that ends it costs `swap_ns`, and counts as if it cost nothing."""
+    pacer = Pacer(parts[0][0], start)
+    now, ticks, late = start, 0, 0
+    for (period, costs), (next_period, _) in zip(parts, [*parts[1:], parts[0]], strict=True):
+        assert pacer.period_ns == period
+        for k, cost in enumerate(costs, 1):
+            now = max(now, start + k * period) + cost
+            pacer.finished(now)
+            ticks, late = ticks + 1, late + (now > start + (k + 1) * period)
+        done = len(costs) + 1
+        began = max(now, start + done * period)
+        never_ran = sum(began > start + (k + 1) * period for k in range(done + 1, done + 4000))
+        ticks, late = ticks + 1 + never_ran, late + (began > start + (done + 1) * period) + never_ran
+        now = start = began + swap_ns
+        pacer.change_period(next_period, began, now)
+    stats = pacer.stats(now)
+    assert (stats.ticks, stats.late) == (ticks, late)
+
+
+def test_another_period_begins_a_new_grid_at_the_end_of_the_tick_that_took_it() -> None:
+    pacer = Pacer(PERIOD, 0)
+    now = run(pacer, 0, [MS // 2] * 10)
+    began = pacer.next_deadline_ns
+    end = began + 40 * MS  # taking the scene took long
+    pacer.change_period(MS, began, end)
+    assert (pacer.period_ns, pacer.next_deadline_ns) == (MS, end + MS)
+    now = run(pacer, end, [MS // 4] * 20)
+    stats = pacer.stats(now)
+    assert (stats.ticks, stats.late, stats.missing, stats.max_ns) == (31, 0, 0, MS // 2)
+    pacer.finished(pacer.next_deadline_ns + MS + 1)
+    assert pacer.stats(pacer.next_deadline_ns).late == 1, "late by the new period"
+
+
+def test_another_period_forgets_nothing_that_was_late_before_it() -> None:
+    pacer = Pacer(PERIOD, 0)
+    now = run(pacer, 0, [MS // 2] * 9 + [100 * MS])
+    before = pacer.stats(now)
+    pacer.change_period(MS, now, now + MS)
+    stats = pacer.stats(now + 2 * MS)
+    assert stats.ticks == before.ticks > 50
+    assert (stats.finished, stats.late) == (11, before.late), "the tick was overdue, and is done late"
+    assert pacer.ticks_due(now + 2 * MS) == 1
+
+
+def test_another_period_in_a_pause_counts_nothing() -> None:
+    pacer = Pacer(PERIOD, 0)
+    now = run(pacer, 0, [0] * 5)
+    pacer.pause(now)
+    pacer.change_period(4 * MS, now + 100 * MS, now + 200 * MS)
+    assert pacer.ticks_due(now + 900 * MS) == 0
+    pacer.resume(now + 1_000 * MS)
+    assert pacer.next_deadline_ns == now + 1_004 * MS
+    assert pacer.stats(now + 1_004 * MS) == Pacer(PERIOD, 0).stats(0)._replace(ticks=5, finished=5)
+
+
 def test_percentiles_of_a_part_are_of_that_part() -> None:
     pacer = Pacer(PERIOD, 0)
     now = run(pacer, 0, [100 * MS] + [0] * 60)
@@ -162,5 +225,8 @@ def test_nonsense_is_refused() -> None:
         Pacer(0, 0)
     with pytest.raises(ValueError, match="at most the backlog"):
         Pacer(PERIOD, 0, max_backlog_ns=PERIOD - 1)
+    for period in (0, 2_000 * MS):
+        with pytest.raises(ValueError, match="must be positive and at most the backlog"):
+            Pacer(PERIOD, 0).change_period(period, 0, 0)
     assert Pacer(PERIOD, 0).stats(0) == (0, 0, 0, 0, 0.0, 0, 0, 0)
     assert Pacer(PERIOD, 0).finished(2**50) > 2**49

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
 import pytest
 
 from iris_session import Session
-from iris_session.physics import PhysicsError, find_objects, find_robots
+from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
 from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
 from iris_session.physics.scenes import n_arms_scene, scene_path
-from iris_session.protocol.client_messages import Control
+from iris_session.protocol.client_messages import Control, GetSnapshot
 from iris_session.protocol.entries import SceneLoaded, decode_entries
-from iris_session.protocol.server_messages import SceneChanged
+from iris_session.protocol.server_messages import SceneChanged, Snapshot
 from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.errors import ConfigError, OwnershipError
-from iris_session.runtime.scene_change import prepare
+from iris_session.runtime.scene_change import follow_timestep, prepare
 from iris_session.runtime.shared_scene import SharedScenes
 from iris_session.runtime.stepper import MAX_SCENES
+from iris_session.runtime.tick_times import TickTimes
 from tests.runtime.play import TICK_NS, entries, host, make_core
 from tests.runtime.test_stepper import Rig
 
 AT = 90  # step of the change: Ann's clutch is closed since step 50
 
 
-def bench_scene() -> mujoco.MjModel:
-    return n_arms_scene(2, objects=3).compile()
+def bench_scene(timestep: float = 0.002) -> mujoco.MjModel:
+    spec = n_arms_scene(2, objects=3)
+    spec.option.timestep = timestep
+    return spec.compile()
 
 
 def loaded(model: mujoco.MjModel, state: bytes = b"") -> SceneLoaded:
@@ -61,9 +65,10 @@ def test_the_same_journal_gives_the_same_digests_across_a_change() -> None:
     assert live.world.view().tick == 150 - AT, "a new world begins at tick 0"
 
 
+@pytest.mark.parametrize("timestep", [0.002, 0.001])
 @pytest.mark.parametrize("at", [40, AT + 1, 130])
-def test_restoring_a_snapshot_is_invisible_from_either_side_of_the_change(at: int) -> None:
-    model = bench_scene()
+def test_restoring_a_snapshot_is_invisible_from_either_side_of_the_change(at: int, timestep: float) -> None:
+    model = bench_scene(timestep)
     scene = loaded(model)
     straight = with_models(model)
     play(straight, 0, at, scene)
@@ -107,6 +112,61 @@ def test_a_session_that_goes_on_from_the_new_scene_needs_no_other_model() -> Non
     assert play(resumed, 120, 150, scene) == play(before, 120, 150, scene)
 
 
+def test_a_scene_with_another_timestep_is_as_fast_and_everybody_is_told() -> None:
+    """Twice as many ticks a second, each half as long: sim_time, speeds of control and what clients know follow."""
+    model = bench_scene(0.001)
+    scene = loaded(model)
+    core = with_models(model)
+    play(core, 0, AT, scene)
+    joined = core.step(AT * TICK_NS + 1, [host(AT * TICK_NS + 1, scene), host(AT * TICK_NS + 1, GetSnapshot())], 1)
+    assert [e.body.tick_period_ns for e in joined.decision.events if isinstance(e.body, SceneChanged)] == [1_000_000]
+    told = [o.message for o in joined.decision.outgoing if isinstance(o.message, Snapshot)]
+    assert [m.tick_period_ns for m in told] == [1_000_000]
+    for i in range(AT + 1, AT + 100):
+        core.step(i * TICK_NS + 1, entries(i, 2), 2)
+    view = core.world.view()
+    assert (view.tick, view.tick_period_ns) == (199, 1_000_000)
+    assert view.sim_time == pytest.approx(0.199)
+    core.step(500 * TICK_NS, [host(500 * TICK_NS, Control(0, "reset"))], 0)
+    assert core.world.tick_period_ns == 1_000_000
+
+
+def test_control_moves_as_fast_whatever_the_timestep() -> None:
+    """The same hand, the same time: the tips end at the same place."""
+    ends = []
+    for timestep, n_ticks in ((0.002, 1), (0.001, 2), (0.0005, 4)):
+        spec = mujoco.MjSpec.from_file(str(scene_path("handover")))
+        spec.option.timestep = timestep
+        model = spec.compile()
+        first = make_core()
+        core = SessionCore(model, first.config)
+        for i in range(200):
+            core.step((i + 1) * TICK_NS, entries(i), n_ticks)
+        ends.append(core.world.view().tip_pose("left").p)
+        assert core.world.view().sim_time == pytest.approx(0.4)
+    begun = make_core().world.view().tip_pose("left").p
+    assert math.dist(ends[0], begun) > 0.02
+    for end in ends[1:]:
+        assert math.dist(end, ends[0]) < 0.1 * math.dist(ends[0], begun)
+
+
+def test_the_loop_keeps_the_timestep_of_the_scene_from_its_first_tick_on() -> None:
+    rig = Rig()
+    rig.steps(30)
+    pacer = Pacer(TICK_NS, rig.stepper.clock())
+    times = TickTimes(TICK_NS, rig.stepper.clock)
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", None, None)
+    rig.stepper.change_scene(scene)
+    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    rig.steps(1)
+    assert follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    assert (pacer.period_ns, times.lateness()) == (1_000_000, None)
+    assert pacer.next_deadline_ns == rig.stepper.clock() + 1_000_000
+    stats = pacer.stats(rig.stepper.clock())
+    assert (stats.finished, stats.late, stats.missing) == (1, 0, 0)
+    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+
+
 def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
     rig = Rig()
     rig.steps(60)
@@ -121,7 +181,7 @@ def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
     first = decode_entries(rig.recorder.rows[rows].entries)[0].message
     assert first == scene.plant.scene
     events = [e.body for e in rig.stepper.ledger.recent if isinstance(e.body, SceneChanged)]
-    assert events == [SceneChanged(2, 0, "new_scene")]
+    assert events == [SceneChanged(2, 0, "new_scene", tick_period_ns=TICK_NS)]
     assert rig.stepper.ledger.mirror.synced
     assert set(rig.stepper.ledger.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
     assert rig.front.n_bodies == len(scene.plant.world.bodies)
@@ -138,10 +198,9 @@ def test_changes_that_nobody_takes_are_refused() -> None:
 
 def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
     core = make_core()
-    spec = n_arms_scene(2)
-    spec.option.timestep = 0.004
-    with pytest.raises(ConfigError, match=r'timestep of 4 ms, the session one of 2 ms: set <option timestep="0.002"/>'):
-        prepare(core, SharedScenes(False, "test"), spec.compile(), b"", None, None)
+    for timestep in (1e-6, 0.25):
+        with pytest.raises(ConfigError, match=rf"timestep of {timestep:g} s, run\(\) takes 1e-05 to 0.1 s"):
+            prepare(core, SharedScenes(False, "test"), bench_scene(timestep), b"", None, None)
     with pytest.raises(PhysicsError):
         prepare(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
 

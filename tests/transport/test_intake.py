@@ -89,7 +89,7 @@ class Desk:
         self.take(msgspec.structs.replace(Hello("operator", "Ann", secret=b"s" * 16), **hello), peer)
         (entry,) = self.coalescer.take()
         assert isinstance(entry.message, Join)
-        self.admission.welcome(Admitted(entry.connection, "p1", "operator", False), self.now_ns)
+        self.admission.welcome(Admitted(entry.connection, "p1", "operator", False), self.now_ns, 2_000_000)
         welcome = self.sent[-1][1]
         assert isinstance(welcome, Welcome)
         return welcome
