@@ -3,6 +3,9 @@
 Public API, nothing else is public:
 
 - `Session`, `SessionConfig`: share a MuJoCo scene from your own process. Errors: `SessionError` and its subclasses.
+- `SceneBuilder`: compose a scene without MuJoCo, from shapes and files (glTF, URDF, OBJ, STL, ...). Error:
+  `SceneBuildError`.
+- `ScenePublisher`: share such a scene, moved by another simulator or a real robot. Error: `PublishError`.
 - `Client`: join a session from any process. Errors: `ClientError` and its subclasses. `find_sessions`: those on this
   network, as `FoundSession`.
 
@@ -17,8 +20,18 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from iris_session.client import Client, ClientError, FoundSession, find_sessions
     from iris_session.runtime.config import SessionConfig
-    from iris_session.runtime.errors import ConfigError, OwnershipError, ResumeError, SessionError, StartError
+    from iris_session.runtime.errors import (
+        ConfigError,
+        OwnershipError,
+        PublishError,
+        ResumeError,
+        SessionError,
+        StartError,
+    )
+    from iris_session.runtime.scene_publisher import ScenePublisher
     from iris_session.runtime.session import Session
+    from iris_session.scene.compose import SceneBuilder
+    from iris_session.scene.errors import SceneBuildError
 
 _HOME: Final = {
     "Session": "iris_session.runtime.session",
@@ -28,6 +41,10 @@ _HOME: Final = {
     "StartError": "iris_session.runtime.errors",
     "ResumeError": "iris_session.runtime.errors",
     "OwnershipError": "iris_session.runtime.errors",
+    "SceneBuilder": "iris_session.scene.compose",
+    "SceneBuildError": "iris_session.scene.errors",
+    "ScenePublisher": "iris_session.runtime.scene_publisher",
+    "PublishError": "iris_session.runtime.errors",
     "Client": "iris_session.client",
     "ClientError": "iris_session.client",
     "FoundSession": "iris_session.client",
@@ -42,6 +59,10 @@ __all__ = [
     "StartError",
     "ResumeError",
     "OwnershipError",
+    "SceneBuilder",
+    "SceneBuildError",
+    "ScenePublisher",
+    "PublishError",
     "Client",
     "ClientError",
     "FoundSession",

@@ -1,8 +1,8 @@
-"""Scenes to share: MuJoCo models as specifications with content-addressed assets, their encodings, levels of detail.
+"""Scenes to share: specifications with content-addressed assets, their encodings, levels of detail.
 
-Imports only `protocol`. `AssetStore` keeps assets; `decode_mesh`, `decode_image`, `decode_arrays` read them (layouts in
-docs/scene.md). `mujoco_scene.parse_mujoco` makes a scene, `budget.choose_levels` fits it to what a client draws. Only
-modules named `mujoco_*` import MuJoCo.
+`AssetStore` keeps assets; `decode_mesh`, `decode_image`, `decode_arrays` read them (layouts in docs/scene.md).
+`mujoco_scene.parse_mujoco` makes a scene of a MuJoCo model, `compose.SceneBuilder` one of shapes and files;
+`budget.choose_levels` fits it to what a client draws. Only modules named `mujoco_*` import MuJoCo.
 """
 
 from iris_session.scene.arrays import decode_arrays, encode_arrays

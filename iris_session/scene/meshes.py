@@ -20,6 +20,7 @@ from iris_session.scene.errors import AssetError
 _POSITION_STEPS: Final = 65_535
 _NORMAL_STEPS: Final = 127
 Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,15 @@ class MeshArrays:
     """Triangles, counter-clockwise seen from outside.
 
     `position` (n, 3) [m], `normal` (n, 3) unit vectors, `uv` (n, 2) or `None`: u to the right, v down from the upper
-    left corner of the image; `index` (m, 3) into the n corners.
+    left corner of the image; `index` (m, 3) into the n corners. `color` (n, 4) or `None`: red, green, blue, alpha at
+    the corners, 0..255, which multiply the colour of what wears the mesh.
     """
 
     position: Floats
     normal: Floats
     uv: Floats | None
     index: NDArray[np.uint32]
+    color: Bytes | None = None
 
     @property
     def vertices(self) -> int:
@@ -44,13 +47,15 @@ class MeshArrays:
         return len(self.index)
 
 
-def index_corners(position: Floats, normal: Floats, uv: Floats | None) -> MeshArrays:
+def index_corners(position: Floats, normal: Floats, uv: Floats | None, color: Bytes | None = None) -> MeshArrays:
     """Corners of triangles, shape (m, 3, ...), to indexed ones in the order of their first use."""
     parts = [position.reshape(-1, 3), normal.reshape(-1, 3)]
     if uv is not None:
         parts.append(uv.reshape(-1, 2))
+    if color is not None:  # its four bytes as one more column: rows are compared by bits
+        parts.append(np.ascontiguousarray(color).reshape(-1, 4).view(np.float32))
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1), np.float32)
-    first, inverse = _unique_rows(rows)
+    first, inverse = unique_rows(rows)
     order = np.argsort(first)
     rank = np.empty(len(first), np.uint32)
     rank[order] = np.arange(len(first), dtype=np.uint32)
@@ -60,10 +65,11 @@ def index_corners(position: Floats, normal: Floats, uv: Floats | None) -> MeshAr
         normal=np.ascontiguousarray(kept[:, 3:6]),
         uv=None if uv is None else np.ascontiguousarray(kept[:, 6:8]),
         index=rank[inverse].reshape(-1, 3),
+        color=None if color is None else np.ascontiguousarray(kept[:, -1:]).view(np.uint8),
     )
 
 
-def _unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First occurrence of each different row, and for every row which of these it is. By bits."""
     bits = rows.view(np.uint32)
     key = np.zeros(len(rows), np.uint64)
@@ -86,6 +92,8 @@ def encode_mesh(mesh: MeshArrays) -> bytes:
     ]
     if mesh.uv is not None:
         arrays.append(Stored("uv", mesh.uv, ArrayFilter.SHUFFLE))
+    if mesh.color is not None:
+        arrays.append(Stored("color", mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays)
 
 
@@ -106,6 +114,8 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
     ]
     if mesh.uv is not None:
         arrays.append(_quantised("uv", mesh.uv, *_lattice(mesh.uv)))
+    if mesh.color is not None:
+        arrays.append(Stored("color", mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays, error), error
 
 
@@ -115,12 +125,13 @@ def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY
     position = require(arrays, "position", "f4", (None, 3))
     normal = require(arrays, "normal", "f4", (len(position), 3))
     uv = require(arrays, "uv", "f4", (len(position), 2)) if "uv" in arrays else None
+    color = require(arrays, "color", "u1", (len(position), 4)) if "color" in arrays else None
     index = require(arrays, "index", "u2 u4", (None, 3)).astype(np.uint32)
     if index.size and int(index.max()) >= len(position):
         raise AssetError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
     if not np.isfinite(position).all():
         raise AssetError("a vertex is not finite")
-    return MeshArrays(position, normal, uv, index)
+    return MeshArrays(position, normal, uv, index, color)
 
 
 def _narrow(index: NDArray[np.uint32], vertices: int) -> NDArray[np.uint32] | NDArray[np.uint16]:

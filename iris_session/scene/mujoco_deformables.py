@@ -7,22 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind
-from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.scene.build import Builder
+from iris_session.scene.deformable_assets import encode_deformable
 from iris_session.scene.mujoco_looks import drawn_rgba
 from iris_session.scene.mujoco_names import label
 from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
-
-#: Below this many vertices their numbers fit 16 bits.
-_SHORT: Final = 1 << 16
 
 
 def stream_name(index: int) -> str:
@@ -82,20 +78,8 @@ class FlexMesh:
     def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:
         """The asset, for vertices at rest (n, 3) [m], world frame."""
 
-        def encode() -> bytes:
-            narrow = self.elements.astype(np.uint16) if len(rest) <= _SHORT else self.elements
-            arrays = [
-                Stored("elements", narrow, ArrayFilter.DELTA),
-                Stored("position", rest, ArrayFilter.SHUFFLE),
-                Stored("plan", np.frombuffer(self.topology.to_bytes(), np.uint8)),
-            ]
-            if len(self.numbers) <= int(self.numbers.max()):  # the inside is left out
-                arrays.append(Stored("vertex", self.numbers.astype(np.uint32), ArrayFilter.DELTA))
-            if self.uv is not None:
-                arrays.append(Stored("uv", self.uv, ArrayFilter.SHUFFLE))
-            return encode_arrays(ArrayKind.DEFORMABLE, arrays)
-
-        return encode
+        numbers = self.numbers if len(self.numbers) <= int(self.numbers.max()) else None  # the inside is left out
+        return lambda: encode_deformable(self.elements, self.uv, rest, self.topology, numbers)
 
 
 def flex_mesh(model: mujoco.MjModel, index: int) -> FlexMesh:

@@ -2,7 +2,7 @@
 
 Not a quadric decimation, which keeps flat parts better: here the error is proven. No point of a triangle moves farther
 than the vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in
-threads.) Parts smaller than a cell vanish. Meshes with texture coordinates are not made coarser: their textures
+threads.) Parts smaller than a cell vanish. Meshes with texture coordinates or colours are not made coarser: these
 would move across seams.
 """
 
@@ -26,9 +26,9 @@ Ints = NDArray[np.int64]
 def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
     """A mesh of about `triangles`, and how far its points lie from `mesh` at most [m].
 
-    `None` where that would gain less than a quarter, and when `mesh` is textured.
+    `None` where that would gain less than a quarter, and when `mesh` is textured or coloured.
     """
-    if mesh.uv is not None or triangles <= 0 or mesh.triangles <= triangles:
+    if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
         return None
     points, inverse = np.unique(mesh.position.astype(np.float64), axis=0, return_inverse=True)
     index = inverse.reshape(-1)[mesh.index].astype(np.int64)
@@ -70,7 +70,12 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
 def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
     """Corners with area-weighted normals, creased by `CREASE`."""
     corners = points[faces]
-    face_normal = _across(corners)
+    return index_corners(corners.astype(np.float32), creased_normals(points, faces).astype(np.float32), None)
+
+
+def creased_normals(points: Doubles, faces: Ints) -> Doubles:
+    """Normals at the corners of faces, (m, 3, 3): area-weighted, those of the face itself across a crease."""
+    face_normal = _across(points[faces])
     vertex_normal = np.zeros_like(points)
     for k in range(3):
         np.add.at(vertex_normal, faces[:, k], face_normal)
@@ -78,7 +83,7 @@ def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
     normal = unit(vertex_normal)[faces]
     creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE
     normal[creased] = np.broadcast_to(face_normal[:, None], normal.shape)[creased]
-    return index_corners(corners.astype(np.float32), normal.astype(np.float32), None)
+    return normal
 
 
 def _across(corners: Doubles) -> Doubles:

@@ -1,0 +1,283 @@
+"""From what a `SceneBuilder` has collected to a specification: numbers for everything, each mesh, texture and material
+once, assets in the store. The order of all lists follows from the order in which things were added, and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.pose import compose, inverse
+from iris_session.protocol.common import IDENTITY, Pose, Vec3
+from iris_session.protocol.scene import (
+    MAX_SCENE_BYTES,
+    Body,
+    Deformable,
+    Environment,
+    Geometry,
+    SceneSpec,
+    Visual,
+    encode_scene,
+)
+from iris_session.protocol.scene_looks import Material, Mesh, Texture, TextureUse
+from iris_session.protocol.scene_names import GeometryKind, TextureKind
+from iris_session.scene.build import Builder, EncodeOptions, MeshNote, Work
+from iris_session.scene.collected import Flexible, World
+from iris_session.scene.composed import ComposedScene, DeformableSource
+from iris_session.scene.deformable_assets import encode_deformable
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.meshes import MeshArrays
+from iris_session.scene.parts import Item, Look, Matrix, Picture, matrix_of, rigid_and_rest
+from iris_session.scene.store import AssetStore
+from iris_session.scene.surfaces import scaled
+from iris_session.scene.totals import with_totals
+from iris_session.streams.deformable_topology import DeformableTopology
+
+#: Farthest that is drawn, at least [m], and times the extent of the scene.
+_FAR: Final = 50.0
+_FAR_EXTENTS: Final = 10.0
+_FACES: Final = 6
+
+
+def assemble(
+    world: World, environment: Environment | None, store: AssetStore, options: EncodeOptions | None, threads: int
+) -> ComposedScene:
+    """Builds it all. Raises `SceneBuildError`."""
+    builder = Builder(store, options, threads)
+    ids, bodies = _bodies(world)
+    placed = [rigid_and_rest(item.matrix) for item in world.items]
+    meshes, worn_mesh = _meshes(world.items, [rest for _, rest in placed], builder)
+    looks = [*(item.look for item in world.items), *(flexible.look for flexible in world.flexibles)]
+    textures, materials, worn_look, skybox = _looks(looks, world.skybox, builder)
+    visuals = tuple(
+        Visual(
+            id=k,
+            body=ids[item.body],
+            name=item.name,
+            T_body_visual=placed[k][0],
+            group=0,
+            geometry=_geometry(item, worn_mesh[k], meshes),
+            material=worn_look[k],
+            rgba=item.look.rgba,
+        )
+        for k, item in enumerate(world.items)
+    )
+    deformables, sources = _deformables(world.flexibles, worn_look[len(visuals) :], builder)
+    spec = with_totals(
+        SceneSpec(
+            name=world.name,
+            source="composed",
+            bodies=bodies,
+            visuals=visuals,
+            materials=materials,
+            textures=textures,
+            meshes=meshes,
+            lights=tuple(msgspec.structs.replace(light, body=ids[body]) for body, light in world.lights),
+            cameras=tuple(msgspec.structs.replace(camera, body=ids[body]) for body, camera in world.cameras),
+            deformables=deformables,
+        )
+    )
+    surroundings = environment or _surroundings(spec, sources)
+    if skybox >= 0:
+        surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
+    spec = msgspec.structs.replace(spec, environment=surroundings)
+    encoded = encode_scene(spec)
+    if len(encoded) > MAX_SCENE_BYTES:
+        raise SceneBuildError(
+            f"{len(visuals)} visuals on {len(bodies)} bodies make a specification of {len(encoded) >> 20} MiB, at most "
+            f"{MAX_SCENE_BYTES >> 20} are read: join what stands still into fewer meshes"
+        )
+    return ComposedScene(
+        spec=spec,
+        scene_hash=store.put(encoded),
+        moving=tuple(body.name for body in bodies if body.moving),
+        poses=tuple(body.T_world_body for body in bodies if body.moving),
+        articulations=dict(world.articulations),
+        deformables={source.name: source for source in sources},
+        skipped=tuple(world.skipped),
+        built=builder.built,
+        recalled=builder.recalled,
+    )
+
+
+def _bodies(world: World) -> tuple[dict[int, int], tuple[Body, ...]]:
+    """Ids by the places of things (-1: the world), and the bodies: moving ones first."""
+    order = sorted(range(len(world.things)), key=lambda k: not world.things[k].moving)
+    ids = {-1: 0, **{place: number for number, place in enumerate(order, start=1)}}
+    bodies = [Body(0, "world", -1, IDENTITY, IDENTITY, moving=False)]
+    for place in order:
+        thing = world.things[place]
+        above = world.things[thing.parent].pose if thing.parent >= 0 else IDENTITY
+        T_parent_body = thing.pose
+        if thing.parent >= 0:
+            T_parent_body = Pose(*compose(inverse((above.p, above.q)), (thing.pose.p, thing.pose.q)))
+        bodies.append(Body(ids[place], thing.name, ids[thing.parent], T_parent_body, thing.pose, thing.moving))
+    return ids, tuple(bodies)
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def _meshes(
+    items: Sequence[Item], rests: Sequence[Matrix | None], builder: Builder
+) -> tuple[tuple[Mesh, ...], list[int]]:
+    """Meshes, and for every item which of them it wears, -1 for a shape. What is equal to the bit is one."""
+    pieces: dict[tuple[object, ...], tuple[str, MeshArrays, Matrix | None]] = {}
+    keys: list[tuple[object, ...] | None] = []
+    for item, rest in zip(items, rests, strict=True):
+        if item.mesh is None:
+            keys.append(None)
+            continue
+        mapped = item.mesh.uv is not None and bool(item.look.pictures)
+        key: tuple[object, ...] = (id(item.mesh), None if rest is None else rest.tobytes(), mapped)
+        mesh = item.mesh if mapped else replace(item.mesh, uv=None)  # coordinates of nothing would keep levels out
+        pieces.setdefault(key, (item.name, mesh, rest))
+        keys.append(key)
+    notes = builder.run([_mesh_work(builder, mesh, rest) for _, mesh, rest in pieces.values()])
+    found: dict[str, int] = {}
+    meshes: list[Mesh] = []
+    places: dict[tuple[object, ...] | None, int] = {None: -1}
+    for (key, (name, mesh, _)), note in zip(pieces.items(), notes, strict=True):
+        address = note.levels[0].address
+        if address not in found:
+            found[address] = len(meshes)
+            meshes.append(Mesh(name, note.low, note.high, mesh.uv is not None, note.levels))
+        places[key] = found[address]
+    return tuple(meshes), [places[key] for key in keys]
+
+
+def _mesh_work(builder: Builder, mesh: MeshArrays, rest: Matrix | None) -> Work[MeshNote]:
+    marks = np.array([mesh.uv is not None, mesh.color is not None, rest is not None], np.uint8)
+    given = (mesh.position, mesh.normal, mesh.index, mesh.uv, mesh.color, rest)
+    raw: list[NDArray[Any]] = [marks, *(array for array in given if array is not None)]
+    return builder.mesh(raw, lambda: scaled(mesh, rest))
+
+
+def _geometry(item: Item, mesh: int, meshes: Sequence[Mesh]) -> Geometry:
+    if mesh < 0:
+        return Geometry(item.kind, item.size)
+    low, high = meshes[mesh].low, meshes[mesh].high
+    half: Vec3 = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
+    return Geometry(GeometryKind.MESH, half, mesh)
+
+
+# --- looks ------------------------------------------------------------------------------------------------------------
+
+
+def _looks(
+    looks: Sequence[Look], skybox: Picture | None, builder: Builder
+) -> tuple[tuple[Texture, ...], tuple[Material, ...], list[int], int]:
+    """Textures, materials, for every look its material (-1: its colour says all), and the texture of the skybox."""
+    pictures: dict[int, Picture] = {id(picture): picture for look in looks for _, picture in look.pictures}
+    if skybox is not None:
+        pictures[id(skybox)] = skybox
+    notes = builder.run([builder.texture(picture.pixels, picture.kind) for picture in pictures.values()])
+    found: dict[tuple[str, str, str], int] = {}
+    textures: list[Texture] = []
+    places: dict[int, int] = {}
+    for (key, picture), note in zip(pictures.items(), notes, strict=True):
+        same = (note.levels[0].address, picture.kind, picture.colorspace)
+        if same not in found:
+            found[same] = len(textures)
+            height, width, channels = picture.pixels.shape
+            height //= 1 if picture.kind == TextureKind.IMAGE else _FACES
+            textures.append(
+                Texture(picture.name, picture.kind, width, height, channels, picture.colorspace, note.levels)
+            )
+        places[key] = found[same]
+    materials: dict[Material, int] = {}
+    worn = []
+    for look in looks:
+        uses = tuple(TextureUse(role, places[id(picture)]) for role, picture in look.pictures)
+        worn.append(-1 if look.plain else materials.setdefault(_material(look, uses), len(materials)))
+    return tuple(textures), tuple(materials), worn, -1 if skybox is None else places[id(skybox)]
+
+
+def _material(look: Look, uses: tuple[TextureUse, ...]) -> Material:
+    return Material(
+        name=look.name,
+        rgba=look.rgba,
+        emission=look.emission,
+        specular=look.specular,
+        shininess=look.shininess,
+        metallic=look.metallic,
+        roughness=look.roughness,
+        textures=uses,
+        repeat=look.repeat,
+        uniform=look.uniform,
+    )
+
+
+# --- what bends, and what is around -----------------------------------------------------------------------------------
+
+
+def _deformables(
+    flexibles: Sequence[Flexible], materials: Sequence[int], builder: Builder
+) -> tuple[tuple[Deformable, ...], list[DeformableSource]]:
+    sources, works = [], []
+    for k, one in enumerate(flexibles):
+        ends = {"edges": one.elements} if one.elements.shape[1] == 2 else {"faces": one.elements}
+        try:
+            topology = DeformableTopology(len(one.vertices), **ends).bare()
+        except ValueError as error:
+            raise SceneBuildError(f"deformable {one.name!r}: {error}") from None
+        sources.append(DeformableSource(one.name, f"deformable-{k}", topology, one.vertices))
+        uv = None if one.uv is None or one.elements.shape[1] == 2 else one.uv[one.elements]
+        raw: list[bytes | NDArray[Any]] = [b"deformable", one.elements, one.vertices]
+        works.append(builder.blob([*raw, *([] if uv is None else [uv])], _encoder(one, uv, topology)))
+    notes = builder.run(works)
+    listed = tuple(
+        Deformable(
+            name=one.name,
+            dim=one.elements.shape[1] - 1,
+            group=0,
+            vertices=len(one.vertices),
+            elements=len(one.elements),
+            radius=one.radius,
+            flat=one.flat,
+            material=material,
+            rgba=one.look.rgba,
+            stream=source.stream,
+            address=note.address,
+            bytes=note.bytes,
+        )
+        for one, material, source, note in zip(flexibles, materials, sources, notes, strict=True)
+    )
+    return listed, sources
+
+
+def _encoder(one: Flexible, uv: NDArray[np.float32] | None, topology: DeformableTopology) -> Callable[[], bytes]:
+    return lambda: encode_deformable(one.elements, uv, one.vertices, topology)
+
+
+def _surroundings(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
+    """Centre and extent of what is there at first, without planes; everything of it is near enough to be drawn."""
+    poses = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    corners = [np.array(source.vertices, np.float64) for source in sources]
+    for visual in spec.visuals:
+        geometry = visual.geometry
+        if geometry.kind == GeometryKind.PLANE:
+            continue
+        size = np.array(geometry.size)
+        low, high = -size, size
+        if geometry.mesh >= 0:
+            low, high = np.array(spec.meshes[geometry.mesh].low), np.array(spec.meshes[geometry.mesh].high)
+        elif geometry.kind == GeometryKind.CAPSULE:
+            caps = np.array([0.0, 0.0, size[0]])
+            low, high = -size - caps, size + caps
+        box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        T = poses[visual.body] @ matrix_of(visual.T_body_visual)
+        corners.append(box @ T[:3, :3].T + T[:3, 3])
+    if not corners:
+        return Environment()
+    points = np.concatenate(corners)
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y, z = ((low + high) / 2).tolist()
+    extent = max(0.1, math.dist(low.tolist(), high.tolist()) / 2)
+    return Environment(zfar=max(_FAR, _FAR_EXTENTS * extent), extent=extent, center=(x, y, z))

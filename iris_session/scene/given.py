@@ -1,0 +1,136 @@
+"""What callers give as arrays and numbers, checked: every refusal says what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, Final, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.scene_names import TextureRole
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.meshes import MeshArrays, index_corners
+from iris_session.scene.parts import GREY, MAX_TRIANGLES, Look, Picture
+from iris_session.scene.pictures import checked_pixels, read_pixels
+from iris_session.scene.references import read_bounded
+from iris_session.scene.simplify import creased_normals, unit
+
+_NUMBERS: Final = ("emission", "specular", "shininess", "metallic", "roughness")
+
+
+class Looks(TypedDict, total=False):
+    """How something looks. `rgba`: 0..1. `texture`: a path, or pixels (height, width, 1, 3 or 4) uint8, first row on
+    top, which the colour multiplies. `metallic`, `roughness`, `emission`, `specular`, `shininess`: as in `Material`.
+    `repeat`: how often the texture lies on a shape, or on a metre where `uniform`.
+    """
+
+    rgba: Sequence[float]
+    texture: str | PathLike[str] | NDArray[np.uint8]
+    metallic: float
+    roughness: float
+    emission: float
+    specular: float
+    shininess: float
+    repeat: Sequence[float]
+    uniform: bool
+
+
+def look_of(options: Mapping[str, Any]) -> Look | None:
+    """The look that the options ask for, `None` where they ask for none."""
+    if not options.keys() & Looks.__annotations__.keys():
+        return None
+    default = (1.0, 1.0, 1.0, 1.0) if "texture" in options else GREY
+    rgba = [float(v) for v in options.get("rgba", default)]
+    if len(rgba) == 3:
+        rgba.append(1.0)
+    red, green, blue, alpha = numbers("rgba", rgba, 4)
+    if not all(0.0 <= v <= 1.0 for v in rgba):
+        raise SceneBuildError(f"rgba is {tuple(rgba)}: each from 0 to 1")
+    across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
+    pictures: tuple[tuple[str, Picture], ...] = ()
+    if "texture" in options:
+        pixels = _texture(options["texture"])
+        pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, Picture(pixels)),)
+    values: dict[str, Any] = {name: numbers(name, [options[name]], 1)[0] for name in _NUMBERS if name in options}
+    if "roughness" in values and "shininess" not in values:  # for clients that do not draw by roughness
+        values["shininess"] = min(max(1.0 - values["roughness"], 0.0), 1.0)
+    plain = Look(
+        rgba=(red, green, blue, alpha),
+        pictures=pictures,
+        repeat=(across, down),
+        uniform=bool(options.get("uniform", False)),
+    )
+    return replace(plain, **values)
+
+
+def _texture(texture: Any) -> NDArray[np.uint8]:
+    if isinstance(texture, str | PathLike):
+        path = Path(fspath(texture))
+        return read_pixels(read_bounded(path), str(path))
+    return checked_pixels(texture, "texture")
+
+
+def numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
+    """As many finite numbers, greater than `above`."""
+    try:
+        found = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
+    if len(found) != count or not np.isfinite(found).all():
+        raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers are needed")
+    if above is not None and min(found) <= above:
+        raise SceneBuildError(f"{what} is {values!r}: numbers greater than {above:g} are needed")
+    return found
+
+
+def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
+    """Rows of finite float32, read-only."""
+    try:
+        array = np.array(values, np.float32)
+    except (TypeError, ValueError):
+        array = np.empty(0, np.float32)
+    if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
+        raise SceneBuildError(f"an array of shape {array.shape}: finite numbers of shape (n, {width}) are needed")
+    if count is not None and len(array) != count:
+        raise SceneBuildError(f"{len(array)} rows for {count} vertices: one each is needed")
+    array.setflags(write=False)
+    return array
+
+
+def triangles_of(values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
+    """Rows of vertex numbers."""
+    array = np.asarray(values)
+    if array.ndim != 2 or array.shape[1] != width or not len(array) or array.dtype.kind not in "iu":
+        raise SceneBuildError(
+            f"an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at least one row"
+        )
+    if len(array) > MAX_TRIANGLES:
+        raise SceneBuildError(f"{len(array)} rows: at most {MAX_TRIANGLES:,}")
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= vertices:
+        raise SceneBuildError(f"vertex {low if low < 0 else high} of {vertices}: numbers go from 0 to {vertices - 1}")
+    return np.ascontiguousarray(array, np.uint32)
+
+
+def given_mesh(vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: Any) -> MeshArrays:
+    """A mesh of arrays per vertex."""
+    points = given_vertices(vertices)
+    index = triangles_of(triangles, len(points)).astype(np.int64)
+    if normals is None:
+        across = creased_normals(points.astype(np.float64), index).astype(np.float32)
+    else:
+        across = np.asarray(unit(given_vertices(normals, 3, len(points)))[index], np.float32)
+    uv = None if uvs is None else given_vertices(uvs, 2, len(points))[index]
+    color = None
+    if colors is not None:
+        array = np.asarray(colors)
+        if array.dtype != np.uint8 or array.ndim != 2 or array.shape[1] not in (3, 4) or len(array) != len(points):
+            raise SceneBuildError(f"colors {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8")
+        if array.shape[1] == 3:
+            array = np.concatenate([array, np.full((len(array), 1), 255, np.uint8)], axis=1)
+        color = array[index]
+    return index_corners(points[index], across, uv, color)

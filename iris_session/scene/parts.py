@@ -1,0 +1,180 @@
+"""What files become before they are part of a scene: nodes with surfaces, looks, lights and cameras, in plain values.
+
+Frames: a node's matrix leads to the file's own frame, as the file has it, with its scale. Colours are those of the
+specification (as they are seen), texture coordinates too (v down).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.lie import matrix_quat, quat_matrix
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose, Quat, Vec3
+from iris_session.protocol.scene import Camera, Light
+from iris_session.protocol.scene_looks import Rgba, Vec2
+from iris_session.protocol.scene_names import ColorSpace, GeometryKind, TextureKind
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.images import Pixels
+from iris_session.scene.meshes import MeshArrays
+
+#: Largest file that is read, with each of the files that it refers to [bytes].
+MAX_FILE_BYTES: Final = 512 << 20
+#: Most triangles of one file, and most nodes.
+MAX_TRIANGLES: Final = 20_000_000
+MAX_NODES: Final = 100_000
+#: What has no colour of its own.
+GREY: Final[Rgba] = (0.5, 0.5, 0.5, 1.0)
+#: Farther than this from the identity, a matrix's scale is put into the vertices.
+_RIGID: Final = 1e-9
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A texture to be. `pixels` (height, width, channels), 1, 3 or 4 of them; six faces below each other of a cube."""
+
+    pixels: Pixels
+    name: str = ""
+    kind: str = TextureKind.IMAGE
+    colorspace: str = ColorSpace.AUTO
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How a surface looks: fields as in `Material`, which it becomes unless it is a colour only.
+
+    `pictures`: (role, picture) pairs.
+    """
+
+    rgba: Rgba = GREY
+    name: str = ""
+    emission: float = 0.0
+    specular: float = 0.5
+    shininess: float = 0.5
+    metallic: float = -1.0
+    roughness: float = -1.0
+    pictures: tuple[tuple[str, Picture], ...] = ()
+    repeat: Vec2 = (1.0, 1.0)
+    uniform: bool = False
+
+    @property
+    def plain(self) -> bool:
+        """Whether the colour says all."""
+        defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
+        return not self.pictures and defaults == (
+            self.emission,
+            self.specular,
+            self.shininess,
+            self.metallic,
+            self.roughness,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles with one look."""
+
+    mesh: MeshArrays
+    look: Look | None = None
+    name: str = ""
+
+
+@dataclass(eq=False)
+class Node:
+    """A place in a file. `matrix` (4, 4): T_file_node. `parent`: an earlier node, -1 for none.
+
+    The `lights` and `cameras` are in the node's frame; their bodies are not yet known.
+    """
+
+    name: str = ""
+    parent: int = -1
+    matrix: Matrix = field(default_factory=lambda: np.eye(4))
+    surfaces: list[Surface] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)
+    cameras: list[Camera] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Item:
+    """Something drawn on body `body` (its place in a list of bodies, -1 for the world): a `mesh`, or a shape of `kind`
+    and `size` as in `Geometry`. `matrix` (4, 4): T_body_item, of meshes with scale."""
+
+    body: int
+    name: str
+    matrix: Matrix
+    look: Look
+    mesh: MeshArrays | None = None
+    kind: str = GeometryKind.MESH
+    size: Vec3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A file as it was read: nodes, parents first. `up`: the axis that it says is up, `y` or `z`.
+
+    `unit`: one of its lengths in metres. `skipped`: what it has and the specification does not, a line each.
+    """
+
+    nodes: tuple[Node, ...]
+    up: str = "z"
+    unit: float = 1.0
+    skipped: tuple[str, ...] = ()
+
+
+def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
+    """`matrix` (4, 4) as a pose and what is left of its turning part (3, 3), to be applied before it: scale, shear,
+    reflection; `None` where nothing is left. Raises `SceneBuildError` for one that flattens or is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        raise SceneBuildError("a place in the file is not finite")
+    turn = np.asarray(matrix[:3, :3], np.float64)
+    U, scale, Vt = np.linalg.svd(turn)
+    if scale[-1] <= 1e-12 * max(1.0, float(scale[0])):
+        raise SceneBuildError("a scale in the file is 0: give every axis one")
+    R = U @ Vt
+    if np.linalg.det(R) < 0:
+        R = -R
+    rest = R.T @ turn
+    rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
+    return pose_of(R, matrix[:3, 3]), None if rigid else rest
+
+
+def pose_of(R: NDArray[np.float64], p: Any) -> Pose:
+    """A pose of a rotation matrix (3, 3) and a position."""
+    w, i, j, k = matrix_quat(np.asarray(R, np.float64)).tolist()
+    x, y, z = (float(v) for v in p)
+    return Pose((x, y, z), (w, i, j, k))
+
+
+def matrix_of(pose: Pose) -> Matrix:
+    """(4, 4) of a pose."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_matrix(np.array(pose.q))
+    matrix[:3, 3] = pose.p
+    return matrix
+
+
+def checked_pose(position: Any, quaternion: Any) -> Pose:
+    """A pose of what a caller gave; the quaternion is normalised. Raises `SceneBuildError` for what is none."""
+    try:
+        p: Vec3 = (float(position[0]), float(position[1]), float(position[2]))
+        q = np.array([float(v) for v in quaternion])
+    except (TypeError, ValueError, IndexError) as error:
+        raise SceneBuildError(f"no pose: {error}; give position (x, y, z) and quaternion (w, x, y, z)") from None
+    length = float(np.linalg.norm(q)) if q.shape == (4,) else 0.0
+    if len(position) != 3 or not np.isfinite([*p, length]).all() or length < 1e-9:
+        raise SceneBuildError(
+            f"no pose: position {tuple(position)}, quaternion {tuple(quaternion)}: three and four finite numbers"
+        )
+    w, x, y, z = (q / length).tolist()
+    unit: Quat = (w, x, y, z)
+    return IDENTITY if (p, unit) == (IDENTITY.p, IDENTITY.q) else Pose(p, unit)
+
+
+def cut(name: object) -> str:
+    """A name as the wire holds it."""
+    return str(name)[:MAX_TEXT] if name is not None else ""

@@ -1,0 +1,239 @@
+"""Mesh files that trimesh reads: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF and others. Not glTF: see `gltf`.
+
+Colours are taken as they stand in the file. Where it has no normals they are made as MuJoCo makes them, with creases.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.scene_looks import Rgba
+from iris_session.protocol.scene_names import TextureRole
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.meshes import index_corners, unique_rows
+from iris_session.scene.parts import (
+    GREY,
+    MAX_FILE_BYTES,
+    MAX_NODES,
+    MAX_TRIANGLES,
+    Loaded,
+    Look,
+    Node,
+    Picture,
+    Surface,
+    cut,
+)
+from iris_session.scene.pictures import pixels_of
+from iris_session.scene.references import References, read_bounded
+from iris_session.scene.simplify import creased_normals, unit
+from iris_session.scene.surfaces import recoloured
+
+#: Formats of trimesh that are points, or archives of anything.
+_OTHER: Final = frozenset({"glb", "gltf", "xyz", "zip", "tar.gz", "tar.bz2", "bz2", "zae", "svg", "dxf"})
+_UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
+
+
+def formats() -> tuple[str, ...]:
+    """Endings that are read here, without the dot."""
+    return tuple(sorted(set(_trimesh().exchange.load.mesh_formats()) - _OTHER))
+
+
+def read_with_trimesh(path: Path, references: References) -> Loaded:
+    """The file. Raises `SceneBuildError`."""
+    trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
+    data = read_bounded(path)
+    _check(path, kind, data)
+    resolver = _resolver(trimesh, references)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    reader = _Reader(trimesh, path.name)
+    nodes = reader.nodes(scene)
+    skipped = (*(f"{path.name}: {text}" for text in resolver.missing), *reader.skipped)
+    return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), skipped)
+
+
+def _check(path: Path, kind: str, data: bytes) -> None:
+    if kind == "dae":
+        try:
+            import collada  # noqa: F401
+        except ImportError:
+            raise SceneBuildError(f"{path.name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
+    if zipfile.is_zipfile(io.BytesIO(data)):
+        size = sum(entry.file_size for entry in zipfile.ZipFile(io.BytesIO(data)).infolist())
+        if size > MAX_FILE_BYTES:
+            raise SceneBuildError(f"{path.name} unpacks to {size >> 20} MiB, at most {MAX_FILE_BYTES >> 20} are read")
+
+
+def _up(kind: str, data: bytes) -> str:
+    """COLLADA says which axis is up, and means y when it does not; the others say nothing and are taken as z up."""
+    if kind != "dae":
+        return "z"
+    found = _UP.search(data)
+    return "z" if found and found.group(1) == b"Z" else "y"
+
+
+def _unit(trimesh: Any, scene: Any) -> float:
+    return float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
+
+
+class _Reader:
+    def __init__(self, trimesh: Any, name: str) -> None:
+        self._trimesh = trimesh
+        self._name = name
+        self._looks: dict[int, Look] = {}
+        self._pictures: dict[int, Picture] = {}
+        self.skipped: list[str] = []
+
+    def nodes(self, scene: Any) -> tuple[Node, ...]:
+        """Flat, in the order of the file's geometries: trimesh keeps no other."""
+        surfaces: dict[str, Surface] = {}
+        for name, geometry in scene.geometry.items():
+            if not isinstance(geometry, self._trimesh.Trimesh):
+                self.skipped.append(f"{self._name}: {name}, which is {type(geometry).__name__} and no triangles")
+            elif len(geometry.faces):
+                surfaces[name] = self._surface(geometry, cut(name))
+        if sum(surface.mesh.triangles for surface in surfaces.values()) > MAX_TRIANGLES:
+            raise SceneBuildError(f"{self._name} has more than {MAX_TRIANGLES:,} triangles: make it coarser")
+        order = {name: place for place, name in enumerate(surfaces)}
+        placed = []
+        for node in scene.graph.nodes_geometry:
+            matrix, name = scene.graph[node]
+            if name in order:
+                placed.append((order[name], np.array(matrix, np.float64)))
+        if len(placed) > MAX_NODES:
+            raise SceneBuildError(f"{self._name} has {len(placed)} parts, at most {MAX_NODES} are read")
+        placed.sort(key=lambda entry: (entry[0], entry[1].tolist()))  # names of nodes may be made up by the library
+        names = list(surfaces)
+        return tuple(Node(cut(names[k]), -1, matrix, [surfaces[names[k]]]) for k, matrix in placed)
+
+    def _surface(self, geometry: Any, name: str) -> Surface:
+        points = np.ascontiguousarray(geometry.vertices, np.float64)
+        faces = np.ascontiguousarray(geometry.faces, np.int64)
+        if not np.isfinite(points).all():
+            raise SceneBuildError(f"{self._name}: a vertex of {name} is not finite")
+        visual = geometry.visual
+        uv: NDArray[np.float32] | None = None
+        color: NDArray[np.uint8] | None = None
+        look: Look | None = None
+        if visual.kind == "texture":
+            look = self._look(visual.material)
+            if visual.uv is not None and len(visual.uv) == len(points):
+                downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v is up in trimesh
+                uv = np.ascontiguousarray(np.nan_to_num(downward)[faces], np.float32)
+        elif visual.kind == "vertex":
+            color = np.asarray(visual.vertex_colors, np.uint8)[faces]
+        elif visual.kind == "face":
+            color = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None], 3, axis=1)
+        mesh = index_corners(points[faces].astype(np.float32), self._normals(geometry, points, faces), uv, color)
+        if color is not None:
+            mesh, rgba = recoloured(mesh, (1.0, 1.0, 1.0, 1.0))
+            look = Look(rgba=rgba)
+        return Surface(mesh, look, name)
+
+    def _normals(self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+        """At the corners: those of the file, else made from the triangles around each point."""
+        given = geometry._cache.cache.get("vertex_normals")  # without it trimesh would make its own
+        if given is not None and len(given) == len(points):
+            return np.asarray(unit(np.nan_to_num(given))[faces], np.float32)
+        first, same = unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
+        return creased_normals(points[first], same[faces]).astype(np.float32)
+
+    def _look(self, material: Any) -> Look:
+        if id(material) not in self._looks:
+            pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
+            self._looks[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
+        return self._looks[id(material)]
+
+    def _of_mtl(self, material: Any) -> Look:
+        """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour."""
+        more = getattr(material, "kwargs", None) or {}
+        rgba = _rgba(material.diffuse)
+        alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
+        pictures = self._picture(material.image)
+        specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
+        return Look(
+            rgba=(*rgba[:3], min(max(alpha, 0.0), 1.0)),
+            name=cut(material.name),
+            specular=0.5 if specular is None else min(max(float(np.mean(specular)), 0.0), 1.0),
+            shininess=min(max(gloss / 128.0, 0.0), 1.0),
+            pictures=pictures,
+        )
+
+    def _of_pbr(self, material: Any) -> Look:
+        rgba = (1.0, 1.0, 1.0, 1.0) if material.baseColorFactor is None else _rgba(material.baseColorFactor)
+        glow = 0.0 if material.emissiveFactor is None else float(np.max(material.emissiveFactor))
+        metallic = -1.0 if material.metallicFactor is None else float(material.metallicFactor)
+        roughness = -1.0 if material.roughnessFactor is None else float(material.roughnessFactor)
+        return Look(
+            rgba=rgba,
+            name=cut(material.name),
+            emission=max(0.0, glow),
+            shininess=0.5 if roughness < 0 else min(max(1.0 - roughness, 0.0), 1.0),
+            metallic=metallic,
+            roughness=roughness,
+            pictures=self._picture(material.baseColorTexture),
+        )
+
+    def _picture(self, image: Any) -> tuple[tuple[str, Picture], ...]:
+        if image is None:
+            return ()
+        if id(image) not in self._pictures:
+            self._pictures[id(image)] = Picture(pixels_of(image))
+        picture = self._pictures[id(image)]
+        return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
+
+
+def _rgba(color: Any) -> Rgba:
+    """Bytes of trimesh as a colour."""
+    if color is None:
+        return GREY
+    red, green, blue, alpha = (float(v) / 255 for v in np.asarray(color).reshape(-1)[:4])
+    return red, green, blue, alpha
+
+
+def _first(value: Any, default: float) -> float:
+    """A number of an MTL file, which may come as a list of texts."""
+    try:
+        return float(value[0] if isinstance(value, list | tuple) else value)
+    except (TypeError, ValueError, IndexError):
+        return default
+
+
+def _resolver(trimesh: Any, references: References) -> Any:
+    """What trimesh asks for further files: ours decides which it may have, and keeps what was missing."""
+
+    class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.missing: list[str] = []
+
+        def get(self, name: str) -> bytes:
+            try:
+                return read_bounded(references.find(str(name).strip()))
+            except SceneBuildError as error:
+                self.missing.append(str(error))
+                raise
+
+        def write(self, name: str, data: Any) -> None:
+            raise SceneBuildError("nothing is written where files are read")
+
+        def namespaced(self, namespace: str) -> Any:
+            return self
+
+        def keys(self) -> list[str]:
+            return []
+
+    return Resolver()
+
+
+def _trimesh() -> Any:
+    try:
+        import trimesh
+    except ImportError:
+        raise SceneBuildError("mesh files need trimesh: pip install 'iris-session[files]'") from None
+    return trimesh

@@ -1,0 +1,253 @@
+"""URDF files: links that fixed joints hold together as one body each, joints with limits and mimics, what is drawn.
+
+XML is read by yourdfpy, the meshes by our own readers, as they stand in their files (no axis of theirs is turned up, as
+in ROS). A mesh with colours of its own keeps them; others have the material of the URDF.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene_names import GeometryKind, TextureRole
+from iris_session.scene.articulation import Articulation, Part
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.files import load_file
+from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, cut, pose_of
+from iris_session.scene.pictures import read_pixels
+from iris_session.scene.references import References, read_bounded
+from iris_session.scene.urdf_joints import read_joints, root_link
+
+_SHAPES: Final = frozenset({"box", "cylinder", "sphere", "mesh"})
+#: Joints that leave their link where it is: nothing sets them.
+_STILL: Final = frozenset({"fixed", "floating", "planar"})
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A URDF: `items` are on `articulation.parts`, by their places. `skipped`: a line for each thing left out."""
+
+    articulation: Articulation
+    items: tuple[Item, ...]
+    skipped: tuple[str, ...]
+
+
+def read_urdf(
+    path: Path,
+    name: str,
+    T_world_root: Pose,
+    package_dirs: Sequence[str | PathLike[str]] = (),
+    *,
+    collisions: bool = False,
+) -> Robot:
+    """The robot under `name`: its bodies are called `name/link`. `collisions`: draw these instead of visuals.
+
+    Raises `SceneBuildError`.
+    """
+    references = References(path, package_dirs)
+    data = read_bounded(path)
+    try:
+        robot, skipped = _parsed(path, data)
+        return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root)
+    except SceneBuildError:
+        raise
+    except Exception as error:  # yourdfpy raises whatever the missing attribute leads to
+        raise SceneBuildError(f"{path} is damaged, or no URDF: {type(error).__name__}: {error}") from error
+
+
+def _parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
+    """What yourdfpy makes of it, and shapes that it does not know, taken out before."""
+    try:
+        import yourdfpy
+        from lxml import etree
+    except ImportError:
+        raise SceneBuildError("URDF files need yourdfpy: pip install 'iris-session[files]'") from None
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False)
+    try:
+        root = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        raise SceneBuildError(f"{path} is no XML: {error}") from None
+    if root.getroottree().docinfo.doctype:
+        raise SceneBuildError(f"{path} has a DOCTYPE: remove it")
+    if root.tag != "robot":
+        raise SceneBuildError(f"{path} is no URDF: it begins with <{root.tag}> where <robot> is needed")
+    if any("xacro" in str(space) for space in root.nsmap.values()) and b"<xacro:" in data:
+        raise SceneBuildError(f"{path} is xacro: make URDF of it first (xacro {path.name} > robot.urdf)")
+    skipped: dict[str, None] = {}
+    for holder in [*root.iter("visual"), *root.iter("collision")]:
+        geometry = holder.find("geometry")
+        shape = (
+            next((child.tag for child in geometry if isinstance(child.tag, str)), "") if geometry is not None else ""
+        )
+        if shape not in _SHAPES:
+            link = holder.getparent().get("name", "")
+            skipped[f"{path.name}: {holder.tag} of link {link}: shape {shape or 'none'!r}"] = None
+            holder.getparent().remove(holder)
+    made = yourdfpy.URDF.load(
+        io.BytesIO(etree.tostring(root)),
+        build_scene_graph=False,
+        build_collision_scene_graph=False,
+        load_meshes=False,
+        load_collision_meshes=False,
+    )
+    return made.robot, skipped
+
+
+class _Reader:
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        robot: Any,
+        references: References,
+        package_dirs: Sequence[str | PathLike[str]],
+        skipped: dict[str, None],
+        collisions: bool,
+    ) -> None:
+        self._path, self._name, self._robot = path, name, robot
+        self._references, self._package_dirs = references, package_dirs
+        self._skipped = skipped
+        self._collisions = collisions
+        self._files: dict[Path, Loaded] = {}
+        self._looks: dict[str, Look | None] = {}
+        self._pictures: dict[Path, Picture] = {}
+        self._materials: dict[str, Any] = {}
+        worn = (visual.material for link in robot.links for visual in link.visuals)
+        for material in (*robot.materials, *worn):
+            if material is not None and material.name and (material.color is not None or material.texture is not None):
+                self._materials.setdefault(material.name, material)
+
+    def robot(self, T_world_root: Pose) -> Robot:
+        root = root_link(self._path.name, self._robot)
+        table = read_joints(self._path.name, self._robot)
+        below: dict[str, list[Any]] = {}
+        for joint in self._robot.joints:
+            below.setdefault(joint.parent, []).append(joint)
+        links = {link.name: link for link in self._robot.links}
+        parts = [Part(f"{self._name}/{root}")]
+        items: list[Item] = []
+        waiting: list[tuple[str, int, Matrix]] = [(root, 0, np.eye(4))]
+        while waiting:
+            name, part, T_part_link = waiting.pop()
+            items += self._drawn(links[name], part, T_part_link)
+            for joint in reversed(below.get(name, [])):
+                T_part_child = T_part_link @ _matrix(self._path.name, joint)
+                if joint.type in _STILL:
+                    if joint.type != "fixed":
+                        self._skip(f"joint {joint.name} is {joint.type}: its link stays where it is")
+                    waiting.append((joint.child, part, T_part_child))
+                    continue
+                drive = table.drives[joint.name]
+                parts.append(
+                    Part(
+                        body=f"{self._name}/{joint.child}",
+                        parent=part,
+                        T_parent_joint=pose_of(T_part_child[:3, :3], T_part_child[:3, 3]),
+                        axis=drive.axis,
+                        sliding=joint.type == "prismatic",
+                        joint=drive.joint,
+                        multiplier=drive.multiplier,
+                        offset=drive.offset,
+                    )
+                )
+                waiting.append((joint.child, len(parts) - 1, np.eye(4)))
+        if not items:
+            other = "visuals: leave out collisions=True" if self._collisions else "collisions: give collisions=True"
+            self._skip(f"nothing of it is drawn; what it may have are {other}")
+        articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics)
+        return Robot(articulation, tuple(items), tuple(self._skipped))
+
+    # --- what is drawn ------------------------------------------------------------------------------------------------
+
+    def _drawn(self, link: Any, part: int, T_part_link: Matrix) -> list[Item]:
+        found: list[Item] = []
+        for shape in link.collisions if self._collisions else link.visuals:
+            matrix = T_part_link @ (np.eye(4) if shape.origin is None else shape.origin)
+            look = None if self._collisions else self._look(shape.material)
+            name = cut(shape.name or link.name)
+            geometry = shape.geometry
+            if geometry.mesh is not None:
+                found += self._mesh(geometry.mesh, part, name, matrix, look)
+                continue
+            kind, size = _shape(self._path.name, geometry)
+            found.append(Item(part, name, matrix, look or Look(), kind=kind, size=size))
+        return found
+
+    def _mesh(self, mesh: Any, part: int, name: str, matrix: Matrix, look: Look | None) -> list[Item]:
+        if not mesh.filename:
+            raise SceneBuildError(f"{self._path.name}: a mesh of {name} names no file")
+        path = self._references.find(mesh.filename)
+        if path not in self._files:
+            self._files[path] = load_file(path, (*self._package_dirs, *self._references.folders(path)))
+            for text in self._files[path].skipped:
+                self._skipped[text] = None
+            if any(node.lights or node.cameras for node in self._files[path].nodes):
+                self._skip(f"lights and cameras in {path.name}")
+        loaded = self._files[path]
+        scale = np.eye(4)
+        scale[:3, :3] *= loaded.unit * np.broadcast_to(1.0 if mesh.scale is None else mesh.scale, 3)
+        return [
+            Item(part, name, matrix @ scale @ node.matrix, surface.look or look or Look(), surface.mesh)
+            for node in loaded.nodes
+            for surface in node.surfaces
+        ]
+
+    def _look(self, material: Any) -> Look | None:
+        """Of a material of the URDF; one without colour refers to another of its name."""
+        if material is None:
+            return None
+        known = material
+        if material.color is None and material.texture is None:
+            known = self._materials.get(material.name or "")
+        if known is None:
+            self._skip(f"material {material.name!r}, which has neither colour nor texture anywhere")
+            return None
+        key = f"{known.name} {known.color} {known.texture}"
+        if key not in self._looks:
+            rgba = (1.0, 1.0, 1.0, 1.0) if known.color is None else tuple(float(v) for v in known.color.rgba)
+            if len(rgba) != 4:
+                raise SceneBuildError(f"{self._path.name}: material {known.name!r} needs rgba of four numbers")
+            self._looks[key] = Look(rgba=rgba, name=cut(known.name or ""), pictures=self._texture(known.texture))
+        return self._looks[key]
+
+    def _texture(self, texture: Any) -> tuple[tuple[str, Picture], ...]:
+        if texture is None or not texture.filename:
+            return ()
+        path = self._references.find(texture.filename)
+        if path not in self._pictures:
+            self._pictures[path] = Picture(read_pixels(read_bounded(path), str(path)), cut(path.stem))
+        picture = self._pictures[path]
+        return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
+
+    def _skip(self, text: str) -> None:
+        self._skipped[f"{self._path.name}: {text}"] = None
+
+
+def _matrix(file: str, joint: Any) -> Matrix:
+    """T_parent_joint, as the file has it."""
+    matrix = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
+    if not np.isfinite(matrix).all():
+        raise SceneBuildError(f"{file}: the origin of joint {joint.name} is not finite")
+    return matrix
+
+
+def _shape(file: str, geometry: Any) -> tuple[str, tuple[float, float, float]]:
+    """Kind and size of a simple shape, as in `Geometry`."""
+    if geometry.box is not None:
+        kind, sizes = GeometryKind.BOX, [0.5 * float(v) for v in geometry.box.size]
+    elif geometry.cylinder is not None:
+        radius = float(geometry.cylinder.radius)
+        kind, sizes = GeometryKind.CYLINDER, [radius, radius, 0.5 * float(geometry.cylinder.length)]
+    else:
+        kind, sizes = GeometryKind.SPHERE, [float(geometry.sphere.radius)] * 3
+    if len(sizes) != 3 or not all(math.isfinite(v) and v > 0 for v in sizes):
+        raise SceneBuildError(f"{file}: a {kind} of size {sizes}: three positive lengths are needed")
+    return kind, (sizes[0], sizes[1], sizes[2])
