@@ -227,7 +227,7 @@ class SessionProcesses:
         if self.front is not None:
             self.front.set_scene(scene.shown.info)
         if self._deformables is not None and isinstance(scene, NextScene):
-            self._deformables.use(flexes(scene.plant.world))
+            self._deformables.use(scene.bending)
 
     def _header(self, core: SessionCore, recording_class: str) -> SessionHeader:
         return SessionHeader(

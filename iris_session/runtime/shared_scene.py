@@ -6,9 +6,11 @@ What a model became is remembered on the disk, so only the first session with a 
 from __future__ import annotations
 
 import threading
+import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,6 +22,11 @@ from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.transport import SceneInfo
+
+#: Specifications of patches that are kept: more than can wait for the loop, and as long as a slow disk may take to read
+#: them for the recording. A session that is patched ten times a second must not fill the disk.
+KEPT_LOOKS: Final = 96
+KEPT_LOOKS_S: Final = 10.0
 
 
 class Shown(NamedTuple):
@@ -45,6 +52,8 @@ class SharedScenes:
         self._name = name
         self._composed = composed
         self._holds: list[Hold] = []
+        self._looks: deque[_Look] = deque()  # of patches, the oldest first
+        self._closed = False
         self._store: AssetStore | None = None
         if where is not False:
             try:
@@ -91,8 +100,13 @@ class SharedScenes:
         """It is the newest from now on; its files stay, and those of the one before, which the front still serves."""
         with self.lock:
             self.newest = shown
-            if self._store is not None and shown.spec is not None:
-                self._holds.append(self._store.hold(shown.info.assets))
+            store = self._store
+            if store is not None and shown.spec is not None and not self._closed:  # a thread may be later than the end
+                self._holds.append(store.hold(shown.info.assets))
+                if shown.patches:
+                    address = shown.info.scene_hash
+                    self._looks.append(_Look(address, store.used_at(address), time.monotonic()))
+                self._forget_looks(store)
             while len(self._holds) > 2:
                 self._holds.pop(0).release()
         return shown.info
@@ -100,13 +114,29 @@ class SharedScenes:
     def close(self) -> None:
         """Lets go of the files."""
         with self.lock:
+            self._closed = True
             for hold in self._holds:
                 hold.release()
             self._holds.clear()
 
+    def _forget_looks(self, store: AssetStore) -> None:
+        """Specifications that patches after them have replaced, for everybody."""
+        looks, now = self._looks, time.monotonic()
+        while len(looks) > KEPT_LOOKS and now - looks[0].shown_s > KEPT_LOOKS_S:
+            look = looks.popleft()
+            store.discard(look.address, look.used_at)
+
     def _without(self, why: str) -> None:
         self._store = None
         self.notes.append(f"clients get no meshes and textures: {why}")
+
+
+class _Look(NamedTuple):
+    """The specification after a patch. `used_at`: as the store says; `shown_s`: monotonic."""
+
+    address: str
+    used_at: int
+    shown_s: float
 
 
 def _stored(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:

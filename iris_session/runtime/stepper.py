@@ -33,6 +33,7 @@ from iris_session.protocol.server_messages import BodyInfo, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.runtime.core import Plant, SessionCore, StepOutcome, unmeasured
+from iris_session.runtime.deformables import Bending
 from iris_session.runtime.shared_scene import Shown
 from iris_session.runtime.status import SessionLedger
 
@@ -84,12 +85,14 @@ class RecorderPort(Protocol):
 
 
 class NextScene(NamedTuple):
-    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `shown`: to clients."""
+    """A scene that is to take the place of the present one. `packed_model`: to be recorded; `shown`: to clients;
+    `bending`: what bends in it."""
 
     plant: Plant
     model_hash: str
     packed_model: bytes
     shown: Shown
+    bending: Sequence[Bending] = ()
 
 
 class NextPatch(NamedTuple):

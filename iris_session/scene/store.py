@@ -3,12 +3,13 @@
 Layout: `<root>/<first two hex>/<hash>`; `<root>/index/<two hex>/<key>` remembers what was built from which raw content
 (`build`), `<root>/holds/` what running processes use. Several processes may share a folder: files appear whole (rename)
 and never change. When the files exceed `limit_bytes`, those used longest ago go, but nothing that a process holds and
-nothing used within `GRACE_S`.
+nothing used within `GRACE_S`. Files and folders of others below the root are never touched.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -26,14 +27,18 @@ DEFAULT_LIMIT: Final = 4 << 30
 #: A file used this short ago [s] stays: another process may be about to hold it.
 GRACE_S: Final = 600.0
 _ADDRESS: Final = re.compile(r"[0-9a-f]{64}")
+_PART: Final = re.compile(r"tmp\w+\.part")
 _INDEX: Final = "index"
 _HOLDS: Final = "holds"
 
 
 def default_root() -> Path:
-    """`~/.cache/iris-session/assets`, or below `XDG_CACHE_HOME`."""
+    """`~/.cache/iris-session/assets`, or below `XDG_CACHE_HOME`. Raises `OSError` where there is no home."""
     base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if base else Path.home() / ".cache") / "iris-session" / "assets"
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "iris-session" / "assets"
+    except RuntimeError:  # a user without an entry, as in containers
+        raise OSError(errno.ENOENT, "this user has no home folder: set XDG_CACHE_HOME, or name a folder") from None
 
 
 class Hold:
@@ -41,12 +46,20 @@ class Hold:
 
     def __init__(self, folder: Path, addresses: Iterable[str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=folder, suffix=".hold")
-        self._path = Path(name)
-        self._lock = FileLock(f"{name}.lock")
-        self._lock.acquire()
-        with os.fdopen(handle, "w") as file:
-            file.write("\n".join(sorted(set(addresses))))
+        handle, name = tempfile.mkstemp(dir=folder, suffix=".new")
+        self._path = Path(f"{name}.hold")
+        self._lock = FileLock(f"{self._path}.lock", thread_local=False)  # another thread may release it
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write("\n".join(sorted(set(addresses))))
+            self._lock.acquire()
+            os.replace(name, self._path)  # whoever sees it finds it whole, and locked
+        except BaseException as error:
+            Path(name).unlink(missing_ok=True)
+            self.release()
+            if isinstance(error, NotImplementedError):  # what filelock says of a file system
+                raise OSError(errno.ENOLCK, f"{folder} is on a file system without locks") from error
+            raise
 
     def release(self) -> None:
         self._path.unlink(missing_ok=True)
@@ -68,16 +81,17 @@ class AssetStore:
         self.limit_bytes = limit_bytes
         self.evicted = 0
         self.root.mkdir(parents=True, exist_ok=True)
-        self._total = sum(entry.stat().st_size for entry in self._files())
+        self._total = sum(status.st_size for _, status in self._files())
+        self._look_at = limit_bytes
 
     # --- assets -------------------------------------------------------------------------------------------------------
 
     def put(self, data: bytes | bytearray | memoryview) -> str:
         """Keeps `data`; returns its address. Costs a hash when the store has it already."""
-        address = hashlib.sha256(data).hexdigest()
-        path = self.path(address)
-        if not _touch(path):
-            self._write(path, data)
+        view = memoryview(data).cast("B")
+        address = hashlib.sha256(view).hexdigest()
+        if not self.used(address, len(view)):
+            self._write(self.path(address), view)
         return address
 
     def get(self, address: str) -> bytes:
@@ -88,7 +102,8 @@ class AssetStore:
         except OSError:
             raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again") from None
         if hashlib.sha256(data).hexdigest() != address:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a disk that cannot be written: `put` says so
+                path.unlink()
             raise AssetMissingError(f"asset {address} was damaged on the disk and is gone: build the scene again")
         return data
 
@@ -107,6 +122,25 @@ class AssetStore:
 
     def __contains__(self, address: object) -> bool:
         return isinstance(address, str) and _ADDRESS.fullmatch(address) is not None and self.path(address).is_file()
+
+    def used_at(self, address: str) -> int:
+        """When an asset was used last [ns since 1970], for `discard`; 0 when it is not there."""
+        try:
+            return self.path(address).stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def discard(self, address: str, used_at: int) -> bool:
+        """Removes an asset that is of no use any more, unless somebody holds it, or has used it since. Whether it
+        did."""
+        path = self.path(address)
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            if status.st_mtime_ns == used_at and address not in self._held():
+                path.unlink()
+                self._total -= status.st_size
+                return True
+        return False
 
     def hold(self, addresses: Iterable[str]) -> Hold:
         """Keeps these from being removed, by any process. For as long as a scene is shared."""
@@ -127,9 +161,12 @@ class AssetStore:
     def remember(self, key: str, note: bytes) -> None:
         self._write(self._index(key), note)
 
-    def used(self, address: str) -> bool:
-        """Marks an asset as used now; false when it is not there."""
-        return _touch(self.path(address))
+    def used(self, address: str, n_bytes: int) -> bool:
+        """Marks an asset as used now; false when it is not there, or has not its length: cut off by a crash."""
+        path = self.path(address)
+        with contextlib.suppress(FileNotFoundError):
+            return path.stat().st_size == n_bytes and _touch(path)
+        return False
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -151,34 +188,33 @@ class AssetStore:
             raise
         self._total += len(data)
 
-    def _files(self) -> Iterator[os.DirEntry[str]]:
-        """Files of assets and of the index, not holds."""
-        folders = [self.root, self.root / _INDEX]
-        for folder in folders:
-            with contextlib.suppress(FileNotFoundError), os.scandir(folder) as entries:
-                for entry in entries:
-                    if entry.is_dir() and len(entry.name) == 2:
-                        with os.scandir(entry.path) as files:
-                            yield from files
+    def _files(self) -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
+        """Files of assets and of the index, and parts that a crash left. No holds, nothing that is not ours."""
+        for folder in (self.root, self.root / _INDEX):
+            for sub in _entries(folder):
+                if len(sub.name) == 2 and sub.is_dir(follow_symlinks=False):
+                    for entry in _entries(sub.path):
+                        ours = _ADDRESS.fullmatch(entry.name) and entry.name[:2] == sub.name
+                        if (ours or _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
+                            with contextlib.suppress(FileNotFoundError):  # taken by another process meanwhile
+                                yield entry, entry.stat(follow_symlinks=False)
 
     def _make_room(self, n_bytes: int) -> None:
-        if self._total + n_bytes <= self.limit_bytes:
+        if self._total + n_bytes <= self._look_at:
             return
         held, now = self._held(), time.time()
-        found = []
-        for entry in self._files():
-            with contextlib.suppress(FileNotFoundError):
-                status = entry.stat()
-                found.append((status.st_mtime, status.st_size, entry))
+        found = [(status.st_mtime, status.st_size, entry) for entry, status in self._files()]
         self._total = sum(size for _, size, _ in found)
         for used, size, entry in sorted(found, key=lambda item: item[0]):
             if self._total + n_bytes <= self.limit_bytes or now - used < GRACE_S:
-                return
+                break
             if entry.name not in held:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(entry.path)
                     self._total -= size
                     self.evicted += 1
+        # Where everything is in use, not every file is looked at again for each that comes.
+        self._look_at = max(self.limit_bytes, self._total + n_bytes + self.limit_bytes // 64)
 
     def _held(self) -> set[str]:
         """Addresses that a living process holds. Notes of dead ones are removed."""
@@ -187,8 +223,8 @@ class AssetStore:
             lock = FileLock(f"{path}.lock")
             try:
                 lock.acquire(blocking=False)
-            except Timeout:
-                with contextlib.suppress(FileNotFoundError):
+            except (Timeout, OSError, NotImplementedError):  # or nobody can tell: then it counts
+                with contextlib.suppress(OSError):
                     held.update(path.read_text().split())
                 continue
             path.unlink(missing_ok=True)
@@ -198,9 +234,18 @@ class AssetStore:
 
 
 def _touch(path: Path) -> bool:
-    """Marks a file as used now; false when it is not there."""
+    """Marks a file as used now; false when it is not there. Where that is not allowed, what is there can be read."""
     try:
         os.utime(path)
     except FileNotFoundError:
         return False
+    except OSError:
+        return path.exists()
     return True
+
+
+def _entries(folder: Path | str) -> list[os.DirEntry[str]]:
+    """What is in a folder; nothing where it is not there, or not ours to read."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return list(entries)
+    return []

@@ -1,0 +1,60 @@
+"""What a session keeps on the disk for its clients: held while it is served, and no longer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from iris_session.physics import World
+from iris_session.protocol.scene_patch import SetVisual
+from iris_session.runtime import shared_scene
+from iris_session.runtime.scene_change import prepare
+from iris_session.runtime.shared_scene import SharedScenes
+from iris_session.scene import AssetStore
+from tests.runtime.play import make_core
+from tests.scene.models import flexes
+
+
+@pytest.fixture
+def world() -> World:
+    return make_core().world
+
+
+def held(folder: Path) -> list[Path]:
+    return list((folder / "holds").glob("*"))
+
+
+def test_a_scene_that_was_made_after_the_end_is_not_held(world: World, tmp_path: Path) -> None:
+    """The thread of `load_scene` may end after the session."""
+    scenes = SharedScenes(tmp_path, "test")
+    shown = scenes.make(world)
+    scenes.take(shown)
+    assert held(tmp_path)
+    scenes.close()
+    assert scenes.take(shown) is shown.info
+    assert not held(tmp_path)
+
+
+def test_looks_that_were_replaced_are_not_kept(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_scene, "KEPT_LOOKS", 5)
+    monkeypatch.setattr(shared_scene, "KEPT_LOOKS_S", 0.0)
+    scenes, store = SharedScenes(tmp_path, "test"), AssetStore(tmp_path)
+    scenes.take(scenes.make(world))
+    assert scenes.newest is not None
+    addresses = [scenes.newest.info.scene_hash]
+    for i in range(12):
+        addresses.append(scenes.take(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))])).scene_hash)
+    kept = [address in store for address in addresses]
+    assert len(set(addresses)) == len(addresses)
+    assert kept == [True, *[False] * 7, *[True] * 5], "the scene itself, and the newest looks of it"
+    scenes.close()
+
+
+def test_what_bends_in_the_next_scene_is_prepared_with_it() -> None:
+    """Topologies take long: the loop that swaps scenes only hands them over."""
+    model = flexes()
+    model.opt.timestep = 0.002
+    scene = prepare(make_core(), SharedScenes(False, "test"), model, b"", None, None)
+    assert [mesh.stream for mesh in scene.bending] == ["flex-0", "flex-1", "flex-2"]
+    assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.bending)
