@@ -9,6 +9,7 @@ while True:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,7 @@ from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
 from iris_session.protocol.scene_names import ArrayKind
-from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.arrays import decode_arrays, require
 from iris_session.scene.errors import AssetError
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_VERTICES, DeformableTopology
@@ -35,13 +36,18 @@ RETRY_CALLS: Final = 500
 class _Mesh:
     """One deformable: its stream, and where its vertices stand in the numbering of the model."""
 
-    def __init__(self, spec: Deformable, asset: bytes, feed: MediaFeed) -> None:
+    feed: MediaFeed
+
+    def __init__(self, key: str, spec: Deformable, asset: bytes) -> None:
         arrays = decode_arrays(asset, ArrayKind.DEFORMABLE)
-        self.decoder = DeformableDecoder(DeformableTopology.from_bytes(arrays["plan"].tobytes()))
+        topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
+        self.key, self.stream = key, spec.stream
+        self.decoder = DeformableDecoder(topology)
         self.numbers = arrays.get("vertex")
-        if self.numbers is not None and (self.numbers.ndim != 1 or self.numbers.max(initial=0) >= MAX_VERTICES):
-            raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
-        self.name, self.feed = spec.name, feed
+        if self.numbers is not None:
+            self.numbers = require(arrays, "vertex", "u2 u4", (topology.n_vertices,))
+            if int(self.numbers.max(initial=0)) >= MAX_VERTICES:
+                raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
         self.seq = -1
 
     def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -54,7 +60,8 @@ class _Mesh:
 
 
 class Deformables:
-    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model.
+    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. One without a
+    name, or with that of another, goes by its stream (`keys`).
 
     `scene_hash`: of the scene they are of. `fault`: why nothing can be seen of it, empty while all is well. Everything
     happens in `tend`, which never waits.
@@ -78,7 +85,7 @@ class Deformables:
             self._begin(scene_hash)
         if self._fetch is not None and self._fetch.done:
             self._take(self._fetch)
-        return [mesh.name for mesh in self._meshes if self._show(mesh)]
+        return [mesh.key for mesh in self._meshes if self._show(mesh)]
 
     def _begin(self, scene_hash: str) -> None:
         self._drop()
@@ -89,8 +96,10 @@ class Deformables:
             self.fault = "this session shares no specification of its scene"
 
     def _drop(self) -> None:
+        if self._fetch is not None:
+            self._client.cancel_assets(self._fetch)
         for mesh in self._meshes:
-            self._client.drop_media(mesh.feed.stream)
+            self._client.drop_media(mesh.stream)
         self._meshes, self._parts, self._fetch = [], (), None
         self.vertices.clear()
 
@@ -104,10 +113,12 @@ class Deformables:
                 if self._parts:
                     self._fetch = self._client.fetch_assets([part.address for part in self._parts])
             else:
-                self._meshes = [
-                    _Mesh(part, fetch.read(part.address), self._client.media(part.stream)) for part in self._parts
-                ]
+                for key, part in zip(keys(self._parts), self._parts, strict=True):
+                    mesh = _Mesh(key, part, fetch.read(part.address))
+                    mesh.feed = self._client.media(part.stream)
+                    self._meshes.append(mesh)
         except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
+            self._drop()
             self.fault = str(error)
 
     def _show(self, mesh: _Mesh) -> bool:
@@ -118,8 +129,20 @@ class Deformables:
         if frame.header.scene_epoch != self._client.mirror.scene_epoch:
             return False
         try:
-            self.vertices[mesh.name] = mesh.placed(mesh.decoder.decode(frame.data))
+            self.vertices[mesh.key] = mesh.placed(mesh.decoder.decode(frame.data))
         except StreamError as error:
             self.fault = str(error)
             return False
         return True
+
+
+def keys(parts: Sequence[Deformable]) -> list[str]:
+    """What tells deformables apart: the name of each, where it has one that no other has; else its stream."""
+    names = [part.name for part in parts]
+    found: list[str] = []
+    for part in parts:
+        key = part.name if part.name and names.count(part.name) == 1 else part.stream
+        while key in found or (key != part.name and key in names):  # somebody is called like a stream
+            key += "'"
+        found.append(key)
+    return found

@@ -37,7 +37,7 @@ def scene() -> SceneInfo:
 
 class LiveSession:
     """`origin_ns` and `entries` as the authority has them. Bodies move along x by 0.1 m/s. `assets`: addresses that are
-    served from the store in `asset_root`."""
+    served from the store in `asset_root`; `scene_hash`: of the specification among them."""
 
     def __init__(
         self,
@@ -45,11 +45,12 @@ class LiveSession:
         *,
         asset_root: str = "",
         assets: tuple[str, ...] = (),
+        scene_hash: str = "hash",
         **front: object,
     ) -> None:
         self.origin_ns = time.monotonic_ns()
         settings = {"control_port": 0, "state_port": 0, "origin_ns": self.origin_ns, "session_id": "s1", **front}
-        shown = msgspec.structs.replace(scene(), asset_root=asset_root, assets=assets)
+        shown = msgspec.structs.replace(scene(), asset_root=asset_root, assets=assets, scene_hash=scene_hash)
         self.front = FrontProcess(FrontConfig(**settings), shown)  # type: ignore[arg-type]
         ports = self.front.start()
         self.address = f"127.0.0.1:{ports.control}"
