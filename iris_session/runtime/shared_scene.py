@@ -97,12 +97,15 @@ class SharedScenes:
         return _stored(self._store, patched(newest.spec, ops), newest.info, merging)
 
     def take(self, shown: Shown) -> SceneInfo:
-        """It is the newest from now on; its files stay, and those of the one before, which the front still serves."""
+        """It is the newest from now on; its files stay, and those of the one before, which the front still serves.
+
+        Raises nothing: what is shown has changed already, and a full disk must not make it look as if it had not.
+        """
         with self.lock:
             self.newest = shown
             store = self._store
             if store is not None and shown.spec is not None and not self._closed:  # a thread may be later than the end
-                self._holds.append(store.hold(shown.info.assets))
+                self._hold(store, shown.info.assets)
                 if shown.patches:
                     address = shown.info.scene_hash
                     self._looks.append(_Look(address, store.used_at(address), time.monotonic()))
@@ -118,6 +121,13 @@ class SharedScenes:
             for hold in self._holds:
                 hold.release()
             self._holds.clear()
+
+    def _hold(self, store: AssetStore, addresses: Sequence[str]) -> None:
+        try:
+            self._holds.append(store.hold(addresses))
+        except OSError as error:
+            why = error.strerror or error
+            self.notes.append(f"files of the scene in {store.root} cannot be held, so others may take them away: {why}")
 
     def _forget_looks(self, store: AssetStore) -> None:
         """Specifications that patches after them have replaced, for everybody."""
@@ -140,7 +150,10 @@ class _Look(NamedTuple):
 
 
 def _stored(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
+    named = asset_addresses(spec)
+    if missing := next((address for address in named if address not in store), ""):
+        raise SceneError(f"asset {missing} is not in {store.root}: put it there (AssetStore.put) before it is shown")
     address = store.put(encode_scene(spec))
-    addresses = (address, *asset_addresses(spec))
+    addresses = (address, *named)
     info = msgspec.structs.replace(info, scene_hash=address, asset_root=str(store.root), assets=addresses)
     return Shown(info, spec, patches)

@@ -128,8 +128,9 @@ class Builder:
         digest = hashlib.sha256(self._salt + piece.kind.__name__.encode())
         for part in piece.raw:
             content = np.ascontiguousarray(part).data if isinstance(part, np.ndarray) else memoryview(part)
-            digest.update(content.nbytes.to_bytes(8, "little"))  # parts cannot be mistaken for one another
-            digest.update(content)
+            # Parts cannot be mistaken for one another, nor arrays of one size for those of another shape.
+            digest.update(repr((content.format, content.shape)).encode())
+            digest.update(content.cast("B") if content.nbytes else b"")
         return digest.hexdigest()
 
     def _one(self, item: tuple[str, Work[Note]]) -> tuple[Note, bool]:
@@ -153,8 +154,8 @@ class Builder:
             note = msgspec.msgpack.decode(remembered, type=kind)
         except msgspec.DecodeError:  # damaged: built anew
             return None
-        addresses = (note.address,) if isinstance(note, BlobNote) else tuple(level.address for level in note.levels)
-        return note if all(self.store.used(address) for address in addresses) else None
+        assets = (note,) if isinstance(note, BlobNote) else note.levels
+        return note if all(self.store.used(asset.address, asset.bytes) for asset in assets) else None
 
     def _mesh(self, mesh: MeshArrays) -> MeshNote:
         levels = [self._mesh_level(mesh, encode_mesh(mesh), 0.0)]

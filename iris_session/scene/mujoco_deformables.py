@@ -73,7 +73,7 @@ class FlexMesh:
     @property
     def raw(self) -> list[NDArray[Any]]:
         """What the asset depends on, besides the vertices at rest."""
-        return [self.elements, *([] if self.uv is None else [self.uv])]
+        return [self.elements, self.numbers, *([] if self.uv is None else [self.uv])]
 
     def encode(self, rest: NDArray[np.float32]) -> Callable[[], bytes]:
         """The asset, for vertices at rest (n, 3) [m], world frame."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
 
 from iris_session.physics import World
-from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.scene import SceneError
+from iris_session.protocol.scene_looks import Mesh, MeshLevel
+from iris_session.protocol.scene_patch import AddMesh, SetVisual
 from iris_session.runtime import shared_scene
 from iris_session.runtime.scene_change import prepare
 from iris_session.runtime.shared_scene import SharedScenes
@@ -49,6 +52,32 @@ def test_looks_that_were_replaced_are_not_kept(world: World, tmp_path: Path, mon
     assert len(set(addresses)) == len(addresses)
     assert kept == [True, *[False] * 7, *[True] * 5], "the scene itself, and the newest looks of it"
     scenes.close()
+
+
+def test_a_disk_that_is_full_does_not_undo_a_scene(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = SharedScenes(tmp_path, "test")
+    shown = scenes.make(world)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(AssetStore, "hold", full)
+    assert scenes.take(shown) is shown.info
+    assert scenes.newest is shown
+    assert "No space left on device" in scenes.notes[-1]
+
+
+def test_what_no_store_has_is_not_shown(world: World, tmp_path: Path) -> None:
+    """It would be asked for by everybody, and refused."""
+    scenes = SharedScenes(tmp_path, "test")
+    before = scenes.make(world)
+    scenes.take(before)
+    level = MeshLevel("0" * 64, 10, "arrays", 3, 1)
+    with pytest.raises(SceneError, match=f"asset {level.address} is not in"):
+        scenes.patch([AddMesh(Mesh("arrow", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), False, (level,)))])
+    assert scenes.newest is before
 
 
 def test_what_bends_in_the_next_scene_is_prepared_with_it() -> None:

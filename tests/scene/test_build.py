@@ -86,3 +86,23 @@ def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
     (note,) = builder.run([builder.texture(blob, "2d")])
     assert note.levels[0].encoding == "opaque"
     assert store.get(note.levels[0].address) == blob.tobytes()
+
+
+def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path) -> None:
+    """Two flat height fields, or the same numbers as edges and as triangles."""
+    builder = Builder(AssetStore(tmp_path))
+    grids = [np.zeros((2, 3), np.float32), np.zeros((3, 2), np.float32), np.zeros((2, 3), np.int32)]
+    wide, tall, whole = builder.run([builder.blob([b"grid", grid], repr(grid).encode) for grid in grids])
+    assert len({wide.address, tall.address, whole.address}) == 3
+    assert builder.built == 3
+
+
+def test_what_a_crash_cut_off_is_built_again(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    pixels = picture(64, 64)
+    (note,) = (builder := Builder(store)).run([builder.texture(pixels, "2d")])
+    store.path(note.levels[0].address).write_bytes(b"")
+    again = Builder(store)
+    assert again.run([again.texture(pixels, "2d")]) == [note]
+    assert (again.built, again.recalled) == (1, 0)
+    assert np.array_equal(decode_image(store.get(note.levels[0].address), "arrays"), pixels)
