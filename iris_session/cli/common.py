@@ -40,10 +40,12 @@ def expected_errors() -> tuple[type[Exception], ...]:
     from iris_session.physics import PhysicsError
     from iris_session.recording import RecordingError
     from iris_session.runtime.errors import SessionError
+    from iris_session.scene import SceneBuildError
     from iris_session.transport import FrontError
 
     return (
         SessionError,
+        SceneBuildError,
         PhysicsError,
         ControlError,
         FrontError,

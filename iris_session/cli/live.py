@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from iris_session.protocol.server_messages import Event
-    from iris_session.runtime.session import Session
+    from iris_session.runtime.owner import Owner
 
 #: Refresh of the display [s].
 REFRESH_S: Final = 0.5
@@ -91,7 +91,7 @@ class LiveView:
     """Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped`: refreshes that
     the display was too slow for."""
 
-    def __init__(self, session: Session, out: TextIO, title: str) -> None:
+    def __init__(self, session: Owner, out: TextIO, title: str) -> None:
         self._session = session
         self._out = out
         self._title = title

@@ -1,4 +1,4 @@
-"""`iris-session serve`: shares any MuJoCo scene until Ctrl-C."""
+"""`iris-session serve`: shares any MuJoCo scene, or shows any file with geometry, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, TextIO
 
 from iris_session.cli.common import (
     CommandError,
@@ -23,14 +23,19 @@ from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
     from iris_session.runtime.config import SessionConfig
+    from iris_session.runtime.scene_publisher import ScenePublisher
     from iris_session.runtime.session import Session
+
+#: Files that MuJoCo simulates; any other one is shown.
+SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "serve",
-        help="share a MuJoCo scene",
-        description="Shares a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or named.",
+        help="share a MuJoCo scene, or show a file",
+        description="Shares a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or named. Files "
+        "of other kinds (GLB, STL, OBJ, ...) are shown as they are, a URDF with its joints at rest.",
         epilog=f"scenes with a name (iiwa and aloha need the folder that IRIS_DATA names):\n{scene_names()}\n\n"
         "examples:\n"
         "  iris-session serve scene.xml\n"
@@ -40,10 +45,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session serve aloha --seconds 30\n"
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
         "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
+        "  iris-session serve part.glb    (shown, nothing moves)\n"
         "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (go on where it ended)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scene", nargs="?", help="MJCF or MJB file, or the name of a scene, see below")
+    parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
     parser.add_argument("--robots", type=Path, metavar="TOML", help="robots by name; see `iris-session robots`")
     parser.add_argument(
         "--anchors",
@@ -138,6 +144,29 @@ def new_session(arguments: argparse.Namespace) -> Session:
     return Session(scene.model, config=config, robots=robots)
 
 
+def file_to_show(scene: str | None) -> Path | None:
+    """The file that is to be shown as it is; None where MuJoCo simulates what was asked for."""
+    path = Path(scene or "").expanduser()
+    return path if path.is_file() and path.suffix and path.suffix.lower() not in SIMULATED else None
+
+
+def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
+    """A session in which everybody sees a file, and nothing moves."""
+    from iris_session.runtime.scene_publisher import ScenePublisher
+    from iris_session.scene.compose import SceneBuilder
+
+    drives = ("robots", "assign", "assignment", "mode")
+    if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
+        raise CommandError(f"{', '.join(given)}: nobody drives what is in {path.name}, it is shown as it is")
+    scene = SceneBuilder(path.name)
+    if path.suffix.lower() == ".urdf":
+        scene.add_urdf(path)
+    else:
+        scene.add_file(path)
+    config = with_anchors(session_config(arguments, session_name(path)), arguments.anchors)
+    return ScenePublisher(scene, config)
+
+
 def resumed_session(arguments: argparse.Namespace) -> Session:
     """A session that goes on from its recording."""
     from iris_session.runtime.session import Session
@@ -164,23 +193,26 @@ def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
-    from iris_session.cli.live import LiveView
-
+    shown = None if arguments.resume is not None else file_to_show(arguments.scene)
+    if shown is not None:
+        return _serve(arguments, showing_session(arguments, shown), f"showing {shown.name}, which nobody drives")
     session = resumed_session(arguments) if arguments.resume is not None else new_session(arguments)
+    hint = ""
+    if not session.robots:
+        tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
+        hint = f"{no_robots(session.model)}; {tip}"
+    return _serve(arguments, session, hint, ", ".join(robot.name for robot in session.robots))
+
+
+def _serve(arguments: argparse.Namespace, session: Session | ScenePublisher, hint: str, robots: str = "") -> int:
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
-        names = ", ".join(r.name for r in session.robots) or "none"
-        print(f"session '{session.name}' on {session.address}, robots: {names}", file=out, flush=True)
-        for note in session.notes:
+        print(f"session '{session.name}' on {session.address}, robots: {robots or 'none'}", file=out, flush=True)
+        for note in (*session.notes, *([hint] if hint else [])):
             print(note, file=out, flush=True)
-        if not session.robots:
-            tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
-            print(f"{no_robots(session.model)}; {tip}", file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
-        view = LiveView(session, out, f"iris-session {session.name} on {session.address}")
-        with view.open():
-            session.run(seconds=arguments.seconds, until=view.update)
+        _run(arguments, session, out)
         status = session.status()
         recording = None if session.recording is None else str(session.recording)
     fault = session.recording_fault
@@ -191,3 +223,11 @@ def run(arguments: argparse.Namespace) -> int:
     if fault:
         print(f"iris-session: {fault}", file=sys.stderr)
     return 1 if fault else 0
+
+
+def _run(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
+    from iris_session.cli.live import LiveView
+
+    view = LiveView(session, out, f"iris-session {session.name} on {session.address}")
+    with view.open():
+        session.run(seconds=arguments.seconds, until=view.update)

@@ -32,9 +32,9 @@ class Carrier:
         spec = mujoco.MjSpec()
         spec.modelname = "carrier"
         spec.option.timestep = TICK_S
-        for name, pose in zip(names, poses, strict=True):
-            spec.worldbody.add_body(name=name, pos=pose.p, quat=pose.q, mocap=True)
         try:
+            for name, pose in zip(names, poses, strict=True):
+                spec.worldbody.add_body(name=name, pos=pose.p, quat=pose.q, mocap=True)
             self.model: mujoco.MjModel = spec.compile()
         except ValueError as error:
             raise ModelInvalidError(f"these bodies cannot be published: {one_line(error)}") from error

@@ -126,7 +126,9 @@ class PublishLoop:
         if frame is None:
             return
         now_ns = self._stepper.clock()
-        self._due_ns = max(self._due_ns + self._period_ns, now_ns)
+        self._due_ns += self._period_ns  # a fixed rate, so that a source with jitter loses nothing
+        if self._due_ns <= now_ns:
+            self._due_ns = now_ns + self._period_ns
         if frame.anew:
             self._stepper.post(ExternalReset())
         self._step(1, self._carrier.state(frame.time_s, frame.poses))

@@ -1,0 +1,67 @@
+"""A model that carries poses of another world: its states show exactly what was put in, and can be restored."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from iris_session.physics import ModelInvalidError, World
+from iris_session.physics.carrier import TICK_S, Carrier
+from iris_session.physics.load import model_from_bytes
+from iris_session.protocol.common import Pose
+
+NAMES = ("cup", "arm/link 1", "table top")
+FIRST = tuple(Pose((float(i), 0.0, 0.5), (1.0, 0.0, 0.0, 0.0)) for i in range(3))
+
+
+def shown(world: World) -> np.ndarray:
+    poses = np.zeros((len(world.bodies), 7))
+    world.poses(poses)
+    return poses
+
+
+def moved(seed: int) -> np.ndarray:
+    poses = np.random.default_rng(seed).normal(size=(3, 7))
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return poses
+
+
+def test_bodies_have_the_ids_and_first_poses_of_the_scene() -> None:
+    world = World(Carrier(NAMES, FIRST).model, (), ())
+    assert [(body.id, body.name, body.moving) for body in world.bodies] == [
+        (i + 1, n, True) for i, n in enumerate(NAMES)
+    ]
+    assert shown(world) == pytest.approx(np.array([(*pose.p, *pose.q) for pose in FIRST]))
+    assert world.model.nv == 0
+
+
+def test_a_state_shows_the_poses_and_the_time_that_were_given() -> None:
+    carrier = Carrier(NAMES, FIRST)
+    world = World(carrier.model, (), ())
+    for seed, time_s in ((1, 12.3456), (2, 0.0)):
+        world.set_state_bytes(carrier.state(time_s, moved(seed)))
+        assert np.allclose(shown(world), moved(seed), atol=1e-15)
+        assert (world.view().tick, world.view().sim_time) == (round(time_s / TICK_S), time_s)
+
+
+def test_a_state_survives_a_snapshot_and_the_model_its_bytes() -> None:
+    carrier = Carrier(NAMES, FIRST)
+    world = World(carrier.model, (), ())
+    world.set_state_bytes(carrier.state(7.0, moved(3)))
+    again = World(model_from_bytes(world.model_bytes()), (), ())
+    again.restore(world.snapshot())
+    assert again.state_bytes() == world.state_bytes()
+    assert (shown(again) == shown(world)).all()
+
+
+def test_nothing_may_move() -> None:
+    carrier = Carrier((), ())
+    world = World(carrier.model, (), ())
+    world.set_state_bytes(carrier.state(1.0, np.zeros((0, 7))))
+    assert (world.bodies, world.view().tick) == ((), 1000)
+
+
+@pytest.mark.parametrize("names", [("cup", "cup"), ("world",)])
+def test_names_that_cannot_be_are_refused(names: tuple[str, ...]) -> None:
+    with pytest.raises(ModelInvalidError, match="cannot be published"):
+        Carrier(names, FIRST[: len(names)])

@@ -1,0 +1,115 @@
+"""What a publisher sets: checked at once, nothing changes when it is wrong, taken together as one frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from iris_session.runtime.draft import SceneDraft
+from iris_session.runtime.errors import PublishError
+from tests.runtime.published import CLOTH, MOVING, UNIT, composed
+
+TURNED = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn around z
+
+
+@pytest.fixture
+def draft() -> SceneDraft:
+    return SceneDraft(composed())
+
+
+def pose(draft: SceneDraft, name: str) -> list[float]:
+    return draft.frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
+
+
+def everything(draft: SceneDraft) -> bytes:
+    frame = draft.frame(0, 0.0, anew=False)
+    return frame.poses.tobytes() + b"".join(v.tobytes() for v in frame.vertices.values())
+
+
+def test_a_frame_holds_what_was_set_and_the_rest_as_it_was(draft: SceneDraft) -> None:
+    draft.set_pose("blue", (1.0, 2.0, 3.0), TURNED)
+    frame = draft.frame(7, 0.5, anew=True)
+    assert (frame.capture_ns, frame.time_s, frame.anew) == (7, 0.5, True)
+    assert frame.poses[1].tolist() == pytest.approx([1.0, 2.0, 3.0, *TURNED])
+    assert frame.poses[0].tolist() == [0.0, 0.0, 0.5, *UNIT]
+    draft.set_pose("blue", (0.0, 0.0, 0.0), UNIT)
+    draft.set_vertices("cloth", CLOTH + 1.0)
+    assert frame.poses[1, 0] == 1.0, "a frame that was taken does not change any more"
+    assert (frame.vertices["cloth"] == CLOTH).all()
+    assert (draft.frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
+
+
+def test_joints_and_the_root_place_the_bodies_of_an_articulation(draft: SceneDraft) -> None:
+    draft.set_joints("arm", {"turn": math.pi / 2})
+    assert pose(draft, "arm/fore") == pytest.approx([0.0, 1.0, 0.8, *TURNED])
+    draft.set_joints("arm", {"slide": 0.25})
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 0.8]), "the other joint stays"
+    draft.set_pose("arm", (10.0, 0.0, 0.0), TURNED)
+    assert pose(draft, "arm/base") == pytest.approx([10.0, 0.0, 0.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([8.75, 0.0, 0.0])
+
+
+def test_one_body_of_an_articulation_can_be_placed_by_itself(draft: SceneDraft) -> None:
+    """Robots often tell where their links are, not their joints."""
+    draft.set_pose("arm/upper", (0.0, 0.0, 5.0), UNIT)
+    assert pose(draft, "arm/upper")[2] == 5.0
+    assert pose(draft, "arm/fore")[2] == 0.5
+
+
+def test_many_bodies_at_once_are_as_one_after_the_other(draft: SceneDraft) -> None:
+    other = SceneDraft(composed())
+    names = ["blue", "red"]
+    positions = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
+    draft.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
+    for name, position, q in zip(names, positions, (TURNED, UNIT), strict=True):
+        other.set_pose(name, position, q)
+    assert np.allclose(draft.frame(0, 0.0, anew=False).poses, other.frame(0, 0.0, anew=False).poses, atol=1e-15)
+
+
+def test_a_quaternion_that_was_rounded_is_normalised(draft: SceneDraft) -> None:
+    draft.set_pose("red", (0.0, 0.0, 0.0), (0.7071, 0.0, 0.0, 0.7071))
+    assert np.linalg.norm(pose(draft, "red")[3:]) == pytest.approx(1.0, abs=1e-15)
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda d: d.set_pose("redd", (0, 0, 0), UNIT), "nearest: 'red'"),
+        (lambda d: d.set_pose("cloth", (0, 0, 0), UNIT), "use set_vertices"),
+        (lambda d: d.set_pose("red", (0, NAN, 0), UNIT), "3 finite numbers"),
+        (lambda d: d.set_pose("red", (0, 0), UNIT), "3 finite numbers"),
+        (lambda d: d.set_pose("red", None, UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", (0, 0, 2e6), UNIT), "in metres"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (0, 0, 0, 0)), "length 0"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (1.002, 0, 0, 0)), "unit one"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (1, 0, 0)), "4 finite numbers"),
+        (lambda d: d.set_poses(["red", "blu"], [(1, 1, 1)] * 2, [UNIT] * 2), "nearest: 'blue'"),
+        (lambda d: d.set_poses(["red", "arm"], [(1, 1, 1)] * 2, [UNIT] * 2), "set_pose"),
+        (lambda d: d.set_poses(["red", "blue"], [(1, 1, 1)] * 2, [UNIT, (1.1, 0, 0, 0)]), "of 'blue' has length 1.1"),
+        (lambda d: d.set_poses(["red"], [(1, NAN, 1)], [UNIT]), "not finite"),
+        (lambda d: d.set_poses(["red"], [(1, 1)], [UNIT]), r"\(1, 2\): \(1, 3\) is expected"),
+        (lambda d: d.set_poses(["red"], "red", [UNIT]), "an array of shape"),
+        (lambda d: d.set_joints("armm", {}), "nearest: 'arm'"),
+        (lambda d: d.set_joints("arm", {"turn": 1.0, "twist": 1.0}), "Joints: turn, slide"),
+        (lambda d: d.set_joints("arm", {"follower": 1.0}), "follows 'turn'"),
+        (lambda d: d.set_joints("arm", {"turn": NAN}), "finite"),
+        (lambda d: d.set_joints("arm", [1.0]), "set_joints"),
+        (lambda d: d.set_vertices("clot", CLOTH), "nearest: 'cloth'"),
+        (lambda d: d.set_vertices("cloth", CLOTH[:3]), r"\(3, 3\): \(4, 3\) is expected"),
+        (lambda d: d.set_vertices("cloth", CLOTH * NAN), "not finite"),
+        (lambda d: d.set_vertices("cloth", CLOTH * 1e9), "metres"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_and_changes_nothing(
+    draft: SceneDraft, wrong: Callable[[SceneDraft], None], says: str
+) -> None:
+    before = everything(draft)
+    with pytest.raises(PublishError, match=says):
+        wrong(draft)
+    assert everything(draft) == before

@@ -1,0 +1,209 @@
+"""Frames of a publisher in the session: their rate, what is between them, resets, times. The clock is the test's."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig
+from iris_session.physics.carrier import Carrier
+from iris_session.protocol.client_messages import Marker
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, Join, decode_entries
+from iris_session.protocol.names import Role
+from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
+from iris_session.runtime.core import CoreConfig, CoreState, SessionCore
+from iris_session.runtime.draft import Frame, SceneDraft
+from iris_session.runtime.errors import OwnershipError
+from iris_session.runtime.publish_loop import REPEAT_NS, PublishLoop, ShownVertices
+from iris_session.runtime.stepper import Stepper
+from tests.runtime.published import CLOTH, UNIT, composed
+from tests.runtime.test_stepper import MS, Front, Recorder
+
+PERIOD_NS = 16 * MS
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    until = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.001)
+
+
+class Watch:
+    """In place of the processes, which these tests do not need."""
+
+    def watch(self, stepper: Stepper) -> None:
+        pass
+
+
+class Rig:
+    """A publisher's loop whose clock the test moves; the helper thread is real."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1000 * MS
+        scene = composed()
+        self.draft = SceneDraft(scene)
+        carrier = Carrier(scene.moving, scene.poses)
+        config = CoreConfig(AuthorityConfig(user_owned_loop=True), ControlConfig(), (), ())
+        self.config, self.model = config, carrier.model
+        self.front, self.recorder = Front(), Recorder()
+        core = SessionCore(carrier.model, config)
+        self.stepper = Stepper(core, self.front, self.recorder, lambda: self.now_ns, MS, 10**15, b"root")
+        self.entries: list[Entry] = []
+        self.stepper.on_entries = self._note
+        self.shown: list[tuple[float, float, int]] = []  # x of the red box and of a vertex, scene epoch
+        self.vertices = ShownVertices(scene)
+        self.stepper.beside_state.append(self._show)
+        self.loop = PublishLoop(carrier, self.vertices, self.stepper, Watch(), PERIOD_NS)  # type: ignore[arg-type]
+
+    def _note(self, entries: Sequence[Entry]) -> None:
+        self.entries += entries
+
+    def _show(self, epoch: int, end_ns: int) -> None:
+        (mesh,) = self.vertices.bending
+        red = self.stepper.core.world.data.xpos[1]
+        self.shown.append((float(red[0]), float(mesh.vertices()[0, 0]), epoch))
+
+    def publish(self, x: float, anew: bool = False, delay_ns: int = 0) -> None:
+        self.draft.set_pose("red", (x, 0.0, 0.0), UNIT)
+        self.draft.set_vertices("cloth", CLOTH + np.float32(x))
+        self.loop.offer(self.draft.frame(self.now_ns - delay_ns, self.now_ns * 1e-9, anew))
+
+    def xs(self) -> list[float]:
+        return [x for x, _, _ in self.shown]
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.loop.close()
+
+
+def test_who_joins_before_the_first_frame_sees_the_scene_as_composed(rig: Rig) -> None:
+    assert rig.shown == [(0.0, 0.0, 1)]
+    assert rig.front.n_bodies == 5
+
+
+def test_poses_and_vertices_of_a_frame_go_out_together_with_its_time(rig: Rig) -> None:
+    for x in (1.0, 2.0, 3.0):
+        rig.now_ns += PERIOD_NS
+        rig.publish(x, delay_ns=5 * MS)
+        wait_for(lambda x=x: rig.shown[-1] == (x, x, 1))  # type: ignore[misc]
+        assert rig.front.states[-1].session_time == rig.now_ns - 5 * MS
+        assert rig.front.states[-1].tick == round(rig.now_ns * 1e-6)
+    assert rig.loop.superseded == 0
+
+
+def test_of_frames_that_come_too_fast_the_newest_wins_and_the_others_are_counted(rig: Rig) -> None:
+    for i in range(160):  # 1 kHz for 160 ms, of which the state takes every 16th
+        rig.now_ns += MS
+        rig.publish(float(i))
+    rig.now_ns += PERIOD_NS
+    wait_for(lambda: rig.xs()[-1] == 159.0)
+    taken = len(rig.shown) - 1
+    assert taken <= 12
+    assert rig.loop.superseded == 160 - taken
+    assert rig.xs() == sorted(rig.xs())
+
+
+def test_a_frame_that_comes_before_its_time_is_shown_when_it_is_due(rig: Rig) -> None:
+    rig.publish(1.0)
+    rig.now_ns += PERIOD_NS - 2 * MS  # jitter of a source with about the rate of the state
+    rig.publish(2.0)
+    assert rig.xs()[-1] == 1.0
+    rig.now_ns += 2 * MS
+    wait_for(lambda: rig.xs()[-1] == 2.0)
+    assert rig.loop.superseded == 0
+
+
+def test_while_nothing_is_published_the_session_goes_on(rig: Rig) -> None:
+    rig.now_ns += 100 * MS
+    rig.publish(1.0, delay_ns=40 * MS)
+    before = rig.front.states[-1].session_time
+    join = Join("key", Role.OBSERVER, "ann", devices=(), alignment="not_needed")
+    rig.front.waiting.append(Entry(1, 1, rig.now_ns, join))
+    rig.stepper.post(Marker(0, "quiet"))
+    rig.now_ns += REPEAT_NS
+    wait_for(lambda: any(isinstance(e.body, MarkerAdded) for d in rig.front.decisions for e in d.events))
+    wait_for(lambda: len(rig.shown) == 3)
+    assert rig.shown[-1] == (1.0, 1.0, 1), "for those who joined meanwhile"
+    assert rig.front.states[-1].session_time == before + REPEAT_NS, "as old as the source is"
+    idle = [row for row in rig.recorder.rows if not row.n_ticks]
+    assert idle
+    assert not any(row.plant for row in idle), "the plant's state is in the rows where it changed"
+    rig.publish(2.0, delay_ns=60 * MS)
+    times = [state.session_time for state in rig.front.states]
+    assert times == sorted(set(times)), "a source that got slower does not make time go back"
+
+
+def test_states_between_two_frames_of_a_slow_source_are_not_repeated(rig: Rig) -> None:
+    """A pose that is seen twice is a halt for whoever interpolates."""
+    for x in range(1, 5):
+        steps = rig.stepper.step_count
+        rig.publish(float(x))
+        rig.now_ns += 100 * MS
+        wait_for(lambda steps=steps: rig.stepper.step_count > steps + 1)  # type: ignore[misc]
+    assert rig.xs() == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_reset_is_told_with_the_frame_that_brings_it_even_when_that_one_is_superseded(rig: Rig) -> None:
+    rig.publish(1.0)
+    rig.now_ns += MS
+    rig.publish(2.0, anew=True)
+    rig.publish(3.0)
+    assert not any(isinstance(entry.message, ExternalReset) for entry in rig.entries)
+    rig.now_ns += PERIOD_NS
+    wait_for(lambda: rig.xs()[-1] == 3.0)
+    assert [entry.connection for entry in rig.entries if isinstance(entry.message, ExternalReset)] == [HOST]
+    assert rig.shown[-1] == (3.0, 3.0, 2)
+    changes = [e.body for d in rig.front.decisions for e in d.events if isinstance(e.body, SceneChanged)]
+    assert len(changes) == 1
+
+
+def test_the_journal_gives_the_same_again_from_any_keyframe(rig: Rig) -> None:
+    for i in range(6):
+        rig.now_ns += 100 * MS
+        rig.publish(float(i), anew=i == 3)
+        steps = rig.stepper.step_count
+        rig.now_ns += 50 * MS
+        wait_for(lambda steps=steps: rig.stepper.step_count > steps)  # type: ignore[misc]
+        rig.recorder.wants_keyframe = i == 2
+    rig.loop.close()
+    (_, keyframe, *_) = rig.recorder.keyframes
+    for state in (None, keyframe):
+        core = SessionCore(rig.model, rig.config)
+        first = 0
+        if state is not None:
+            core.restore(CoreState(state.plant, state.authority, state.controller, state.status))
+            first = state.step + 1
+        rows = [row for row in rig.recorder.rows if row.step >= first]
+        assert rows
+        for row in rows:
+            entries = decode_entries(row.entries)
+            assert core.step(row.now_ns, entries, row.n_ticks, row.plant).digest == row.digest
+
+
+def test_the_last_frame_is_shown_at_the_end_and_none_after_it(rig: Rig) -> None:
+    rig.publish(1.0)
+    rig.publish(2.0)
+    rig.loop.close()
+    assert rig.xs()[-1] == 2.0
+    with pytest.raises(OwnershipError, match="closed"):
+        rig.publish(3.0)
+
+
+def test_what_stops_the_helper_is_raised_where_it_is_seen(rig: Rig) -> None:
+    def broken() -> list[Entry]:
+        raise RuntimeError("the link is broken")
+
+    rig.front.poll = broken  # type: ignore[method-assign]
+    rig.now_ns += 100 * MS
+    wait_for(lambda: rig.loop._error)
+    with pytest.raises(RuntimeError, match="the link is broken"):
+        rig.loop.offer(Frame(rig.now_ns, 1.0, np.zeros((5, 7)), {}))
+    del rig.front.poll  # type: ignore[attr-defined]

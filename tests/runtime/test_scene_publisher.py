@@ -1,0 +1,208 @@
+"""The publisher as its owner has it: what it refuses, times, threads; its recordings replay. Real processes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iris_session import (
+    ConfigError,
+    OwnershipError,
+    PublishError,
+    ResumeError,
+    SceneBuilder,
+    ScenePublisher,
+    Session,
+    SessionConfig,
+)
+from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
+from iris_session.recording import Recording
+from iris_session.runtime.verification import verify_recording
+
+CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+
+
+def scene() -> SceneBuilder:
+    builder = SceneBuilder("bench")
+    builder.add_plane("floor")
+    builder.add_box("box", half_size=(0.1, 0.1, 0.1), movable=True, position=(1.0, 0.0, 0.0))
+    builder.add_deformable("cloth", [(0, 0, 1), (0, 1, 1), (1, 0, 1)], [(0, 1, 2)])
+    return builder
+
+
+@pytest.fixture(scope="module")
+def session() -> Iterator[ScenePublisher]:
+    """One for all tests that leave it running; its time is given with every state, as a simulator does."""
+    with ScenePublisher(scene(), CONFIG) as session:
+        yield session
+
+
+def kinds(session: ScenePublisher) -> list[type]:
+    return [type(event.body) for event in session.recent_events()]
+
+
+def box(session: ScenePublisher) -> list[float]:
+    """Where the session has it now."""
+    with session._unchanging():
+        assert session._stepper is not None
+        return session._stepper.core.world.data.xpos[1].tolist()  # type: ignore[no-any-return]
+
+
+def test_what_is_published_is_the_state_and_what_is_only_set_is_not(session: ScenePublisher) -> None:
+    before = box(session)
+    session.set_pose("box", (0.0, 0.0, 2.0))
+    session.run(seconds=0.05)
+    assert box(session) == before
+    session.publish(12.5)
+    session.run(until=lambda: box(session) == [0.0, 0.0, 2.0], seconds=30.0)
+    assert (session.status().sim_time, session.status().tick) == (12.5, 12_500)
+
+
+def test_the_owner_speaks_and_patches_as_of_any_session(session: ScenePublisher) -> None:
+    session.marker("begin")
+    session.estop("from a script")
+    session.run(until=lambda: session.status().estop, seconds=30.0)
+    session.clear_estop()
+    assert session.scene is not None
+    floor = session.scene.visuals[0]
+    session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, 1.0, 1.0)))
+    session.run(until=lambda: SceneChanged in kinds(session) and not session.status().estop, seconds=30.0)
+    assert MarkerAdded in kinds(session)
+    assert session.scene.visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda s: s.begin_tick(), r"publish\(\) is the tick"),
+        (lambda s: s.end_tick(), r"Session\(model, data\)"),
+        (lambda s: s.load_scene("scene.xml"), "begin another"),
+        (lambda s: s.assign(["arm"], "ann"), "nothing that people drive"),
+        (lambda s: s.set_scale("arm", 0.5), "nothing that people drive"),
+        (lambda s: s.pause(), "publish nothing"),
+        (lambda s: s.resume(), "publish again"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_a_published_world_says_what_does(wrong: Callable[[ScenePublisher], None], says: str) -> None:
+    with pytest.raises(OwnershipError, match=says):
+        wrong(ScenePublisher(scene(), CONFIG))
+
+
+NAN = float("nan")
+
+
+def test_times_that_cannot_be_are_refused_and_change_nothing(session: ScenePublisher) -> None:
+    session.publish(13.0)
+    session.run(until=lambda: session.status().sim_time == 13.0, seconds=30.0)
+    before = session.status().sim_time
+    session.set_pose("box", (9.0, 9.0, 9.0))
+    second = 1_000_000_000
+    for at, capture, says in (
+        (NAN, None, "time_s is nan"),
+        (-1.0, None, "seconds from 0"),
+        ("noon", None, "time_s is 'noon'"),
+        (14.0, -1, "whole nanoseconds"),
+        (14.0, 0.5, "whole nanoseconds"),
+        (14.0, session.clock() + second, "ahead of session.clock"),
+        (14.0, 0, "before that of the state before"),
+        (None, None, "with every publish"),
+    ):
+        with pytest.raises(PublishError, match=says):
+            session.publish(at, capture_ns=capture)  # type: ignore[arg-type]
+    session.run(seconds=0.1)
+    assert session.status().sim_time == before
+    assert 9.0 not in box(session)
+    session.publish(np.float32(14.0), capture_ns=np.int64(session.clock()))  # type: ignore[arg-type]
+
+
+def test_a_time_that_goes_back_is_a_new_scene_epoch(session: ScenePublisher) -> None:
+    before = kinds(session).count(SceneChanged)
+    session.publish(15.0)
+    session.publish(15.0)  # a world that stands still
+    session.publish(4.0)
+    session.run(until=lambda: session.status().sim_time == 4.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 1
+    session.reset()
+    session.publish(4.5)
+    session.run(until=lambda: kinds(session).count(SceneChanged) == before + 2, seconds=30.0)
+
+
+def test_several_threads_may_publish(session: ScenePublisher) -> None:
+    faults: list[BaseException] = []
+
+    def work(x: float) -> None:
+        try:
+            for _ in range(200):
+                session.set_pose("box", (x, x, x))
+                session.publish(20.0)
+        except BaseException as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=work, args=(float(x),)) for x in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+    session.run(until=lambda: session.status().sim_time == 20.0, seconds=30.0)
+    assert len(set(box(session))) == 1, "never half of one and half of another"
+
+
+def test_nothing_is_set_before_the_start_or_published_after_the_end() -> None:
+    session = ScenePublisher(scene(), CONFIG)
+    for call in (session.publish, session.reset, session.run, lambda: session.marker("x"), lambda: session.address):
+        with pytest.raises(OwnershipError, match="not started"):
+            call()
+    assert (session.name, session.recording, session.superseded, session.stopping) == ("session", None, 0, False)
+    with session:
+        session.stop()
+        session.run()  # ends at once
+    assert session.stopping
+    with pytest.raises(OwnershipError, match="closed"):
+        session.publish()
+    assert session.close()
+
+
+def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
+    broken = SceneBuilder("broken")
+    broken.add_box("world", half_size=(1.0, 1.0, 1.0), movable=True)
+    for builder, config, says in (
+        ("scene.xml", CONFIG, "a SceneBuilder is expected"),
+        (scene(), "config", "a SessionConfig is expected"),
+        (scene(), SessionConfig(resume=tmp_path), "cannot go on from its recording"),
+        (scene(), SessionConfig(assets=False), "nothing but what clients draw"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            ScenePublisher(builder, config)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="cannot be built"):
+        ScenePublisher(broken, CONFIG).start()
+
+
+def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=path, keyframe_s=0.5)
+    with ScenePublisher(scene(), config) as session:
+        moments = iter(range(60))
+
+        def move() -> bool:
+            i = next(moments, -1)
+            session.set_pose("box", (i * 0.01, 0.0, 0.5))
+            session.publish(i % 30 * 0.02)
+            return i < 0
+
+        session.run(until=move)
+    assert session.close(), session.recording_fault
+    report = verify_recording(path)
+    assert (report.ok, report.unverified_steps) == (True, 0), report
+    with Recording.open(path) as recording:
+        assert recording.header.recording_class == "open"
+        assert [body.name for body in recording.header.bodies] == ["box"]
+        rows = list(recording.rows())
+        assert 10 < sum(bool(row.plant) for row in rows) <= 61, "only where something was published"
+    with pytest.raises(ResumeError, match="class 'open'"):
+        Session(config=SessionConfig(resume=path))
