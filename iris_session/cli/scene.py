@@ -1,24 +1,37 @@
-"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers."""
+"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers.
+
+MuJoCo reads MJCF and MJB, and scenes with a name; every other file is composed without it (`SceneBuilder`).
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from iris_session.cli.common import CommandError, add_json, open_scene, print_json
 
 if TYPE_CHECKING:
+    from iris_session.protocol.scene import SceneSpec
     from iris_session.scene import AssetStore
-    from iris_session.scene.mujoco_scene import Parsed
+
+#: Endings of files that MuJoCo reads; none: a name.
+_MUJOCO: Final = frozenset({"", ".xml", ".mjb"})
+
+
+class _Found(NamedTuple):
+    spec: SceneSpec
+    scene_hash: str
+    skipped: tuple[str, ...]
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "scene",
         help="what clients are given of a scene, what is heavy in it; export to GLB",
-        epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene export handover handover.glb",
+        epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene inspect arm.urdf\n"
+        "  iris-session scene export handover handover.glb",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -42,7 +55,17 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "scene", metavar="FILE", help="MJCF, URDF or MJB file, or the name of a scene (see `iris-session serve --help`)"
+        "scene",
+        metavar="FILE",
+        help="MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
+        "scene (see `iris-session serve --help`)",
+    )
+    parser.add_argument(
+        "--package-dir",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder of packages that the file refers to by package://, or may refer into; may be repeated",
     )
     parser.add_argument(
         "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
@@ -103,16 +126,41 @@ def run_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _parse(arguments: argparse.Namespace) -> tuple[Parsed, AssetStore]:
+def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
+    """The scene, with its assets in a store."""
     from iris_session.scene import AssetStore
-    from iris_session.scene.mujoco_scene import parse_mujoco
 
-    model = open_scene(arguments.scene).model
+    path = Path(arguments.scene)
     try:
         store = AssetStore(arguments.assets)
-        return parse_mujoco(model, store, name=Path(arguments.scene).stem), store
+        composed = path.suffix.lower() not in _MUJOCO
+        return _compose(path, arguments.package_dir, store) if composed else _parse_model(arguments.scene, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
+
+
+def _parse_model(scene: str, store: AssetStore) -> _Found:
+    from iris_session.scene.mujoco_scene import parse_mujoco
+
+    parsed = parse_mujoco(open_scene(scene).model, store, name=Path(scene).stem)
+    return _Found(parsed.spec, parsed.scene_hash, parsed.skipped)
+
+
+def _compose(path: Path, package_dirs: list[str], store: AssetStore) -> _Found:
+    from iris_session.scene import SceneBuildError
+    from iris_session.scene.compose import SceneBuilder
+
+    builder = SceneBuilder(path.stem)
+    try:
+        if path.suffix.lower() == ".urdf":
+            builder.add_urdf(path, package_dirs=package_dirs)
+        else:
+            builder.add_file(path, package_dirs=package_dirs)
+        made = builder.build(store)
+    except SceneBuildError as error:
+        advice = "" if not str(error).count("package_dirs") else " (here: --package-dir DIR)"
+        raise CommandError(f"{error}{advice}") from None
+    return _Found(made.spec, made.scene_hash, made.skipped)
 
 
 def _size(n_bytes: int) -> str:

@@ -91,8 +91,12 @@ class Articulation:
             if name not in known:
                 names = ", ".join(joint.name for joint in self.joints) or "none"
                 raise SceneBuildError(f"{self.name!r} has no joint {name!r} that can be set. Joints: {names}")
-            if not math.isfinite(value):
-                raise SceneBuildError(f"joint {name!r} of {self.name!r} at {value}: a finite number is needed")
+            try:
+                finite = math.isfinite(value)
+            except TypeError:
+                finite = False
+            if not finite:
+                raise SceneBuildError(f"joint {name!r} of {self.name!r} at {value!r}: a finite number is needed")
 
 
 def _moved(part: Part, position: float) -> tuple[Vec3, tuple[float, float, float, float]]:

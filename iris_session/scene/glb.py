@@ -1,7 +1,8 @@
 """A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors open anywhere.
 
 Y is up there, so a root node turns the scene. Every mesh and texture is in the file once, however many bodies wear
-it. 2d textures are kept; cubes and skies have no form in glTF and leave their colour. Groups that are hidden stay out.
+it. 2d textures are kept, with normals, roughness and the like; cubes and skies have no form in glTF and leave their
+colour. Groups that are hidden stay out. Cameras come along, and lights that are lit.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import SceneSpec, Visual
-from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind
+from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.glb_views import add_viewpoints
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
 from iris_session.scene.shapes import generated_uv, height_field, primitive
@@ -50,6 +52,7 @@ class _Glb:
             "scenes": [{"nodes": [0]}],
             "nodes": [{"name": spec.name or "scene", "rotation": _Y_UP, "children": []}],
             **{name: [] for name in ("meshes", "materials", "accessors", "bufferViews", "textures", "images")},
+            "cameras": [],
         }
         self._meshes: dict[tuple[object, ...], int | None] = {}
         self._materials: dict[tuple[object, ...], int] = {}
@@ -72,6 +75,7 @@ class _Glb:
                 node = self._node(deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
                 self._json["nodes"][node]["mesh"] = self._deformable(index)
                 self._children(0).append(node)
+        add_viewpoints(self._json, self._spec, nodes)
         return self._packed()
 
     def _packed(self) -> bytes:
@@ -162,6 +166,8 @@ class _Glb:
         }
         if uv is not None:
             attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2")
+        if mesh.color is not None:
+            attributes["COLOR_0"] = self._accessor(_linear_colors(mesh.color), "VEC4")
         index = self._add(
             "accessors",
             {
@@ -212,9 +218,16 @@ class _Glb:
             if material.emission > 0:
                 found["emissiveFactor"] = [min(1.0, material.emission * v) for v in colour]
             found["name"] = material.name or f"material_{index}"
-            texture = self._texture(material.texture())
-            if texture is not None:
-                look["baseColorTexture"] = {"index": texture}
+            for where, key, roles in (
+                (look, "baseColorTexture", ()),
+                (look, "metallicRoughnessTexture", (TextureRole.ORM,)),
+                (found, "occlusionTexture", (TextureRole.ORM, TextureRole.OCCLUSION)),
+                (found, "normalTexture", (TextureRole.NORMAL,)),
+                (found, "emissiveTexture", (TextureRole.EMISSIVE,)),
+            ):
+                texture = self._texture(material.texture(*roles))
+                if texture is not None:
+                    where[key] = {"index": texture}
         look["baseColorFactor"] = [*colour, min(max(float(rgba[3]), 0.0), 1.0)]
         if rgba[3] < 1:
             found["alphaMode"] = "BLEND"
@@ -233,6 +246,14 @@ class _Glb:
             image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
             self._textures[index] = self._add("textures", {"source": image, "sampler": 0})
         return self._textures[index]
+
+
+def _linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Colours of vertices as they are seen, in bytes, to linear ones; alpha as it is."""
+    v = color.astype(np.float64) / 255
+    shone = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    shone[:, 3] = v[:, 3]
+    return shone.astype(np.float32)
 
 
 def _linear(value: float) -> float:

@@ -6,6 +6,7 @@ specification (as they are seen), texture coordinates too (v down).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -30,6 +31,8 @@ MAX_NODES: Final = 100_000
 GREY: Final[Rgba] = (0.5, 0.5, 0.5, 1.0)
 #: Farther than this from the identity, a matrix's scale is put into the vertices.
 _RIGID: Final = 1e-9
+#: Digits of a scale that count.
+_DIGITS: Final = 12
 Matrix = NDArray[np.float64]
 
 
@@ -138,7 +141,8 @@ def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     R = U @ Vt
     if np.linalg.det(R) < 0:
         R = -R
-    rest = R.T @ turn
+    digits = _DIGITS - math.floor(math.log10(float(scale[0])))
+    rest = np.round(R.T @ turn, digits) + 0.0  # so that one scale is the same at every angle, and its mesh is one
     rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
     return pose_of(R, matrix[:3, 3]), None if rigid else rest
 

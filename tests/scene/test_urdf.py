@@ -1,0 +1,176 @@
+"""URDF: links where MuJoCo and yourdfpy have them, the same picture as MuJoCo's, and faults that are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yourdfpy
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Pose
+from iris_session.scene import AssetStore, SceneBuildError
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.composed import ComposedScene
+from iris_session.scene.parts import matrix_of
+from tests.scene.arm import FREE, JOINTS, write_arm
+from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
+from tests.scene.rebuild import rebuild
+
+FOLLOWS = {"finger_right": ("finger_left", 0.5, 0.01)}
+
+
+def positions(seed: int) -> dict[str, float]:
+    """Random positions of the joints that can be set."""
+    rng = np.random.default_rng(seed)
+    return {name: rng.uniform(-3 if low is None else low, 3 if high is None else high) for name, _, low, high in JOINTS}
+
+
+def with_followers(q: dict[str, float]) -> dict[str, float]:
+    return {**q, **{name: q[source] * times + plus for name, (source, times, plus) in FOLLOWS.items()}}
+
+
+def composed(urdf: Path, tmp_path: Path, **options: object) -> ComposedScene:
+    scene = SceneBuilder("arm")
+    scene.add_urdf(urdf, name="arm", **options)
+    return scene.build(AssetStore(tmp_path / "store"))
+
+
+def difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(np.abs(a - b).max())
+
+
+def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    arm = composed(urdf, tmp_path).articulations["arm"]
+    model = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
+    data = mujoco.MjData(model)
+    other = yourdfpy.URDF.load(str(urdf), load_meshes=False)
+    for seed in range(20):
+        q = positions(seed)
+        found = arm.poses(q)
+        everything = with_followers(q)
+        for name, value in everything.items():
+            data.qpos[model.joint(name).qposadr[0]] = value
+        mujoco.mj_kinematics(model, data)
+        other.update_cfg([q[name] for name in other.actuated_joint_names])
+        for body, pose in found.items():
+            link = body.removeprefix("arm/")
+            T_world_link = np.eye(4)
+            if link != "base":
+                T_world_link[:3, :3] = data.body(link).xmat.reshape(3, 3)
+                T_world_link[:3, 3] = data.body(link).xpos
+            assert difference(matrix_of(pose), T_world_link) < 1e-9
+            assert difference(matrix_of(pose), other.get_transform(link)) < 1e-9
+
+
+def _beside_meshes(urdf: Path) -> Path:
+    """The same file where MuJoCo finds its meshes: it strips paths, and searches below the model's own folder."""
+    copy = urdf.parents[1] / "arm.urdf"
+    copy.write_text(urdf.read_text())
+    return copy
+
+
+def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
+    scene = composed(write_arm(tmp_path), tmp_path, position=(1, 2, 3))
+    arm = scene.articulations["arm"]
+    assert tuple(joint.name for joint in arm.joints) == FREE
+    assert arm.mimics == {"finger_right": "finger_left"}
+    by_name = {joint.name: joint for joint in arm.joints}
+    assert (by_name["bend"].low, by_name["bend"].high, by_name["bend"].rest) == (0.3, 2.5, 0.3)
+    assert by_name["twist"].high == float("inf")
+    # the sensor and the hand are fixed: they have no body of their own
+    assert arm.bodies == scene.moving
+    assert arm.bodies[0] == "arm/base"
+    assert {"arm/sensor", "arm/hand"}.isdisjoint(arm.bodies)
+    assert len(arm.bodies) == 1 + 6 + 2
+    assert scene.poses[0] == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    assert arm.poses({})["arm/base"].p == (0.0, 0.0, 0.0)
+    colours = {visual.name: visual.rgba for visual in scene.spec.visuals}
+    assert colours["link2"] == (0.9, 0.5, 0.1, 1.0)
+    assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
+    assert len(scene.spec.meshes) == 2  # the six links wear one
+    assert scene.skipped == ()
+
+
+def test_picture_is_mujocos(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    scene = SceneBuilder("arm")
+    scene.add_urdf(urdf, name="arm")
+    store = AssetStore(tmp_path / "store")
+    ours = rebuild(store.get(scene.build(store).scene_hash), store)
+    theirs = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
+    rest = {"bend": 0.3, "finger_right": 0.01}  # ours stand as near to 0 as limits and what they follow allow
+    with graphics():
+        a, b = Artist(ours), Artist(theirs)
+        for name, value in rest.items():
+            b.data.qpos[theirs.joint(name).qposadr[0]] = value
+        mujoco.mj_forward(theirs, b.data)
+        for camera in cameras(ours):
+            assert silhouette_iou(a.segments(camera) >= 0, b.segments(camera) >= 0) >= 0.99
+        a.close()
+        b.close()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ('type="continuous"', 'type="magic"', "type 'magic'"),
+        ('<child link="link2"/>', '<child link="link9"/>', "'link9', which is not there"),
+        ('<child link="link2"/>', '<child link="link1"/>', "hangs on two joints"),
+        ('<child link="link0"/>', '<child link="base"/>', "in a loop"),
+        ('joint="finger_left" mult', 'joint="flange" mult', "which does not move"),
+        ('joint="finger_left" mult', 'joint="finger_right" mult', "follows it in turn"),
+        ("meshes/link.stl", "meshes/lost.stl", "lost.stl"),
+        ("package://arm_description/", "package://other/", "package_dirs"),
+        ("package://arm_description/meshes/link.stl", "../../../../../../etc/passwd", "outside of its own folders"),
+        ("package://arm_description/meshes/link.stl", "package://arm_description/../../x.stl", "package_dirs"),
+        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "only files and package"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "the axis of joint turn"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "damaged, or no URDF"),
+        ('radius="0.1"', 'radius="-1"', "positive lengths"),
+        ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
+        ("</robot>", "", "no XML"),
+        ("robot", "sdf", "<robot> is needed"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, before: str, after: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    assert before in urdf.read_text()
+    urdf.write_text(urdf.read_text().replace(before, after))
+    with pytest.raises(SceneBuildError, match=text):
+        SceneBuilder().add_urdf(urdf)
+
+
+def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    changed = urdf.read_text().replace('<sphere radius="0.02"/>', '<capsule radius="0.02" length="1"/>', 1)
+    changed = changed.replace('type="continuous"', 'type="floating"').replace('name="orange"/>', 'name="lost"/>')
+    urdf.write_text(changed)
+    skipped = composed(urdf, tmp_path).skipped
+    assert any("finger_left: shape 'capsule'" in line for line in skipped)
+    assert any("joint twist is floating" in line for line in skipped)
+    assert any("material 'lost'" in line for line in skipped)
+
+
+def test_collision_shapes_on_request(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    assert "leave out collisions=True" in composed(urdf, tmp_path, collisions=True).skipped[0]
+    urdf.write_text(urdf.read_text().replace("<visual>", "<collision>").replace("</visual>", "</collision>"))
+    assert composed(urdf, tmp_path).spec.visuals == ()
+    assert "give collisions=True" in composed(urdf, tmp_path).skipped[0]
+    assert len(composed(urdf, tmp_path, collisions=True).spec.visuals) == 11
+
+
+def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
+    arm = composed(write_arm(tmp_path), tmp_path).articulations["arm"]
+    with pytest.raises(SceneBuildError, match="follows 'finger_left'"):
+        arm.poses({"finger_right": 0.0})
+    with pytest.raises(SceneBuildError, match="Joints: turn, lift"):
+        arm.poses({"elbow": 0.0})
+    with pytest.raises(SceneBuildError, match="finite"):
+        arm.poses({"lift": float("nan")})
+    with pytest.raises(SceneBuildError, match="number"):
+        arm.poses({"lift": "high"})  # type: ignore[dict-item]
