@@ -3,6 +3,9 @@
 Batches of about 20 ms are numbered and kept until the recorder says that they are in the file: first in a window in
 memory, beyond it in a spill file. A recorder that was killed and started anew gets everything that was not yet in the
 file. Only when memory and spill are both full are rows dropped: counted, and told by `take_gap`.
+
+Vertices of what bends are for the picture only. They go by a socket of their own, nobody keeps them, and those that it
+does not take at once are dropped and counted: they cost the journal nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +27,19 @@ from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision
 from iris_session.recording import messages
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal
-from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, RecorderStatus, SceneModel, StateFrame
+from iris_session.recording.messages import (
+    Batch,
+    DenialRecord,
+    MetricRecord,
+    RecorderStatus,
+    SceneAssets,
+    SceneModel,
+    StateFrame,
+    VertexFrame,
+)
 from iris_session.recording.spill import SpillFile
+from iris_session.recording.vertices import VertexPace
+from iris_session.streams.deformable import read_header
 
 _T = TypeVar("_T")
 
@@ -40,11 +54,13 @@ UNSPILL_BATCHES: Final = 4
 SILENCE_S: Final = 1.0
 #: Bound on each list of one batch. A flush comes long before; it holds when a caller never takes a step.
 BATCH_ITEMS: Final = 4096
+#: Frames of vertices on their way. The recorder takes them thirty times a second.
+VERTEX_FRAMES: Final = 32
 
 
 class FeedStats(msgspec.Struct):
     """Counters of one feed. `dropped_rows`: rows that are lost for the recording, `dropped_items`: states, events
-    and so on that are; `recorder`: its last status."""
+    and so on that are, `dropped_vertices`: frames that the picture lacks; `recorder`: its last status."""
 
     rows: int = 0
     batches: int = 0
@@ -55,6 +71,7 @@ class FeedStats(msgspec.Struct):
     spilled_bytes: int = 0
     dropped_rows: int = 0
     dropped_items: int = 0
+    dropped_vertices: int = 0
     recorders: int = 0
     spill_fault: str = ""
     recorder: RecorderStatus | None = None
@@ -64,7 +81,7 @@ class RecorderFeed:
     """One feed per session, used from the thread that takes the steps. No clock, no threads.
 
     Call `row` once per step (it flushes by itself), `keyframe` every few seconds and whenever `wants_keyframe`.
-    `endpoint`: where the recorder process listens, see `RecorderProcess.feed_endpoint`.
+    `endpoint`: where the recorder process listens, see `RecorderProcess.feed_endpoint`; `vertices_endpoint`: the same.
     """
 
     def __init__(
@@ -73,6 +90,7 @@ class RecorderFeed:
         spill_dir: str | Path,
         window_bytes: int = WINDOW_BYTES,
         spill_bytes: int = SPILL_BYTES,
+        vertices_endpoint: str = "",
     ) -> None:
         self.stats = FeedStats()
         self._lost = False
@@ -85,8 +103,15 @@ class RecorderFeed:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.connect(endpoint)
+        self._vertices = self._context.socket(zmq.PUSH) if vertices_endpoint else None
+        if self._vertices is not None:
+            self._vertices.setsockopt(zmq.SNDHWM, VERTEX_FRAMES)
+            self._vertices.setsockopt(zmq.LINGER, 0)
+            self._vertices.setsockopt(zmq.RECONNECT_IVL, 50)
+            self._vertices.connect(vertices_endpoint)
+        self._pace = VertexPace()
         self._header = b""
-        self._scene: tuple[bytes, ...] = ()  # of the newest `SceneModel`
+        self._scene = Batch()  # the newest `SceneModel`, and what the picture is drawn from
         self._next = 0
         self._window: deque[tuple[int, bytes]] = deque()
         self._instance = 0
@@ -105,17 +130,35 @@ class RecorderFeed:
         """True once there is room again after a loss: verification can go on from the next keyframe."""
         return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
 
-    def header(self, header: SessionHeader) -> None:
-        """Names the session: once, before the first row."""
+    def header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
+        """Names the session: once, before the first row. `root`, `scene_hash`: see `SceneAssets`."""
         self._header = messages.encode_header(header)
+        self._scene.assets = [SceneAssets(-1, 0, root, scene_hash)]
         self._exchange()
 
-    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None:
+    def scene(
+        self,
+        model_hash: str,
+        packed_model: bytes,
+        bodies: tuple[BodyInfo, ...],
+        root: str = "",
+        scene_hash: str = "",
+    ) -> None:
         """The model of a scene, before the row that loads it. States from then on are of its `bodies`."""
-        self.flush()
+        self._pace.reset()
         scene = SceneModel(*self._now, model_hash, packed_model, bodies)
-        self._scene = (messages.encode_scene(scene),)
-        self._batch.scenes.append(scene)
+        self._tell(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
+
+    def patch(self, root: str, scene_hash: str) -> None:
+        """The present scene is drawn in another way from now on, before the row that says so."""
+        assets = [SceneAssets(*self._now, root, scene_hash)]
+        self._tell(Batch(scenes=self._scene.scenes, assets=assets), Batch(assets=assets))
+
+    def _tell(self, known: Batch, news: Batch | None = None) -> None:
+        """`known`: what a recorder that comes later is to know; `news`: what this one is told, if not all of that."""
+        self.flush()
+        self._scene, news = known, known if news is None else news
+        self._batch.scenes, self._batch.assets = list(news.scenes), list(news.assets)
         self.flush()
 
     def row(self, row: JournalRow) -> None:
@@ -165,6 +208,16 @@ class RecorderFeed:
         """A scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
         self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
 
+    def vertices(self, stream: str, frame: bytes, session_time: int) -> None:
+        """`full` of a deformable's media stream, as it was published with the state of `session_time`. For the picture:
+        not all of them go in (`VertexPace`), and none waits."""
+        if self._vertices is None or not self._pace.take(stream, read_header(frame).n_vertices, session_time):
+            return
+        try:
+            self._vertices.send(messages.encode_vertices(VertexFrame(stream, session_time, frame)), zmq.NOBLOCK)
+        except zmq.Again:
+            self.stats.dropped_vertices += 1
+
     def take_gap(self) -> int:
         """Rows lost since the last call: journal them as `Entry(RecordingGap(rows))` and take a keyframe."""
         rows, self._gap_rows = self._gap_rows, 0
@@ -174,7 +227,7 @@ class RecorderFeed:
         """Numbers the pending batch and hands over what the window allows. Never blocks."""
         batch = self._batch
         lists: tuple[list[Any], ...] = (batch.states, batch.events, batch.denials, batch.metrics, batch.keyframes)
-        lists += (batch.scenes,)
+        lists += (batch.scenes, batch.assets)
         if batch.rows or any(lists):
             self._batch = Batch(dropped_rows=self.stats.dropped_rows)
             self._enqueue(messages.encode_batch(batch), len(batch.rows), sum(len(items) for items in lists))
@@ -203,6 +256,8 @@ class RecorderFeed:
             said = self.stats.recorder
         complete = not self._window and not self._spill
         self._spill.close()
+        if self._vertices is not None:
+            self._vertices.close(0)
         self._socket.close(0)
         self._context.term()
         return complete
@@ -261,12 +316,14 @@ class RecorderFeed:
         if status.instance != self._instance:
             self._instance = status.instance
             self.stats.recorders += 1
+            self._pace.reset()
         while self._window and self._window[0][0] <= status.written:
             self.stats.window_bytes -= len(self._window.popleft()[1])
         if status.expecting < 0 and self._header and self._header_sent_to != self._instance and not status.fault:
             self._header_sent_to = self._instance
             first = self._window[0][0] if self._window else self._next
-            head = (messages.FRAME.pack(messages.HEADER, first), self._header, *self._scene)
+            known = messages.encode_batch(self._scene)
+            head = (messages.FRAME.pack(messages.HEADER, first), self._header, known)
             self._socket.send_multipart(head, zmq.NOBLOCK)
             for number, body in self._window:
                 self._socket.send_multipart((messages.FRAME.pack(messages.BATCH, number), body), zmq.NOBLOCK)

@@ -1,9 +1,11 @@
 """What travels between the authority's feed and the recorder process. Pure.
 
-Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and the scene that was loaded
-last if there is one; or `BATCH` with its own number, and the body. Recorder -> authority: `RecorderStatus`. The feed
-keeps every batch until a status says that it is in the file; a new recorder process asks for the header (`expecting`
--1) and gets everything since.
+Authority -> recorder: `HEADER` with the number of the batch that follows it, the header, and a batch that says which
+scene was loaded last, if one was, and where its assets lie; or `BATCH` with its own number, and the body. Recorder ->
+authority: `RecorderStatus`. The feed keeps every batch until a status says that it is in the file; a new recorder
+process asks for the header (`expecting` -1) and gets everything since.
+
+Beside it, by a socket of their own that forgets what does not fit: `VertexFrame`, for the picture only.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
 
     `path`: the recording; `part`: which of its files to begin with, none of them may exist. Endpoints: `ipc://` sockets
     that it binds. `origin_ns`: session time zero on CLOCK_MONOTONIC. `parent`: process that it outlives only to finish.
+    Without `vertices_endpoint` nothing bends.
     """
 
     path: str
@@ -36,6 +39,7 @@ class RecorderConfig(msgspec.Struct, frozen=True):
     samples_endpoint: str
     origin_ns: int
     parent: int
+    vertices_endpoint: str = ""
 
 
 class EndMark(msgspec.Struct, frozen=True, array_like=True):
@@ -94,9 +98,29 @@ class SceneModel(msgspec.Struct, frozen=True, array_like=True):
     bodies: tuple[BodyInfo, ...] = ()
 
 
+class SceneAssets(msgspec.Struct, frozen=True, array_like=True):
+    """What the picture is drawn from, since about `step`: the store `root` has the specification, which is its asset
+    `scene_hash`, and all others. Empty: nothing is shared, and the picture is made of the model.
+    """
+
+    step: int = -1
+    session_time: Nanoseconds = 0
+    root: str = ""
+    scene_hash: str = ""
+
+
+class VertexFrame(msgspec.Struct, frozen=True, array_like=True):
+    """Vertices of one deformable as they were published with the state of `session_time`. `frame`: `full` of its media
+    stream, see docs/deformables.md."""
+
+    stream: Name
+    session_time: Nanoseconds
+    frame: bytes
+
+
 class Batch(msgspec.Struct, array_like=True):
     """Everything of about 20 ms. `dropped_rows`: rows lost before this batch since the feed began. `scenes` come before
-    everything else in it."""
+    everything else in it, then `assets`: of the newest of these scenes, or a patch of the present one."""
 
     rows: list[JournalRow] = []
     states: list[StateFrame] = []
@@ -106,6 +130,7 @@ class Batch(msgspec.Struct, array_like=True):
     keyframes: list[Keyframe] = []
     dropped_rows: Count = 0
     scenes: list[SceneModel] = []
+    assets: list[SceneAssets] = []
 
 
 class _Essence(msgspec.Struct, array_like=True):
@@ -126,7 +151,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
 
     `expecting`: number of the next batch, -1 until a header came. `cpu_ns`: processor time of the recorder so far.
     `lag_ns`: age of the newest row when it was written. `samples_refused`: messages of the front that are none, and
-    batches of which only the journal could be read.
+    batches of which only the journal could be read. `vertices_refused`: frames of vertices that are not in the picture,
+    because too many waited, they do not decode, or are of another scene.
     `fault`: one line when the file can no longer be written; the process then ends. `disk_free`: bytes that its disk
     has left, at least 1, 0 when that is not known.
     """
@@ -141,6 +167,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, array_like=True):
     samples_refused: int = 0
     fault: str = ""
     disk_free: int = 0
+    vertices_refused: int = 0
 
 
 encode_batch = msgspec.msgpack.Encoder().encode
@@ -148,6 +175,8 @@ decode_batch = decoder(Batch)
 _decode_essence = decoder(_Essence)
 encode_scene = msgspec.msgpack.Encoder().encode
 decode_scene = decoder(SceneModel)
+encode_vertices = msgspec.msgpack.Encoder().encode
+decode_vertices = decoder(VertexFrame)
 encode_header = msgspec.msgpack.Encoder().encode
 decode_header = decoder(SessionHeader)
 encode_status = msgspec.msgpack.Encoder().encode

@@ -1,61 +1,127 @@
-"""The picture of the scene in a recording: static geometry in named frames; with a second scene, geometry in time.
+"""The picture of the scene in a recording: geometry in named frames, from the moment on from which it is so.
 
-Rerun shows static things at all times, so when another scene is loaded the static ones are emptied and drawn again from
-the beginning until that moment.
+Nothing of it is static, because Rerun shows static things at all times: scenes follow one another, patches change how
+things look, and what bends moves. A scene is drawn at its first state, below `/scene/<number>`.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+import msgspec
 import numpy as np
 import rerun as rr
 
+from anchors.pose import PoseTuple
+from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import paths, scene
-from iris_session.recording.journal import unpack_model
+from iris_session.recording.bending import Bending
+from iris_session.recording.messages import SceneAssets
+from iris_session.recording.scene import Form, SceneReader
+from iris_session.scene import SceneBuildError
 
 #: Step, tick, simulated time [ns], session time [ns].
 Moment = tuple[int, int, int, int]
-BEGINNING: Final[Moment] = (-1, 0, 0, 0)
+#: Names of things that cannot be drawn, in the line that says so.
+NAMED: Final = 5
+#: What keeps a scene or a part of it from being drawn. The journal is worth more than its picture: it goes on.
+_NOT_DRAWN: Final = (ValueError, KeyError, OSError, zlib.error, SceneBuildError)
+
+
+class Source(NamedTuple):
+    """What a scene is drawn from. `packed_model`: for where nothing is shared."""
+
+    packed_model: bytes
+    bodies: Sequence[BodyInfo]
+    assets: SceneAssets = SceneAssets()
+
+
+class _Drawn(NamedTuple):
+    """A visual as it is in the picture now; `shown`: to be seen."""
+
+    visual: Visual
+    entity: str
+    kind: str
+    tint: tuple[float, float, float]
+    shown: bool
 
 
 class ScenePicture:
-    """Geometry of the scenes of one file."""
+    """Geometry of the scenes of one file. `bending`: what has vertices of its own, by stream. `since_ns`: session time
+    from which on the present scene is drawn."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._rec = recording
-        self._number = 1
-        self._shapes: list[scene.Shape] = []
+        self._rec.set_log_time_enabled(False)
+        self._number = 0
+        self._source: Source | None = None
+        self._waits = False
+        self._visuals: dict[int, _Drawn] = {}
+        self._names: Counter[str] = Counter()
+        self._failed: list[str] = []
+        self.bending: dict[str, Bending] = {}
+        self.since_ns = 0
 
-    def begin(self, packed_model: bytes, bodies: Sequence[BodyInfo]) -> None:
-        """The scene that the session began with."""
-        self._shapes = self._shapes_of(packed_model, bodies)
-        for shape in self._shapes:
-            self._rec.log(_entity(paths.SCENE, shape), *drawing(shape), static=True, strict=True)
+    def begin(self, source: Source) -> None:
+        """The scene that the session began with. It is drawn by `draw`."""
+        self._source, self._waits = source, True
 
-    def change(self, packed_model: bytes, bodies: Sequence[BodyInfo], moment: Moment) -> None:
+    def change(self, source: Source, moment: Moment) -> None:
         """Another scene from `moment` on."""
-        if self._number == 1:
-            self._rec.set_log_time_enabled(False)
-            for shape in self._shapes:
-                nothing = rr.InstancePoses3D(translations=[])
-                self._rec.log(_entity(paths.SCENE, shape), nothing, static=True, strict=True)
-            self._draw(BEGINNING)
-        self._at(moment)
-        self._rec.log(f"{paths.SCENE}/{self._number}", rr.Clear(recursive=True), strict=True)
-        self._rec.reset_time()
-        self._number += 1
-        self._shapes = self._shapes_of(packed_model, bodies)
-        self._draw(moment)
+        begun = not self._waits and self._source is not None
+        self.begin(source)
+        if begun:
+            self._at(moment)
+            self._rec.log(self._folder, rr.Clear(recursive=True), strict=True)
+            self.draw(moment)
 
-    def _draw(self, moment: Moment) -> None:
+    def patch(self, assets: SceneAssets, moment: Moment) -> None:
+        """The present scene looks like this from `moment` on."""
+        if self._source is None:
+            return
+        self._source = self._source._replace(assets=assets)
+        if not self._waits:
+            self._at(moment)
+            self._with_scene(self._update)
+            self._rec.reset_time()
+
+    def draw(self, moment: Moment) -> None:
+        """Draws what `begin` was given, once, as it is from `moment` on."""
+        if not self._waits:
+            return
+        self._waits = False
+        self._number += 1
+        self._visuals.clear()
+        self._names.clear()
+        self.bending.clear()
+        self.since_ns = moment[3]
         self._at(moment)
-        for shape in self._shapes:
-            self._rec.log(_entity(f"{paths.SCENE}/{self._number}", shape), *drawing(shape), strict=True)
+        self._with_scene(self._draw_all)
         self._rec.reset_time()
+
+    @property
+    def _folder(self) -> str:
+        return f"{paths.SCENE}/{self._number}"
+
+    def _with_scene(self, work: Any) -> None:
+        """`work(spec, reader)` on the present scene; what is wrong is said where the viewer shows it."""
+        assert self._source is not None
+        self._failed = []
+        try:
+            with scene.opened(self._source.assets, self._source.packed_model) as (spec, store):
+                work(spec, SceneReader(spec, store, self._source.bodies))
+        except _NOT_DRAWN as error:
+            self._say(f"the scene is not drawn: {error}")
+        if self._failed:
+            more = f" and {len(self._failed) - NAMED} more" if len(self._failed) > NAMED else ""
+            self._say(f"{', '.join(self._failed[:NAMED])}{more} cannot be drawn")
+
+    def _say(self, text: str) -> None:
+        self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"), strict=True)
 
     def _at(self, moment: Moment) -> None:
         step, tick, sim_ns, session_ns = moment
@@ -64,49 +130,125 @@ class ScenePicture:
         self._rec.set_time(paths.SIM_TIME, duration=np.timedelta64(sim_ns, "ns"))
         self._rec.set_time(paths.SESSION_TIME, duration=np.timedelta64(session_ns, "ns"))
 
-    def _shapes_of(self, packed_model: bytes, bodies: Sequence[BodyInfo]) -> list[scene.Shape]:
+    def _draw_all(self, spec: SceneSpec, reader: SceneReader) -> None:
+        for visual in spec.visuals:
+            if reader.shown(visual):
+                self._draw(reader, visual)
+        for deformable in spec.deformables:
+            if reader.shown(deformable):
+                entity = self._entity(scene.WORLD, deformable.name or deformable.stream)
+                try:
+                    bending = Bending(
+                        entity, deformable, reader.arrays(deformable), *reader.surface(deformable.material)
+                    )
+                except _NOT_DRAWN as error:
+                    self._failed.append(f"{entity} ({error})")
+                    continue
+                self.bending[deformable.stream] = bending
+                self._rec.log(entity, *bending.drawing(), strict=True)
+
+    def _update(self, spec: SceneSpec, reader: SceneReader) -> None:
+        """What differs from what is drawn. Deformables do not: patches concern visuals."""
+        for gone in sorted(self._visuals.keys() - {visual.id for visual in spec.visuals}):
+            self._clear(gone)
+        for visual in spec.visuals:
+            old = self._visuals.get(visual.id)
+            if old is not None and old.visual != visual:
+                self._redraw(reader, old, visual)
+            elif old is None and reader.shown(visual):
+                self._draw(reader, visual)
+
+    def _draw(self, reader: SceneReader, visual: Visual) -> None:
+        assert self._source is not None
+        body = next((body.name for body in self._source.bodies if body.id == visual.body), scene.WORLD)
+        entity = self._entity(body, visual.name or f"visual_{visual.id}")
         try:
-            return scene.shapes(scene.load_model(unpack_model(packed_model)), bodies)
-        except (ValueError, zlib.error) as error:
-            # The journal is worth more than its picture: go on, and say it where the viewer shows it.
-            text = f"the scene is not drawn, MuJoCo does not take the model: {error}"
-            self._rec.log(f"{paths.EVENTS}/recorder", rr.TextLog(text, level="ERROR"), static=True, strict=True)
-            return []
+            form = reader.form(visual)
+        except _NOT_DRAWN as error:
+            self._failed.append(f"{entity} ({error})")
+            return
+        frame, T_frame_visual = reader.place(visual)
+        self._visuals[visual.id] = _Drawn(visual, entity, form.kind, form.tint, shown=True)
+        self._rec.log(entity, *drawing(form, scene.colour(visual.rgba, form.tint), frame, T_frame_visual), strict=True)
+
+    def _redraw(self, reader: SceneReader, old: _Drawn, visual: Visual) -> None:
+        """Says what has changed, and not the mesh again."""
+        was = old.visual
+        alike = msgspec.structs.replace(was, rgba=visual.rgba, group=visual.group, T_body_visual=visual.T_body_visual)
+        if alike != visual:
+            self._clear(visual.id)
+            if reader.shown(visual):
+                self._draw(reader, visual)
+            return
+        shown = reader.shown(visual)
+        parts: list[Any] = []
+        if visual.rgba != was.rgba:
+            parts.append(recoloured(old.kind, scene.colour(visual.rgba, old.tint)))
+        if shown != old.shown or visual.T_body_visual != was.T_body_visual:
+            size = visual.geometry.size[2]
+            parts.append(placed(old.kind, size, reader.place(visual)[1], shown=shown))
+        self._visuals[visual.id] = old._replace(visual=visual, shown=shown)
+        if parts:
+            self._rec.log(old.entity, *parts, strict=True)
+
+    def _clear(self, visual: int) -> None:
+        self._rec.log(self._visuals.pop(visual).entity, rr.Clear(recursive=False), strict=True)
+
+    def _entity(self, body: str, name: str) -> str:
+        """Where something is drawn: nothing else is."""
+        entity = f"{self._folder}/{entity_part(body)}/{entity_part(name)}"
+        self._names[entity] += 1
+        return entity if self._names[entity] == 1 else self._entity(body, f"{name} ({self._names[entity]})")
 
 
-def _entity(folder: str, shape: scene.Shape) -> str:
-    return f"{folder}/{entity_part(shape.body)}/{entity_part(shape.name)}"
-
-
-def drawing(shape: scene.Shape) -> list[Any]:
-    """Rerun components of one geom: its frame, its pose in that frame, and its form."""
-    frame = rr.CoordinateFrame(shape.frame)
-    w, x, y, z = shape.q
-    p = shape.p
-    color = shape.rgba
-    solid = rr.components.FillMode.Solid
+def drawing(form: Form, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple) -> list[Any]:
+    """Rerun components of one visual: its frame, its pose in that frame, and its form."""
     drawn: Any
-    if shape.kind == scene.BOX:
-        drawn = rr.Boxes3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.ELLIPSOID:
-        drawn = rr.Ellipsoids3D(half_sizes=[shape.size], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.CYLINDER:
-        radius, half = shape.size
-        drawn = rr.Cylinders3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
-    elif shape.kind == scene.CAPSULE:
-        radius, half = shape.size
-        drawn = rr.Capsules3D(lengths=[2.0 * half], radii=[radius], colors=[color], fill_mode=solid)
-        # Rerun's capsule begins at the origin and MuJoCo's is centred there: back by half a length along its axis.
+    solid = rr.components.FillMode.Solid
+    radius, _, half = form.size
+    if form.kind == scene.BOX:
+        drawn = rr.Boxes3D(half_sizes=[form.size], colors=[rgba], fill_mode=solid)
+    elif form.kind == scene.ELLIPSOID:
+        drawn = rr.Ellipsoids3D(half_sizes=[form.size], colors=[rgba], fill_mode=solid)
+    elif form.kind == scene.CYLINDER:
+        drawn = rr.Cylinders3D(lengths=[2.0 * half], radii=[radius], colors=[rgba], fill_mode=solid)
+    elif form.kind == scene.CAPSULE:
+        drawn = rr.Capsules3D(lengths=[2.0 * half], radii=[radius], colors=[rgba], fill_mode=solid)
+    else:
+        assert form.mesh is not None
+        drawn = rr.Mesh3D(
+            vertex_positions=form.mesh.position,
+            vertex_normals=form.mesh.normal,
+            triangle_indices=form.mesh.index,
+            vertex_texcoords=form.uv,
+            albedo_texture=form.texture,
+            albedo_factor=rgba,
+        )
+    return [rr.CoordinateFrame(frame), placed(form.kind, half, T_frame_visual), drawn]
+
+
+def placed(kind: str, half: float, T_frame_visual: PoseTuple, *, shown: bool = True) -> Any:
+    """Where a visual is drawn in its frame. Hidden, it has no extent: so its mesh need not be written again."""
+    p, (w, x, y, z) = T_frame_visual
+    if kind == scene.CAPSULE:
+        # Rerun's capsule begins at the origin and ours is centred there: back by half a length along its axis.
         axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
         p = (p[0] - half * axis[0], p[1] - half * axis[1], p[2] - half * axis[2])
-    else:
-        drawn = rr.Mesh3D(
-            vertex_positions=shape.vertices,
-            vertex_normals=shape.normals,
-            triangle_indices=shape.faces,
-            albedo_factor=color,
-        )
-    return [frame, rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])]), drawn]
+    scales = None if shown else [(0.0, 0.0, 0.0)]
+    return rr.InstancePoses3D(translations=[p], quaternions=[rr.Quaternion(xyzw=[x, y, z, w])], scales=scales)
+
+
+def recoloured(kind: str, rgba: scene.Rgba8) -> Any:
+    """The colour alone."""
+    if kind == scene.MESH:
+        return rr.Mesh3D.from_fields(albedo_factor=rgba)
+    primitives: dict[str, Any] = {
+        scene.BOX: rr.Boxes3D,
+        scene.ELLIPSOID: rr.Ellipsoids3D,
+        scene.CYLINDER: rr.Cylinders3D,
+        scene.CAPSULE: rr.Capsules3D,
+    }
+    return primitives[kind].from_fields(colors=[rgba])
 
 
 def entity_part(name: str) -> str:

@@ -1,7 +1,8 @@
 """The recorder process: `python -m iris_session.recording.process`, configuration as MessagePack on standard input.
 
 Takes batches from the authority and raw samples from the front, and writes them into one Rerun file about seven times
-a second, so that a killed process of any kind costs at most 0.25 s. Says `ready` or `failed: <one line>` on standard
+a second, so that a killed process of any kind costs at most 0.25 s. Vertices come last: what there is no time for is
+left out. Says `ready` or `failed: <one line>` on standard
 output. Ends by SIGTERM, or when its parent is gone, after writing everything that was received; SIGINT is the parent's.
 """
 
@@ -34,7 +35,7 @@ from iris_session.recording.messages import (
     decode_batch,
     decode_header,
     decode_journal,
-    decode_scene,
+    decode_vertices,
     encode_status,
 )
 from iris_session.recording.paths import part_path
@@ -47,6 +48,8 @@ SYNC_S: Final = 1.0
 STATUS_S: Final = 0.5
 #: Messages taken per drain, so that a flood cannot keep the file from being written.
 DRAIN_MESSAGES: Final = 4096
+#: Frames of vertices taken per drain.
+DRAIN_VERTICES: Final = 32
 #: After SIGTERM or the parent's end: quiet for this long means that everything was received.
 QUIET_S: Final = 0.1
 FINISH_S: Final = 10.0
@@ -68,6 +71,8 @@ class Recorder:
         self._context = zmq.Context(io_threads=1)
         self._feed = self._bind(zmq.DEALER, config.feed_endpoint)
         self._front = self._bind(zmq.PULL, config.samples_endpoint)
+        vertices = config.vertices_endpoint
+        self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._begin_part()
         if os.path.exists(config.path):  # somebody may have moved the first file away
             self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
@@ -141,9 +146,9 @@ class Recorder:
             raise
         self._syncer = _Syncer(path)
 
-    def _bind(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+    def _bind(self, kind: int, endpoint: str, messages: int = 20_000) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
-        socket.setsockopt(zmq.RCVHWM, 20_000)
+        socket.setsockopt(zmq.RCVHWM, messages)
         socket.setsockopt(zmq.SNDHWM, 100)
         try:
             socket.bind(endpoint)
@@ -189,7 +194,20 @@ class Recorder:
                 break
             m += 1
             self._take_sample(data)
+        if max(n, m) < DRAIN_MESSAGES:  # else behind with what matters: vertices wait, and are dropped at their source
+            self._drain_vertices()
         return n + m
+
+    def _drain_vertices(self) -> None:
+        if self._vertices is None:
+            return
+        for _ in range(DRAIN_VERTICES):
+            try:
+                self._writer.add_vertices(decode_vertices(self._vertices.recv(zmq.NOBLOCK)))
+            except zmq.Again:
+                return
+            except msgspec.DecodeError:
+                self._refused += 1
 
     def _take(self, frames: list[bytes]) -> None:
         """Batches are taken in order only: what a new process gets before its header comes again after it."""
@@ -199,8 +217,8 @@ class Recorder:
         if kind == HEADER and self._expecting < 0:
             self._header = decode_header(frames[1])
             self._writer.header(self._header)
-            for scene in frames[2:]:
-                self._writer.add(Batch(scenes=[decode_scene(scene)]))
+            for known in frames[2:]:
+                self._writer.add(decode_batch(known))
             self._expecting = number
             self._received = number - 1
         elif kind == BATCH and number == self._expecting:
@@ -241,6 +259,7 @@ class Recorder:
             self._refused,
             self._fault,
             disk_free(Path(self._writer.path)),
+            self._writer.vertices_refused,
         )
         with suppress(zmq.Again):
             self._feed.send(encode_status(status), zmq.NOBLOCK)

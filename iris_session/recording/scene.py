@@ -1,172 +1,217 @@
-"""What the Rerun viewer draws of a MuJoCo model: visible geoms as primitives and meshes, each fixed in a named frame.
+"""What the Rerun viewer draws of a scene specification: visuals as primitives and meshes, each fixed in a named frame.
 
-A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. Geoms of
-groups 0 to 2 are visible, as in MuJoCo's own viewer. Flexes, skins, height fields and SDF geoms are not drawn.
+A frame is `world` or the name of a streamed body that moves; the recording moves frames, never geometry. Where nothing
+is shared, the specification is made of the recorded model, here and not where physics runs.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, NamedTuple
 
 import msgspec
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from anchors.pose import IDENTITY_POSE, PoseTuple, compose
+from iris_session.protocol.common import Pose
+from iris_session.protocol.scene import Deformable, Geometry, SceneSpec, Visual, decode_scene
+from iris_session.protocol.scene_looks import Rgba
+from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
 from iris_session.protocol.server_messages import BodyInfo
+from iris_session.recording.journal import unpack_model
+from iris_session.recording.messages import SceneAssets
+from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
+from iris_session.scene.shapes import generated_uv, height_field, primitive
 
 WORLD: Final = "world"
-VISIBLE_GROUPS: Final = 3
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
 INFINITE_PLANE_M: Final = 10.0
 PLANE_HALF_THICKNESS_M: Final = 0.0005
+#: Textures come with the largest level within this side: each is in the file as often as it is worn.
+TEXTURE_SIDE: Final = 512
 
 BOX: Final = "box"
 ELLIPSOID: Final = "ellipsoid"
 CAPSULE: Final = "capsule"
 CYLINDER: Final = "cylinder"
 MESH: Final = "mesh"
-
-_PRIMITIVES: Final = {
-    int(mujoco.mjtGeom.mjGEOM_PLANE): BOX,
-    int(mujoco.mjtGeom.mjGEOM_BOX): BOX,
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): ELLIPSOID,
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): ELLIPSOID,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): CYLINDER,
-    int(mujoco.mjtGeom.mjGEOM_MESH): MESH,
+_FORMS: Final = {
+    GeometryKind.SPHERE: ELLIPSOID,
+    GeometryKind.ELLIPSOID: ELLIPSOID,
+    GeometryKind.CAPSULE: CAPSULE,
+    GeometryKind.CYLINDER: CYLINDER,
 }
+_WHITE: Final = (1.0, 1.0, 1.0)
+#: Any name that no file has.
+_BUFFER: Final = "recorded.mjb"
+
+Rgba8 = tuple[int, int, int, int]
+Pixels = NDArray[np.uint8]
 
 
-class Shape(msgspec.Struct, frozen=True):
-    """One geom. `p`, `q` `[w, x, y, z]`: `T_frame_geom`. `rgba`: 0 to 255.
+class Form(NamedTuple):
+    """How a visual is drawn. `size`: half sizes (box, ellipsoid), or radius twice and half length along z (capsule,
+    cylinder) [m]; unused for meshes. `tint`: to multiply its colour with, where a texture has no place."""
 
-    `size`: half sizes (box, ellipsoid), or radius and half length along z (capsule, cylinder) [m], unused for meshes.
-    `vertices` (nv, 3) float32 [m], `normals` (nv, 3), `faces` (nf, 3): meshes only.
-    """
-
-    name: str
-    body: str
-    frame: str
     kind: str
-    p: tuple[float, float, float]
-    q: tuple[float, float, float, float]
-    rgba: tuple[int, int, int, int]
-    size: tuple[float, ...] = ()
-    vertices: NDArray[np.float32] | None = None
-    normals: NDArray[np.float32] | None = None
-    faces: NDArray[np.int32] | None = None
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mesh: MeshArrays | None = None
+    uv: NDArray[np.float32] | None = None
+    texture: Pixels | None = None
+    tint: tuple[float, float, float] = _WHITE
 
 
-def load_model(mjb: bytes) -> Any:
-    """A `MjModel` from its binary form. Raises `ValueError` when MuJoCo does not take the bytes."""
-    fd, name = tempfile.mkstemp(suffix=".mjb")
+class Place(NamedTuple):
+    """`T`: of a body in the frame."""
+
+    frame: str
+    T: PoseTuple
+
+
+@contextmanager
+def opened(assets: SceneAssets, packed_model: bytes) -> Iterator[tuple[SceneSpec, AssetStore]]:
+    """Specification and store of a scene. Raises `SceneBuildError`, `OSError`, and `ValueError` for bytes that are no
+    specification or no model."""
+    if assets.root:
+        store = AssetStore(assets.root)
+        yield decode_scene(store.get(assets.scene_hash)), store
+    else:
+        with tempfile.TemporaryDirectory(prefix="iris-picture-") as folder:
+            store = AssetStore(folder)
+            yield _made_of(packed_model, store), store
+
+
+def _made_of(packed_model: bytes, store: AssetStore) -> SceneSpec:
+    import mujoco
+
+    from iris_session.scene.mujoco_scene import parse_mujoco
+
+    mjb = unpack_model(packed_model)
     try:
-        with os.fdopen(fd, "wb") as file:
-            file.write(mjb)
-        return mujoco.MjModel.from_binary_path(name)
-    finally:
-        Path(name).unlink(missing_ok=True)
+        model = mujoco.MjModel.from_binary_path(_BUFFER, assets={_BUFFER: mjb})
+    except mujoco.FatalError as error:
+        raise ValueError(str(error)) from error
+    return parse_mujoco(model, store, options=EncodeOptions(levels=False)).spec
 
 
-def shapes(model: Any, bodies: Sequence[BodyInfo]) -> list[Shape]:
-    """The visible geoms of `model`, fixed in the frames of the moving ones among `bodies`."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    frames = _frames(model, bodies)
-    names = {body.id: body.name for body in bodies}
-    out = []
-    for geom in range(model.ngeom):
-        kind = _PRIMITIVES.get(int(model.geom_type[geom]))
-        rgba = _rgba(model, geom)
-        if kind is None or rgba[3] == 0 or int(model.geom_group[geom]) >= VISIBLE_GROUPS:
-            continue
-        body = int(model.geom_bodyid[geom])
-        frame_body, frame = frames[body]
-        p, q = _pose_in(data, frame_body, geom)
-        name = mujoco.mj_id2name(model, int(mujoco.mjtObj.mjOBJ_GEOM), geom) or f"geom{geom}"
-        shape = Shape(name, names.get(body, WORLD), frame, kind, p, q, rgba, _size(model, geom))
-        if kind == MESH:
-            shape = _with_mesh(model, geom, shape)
-        out.append(shape)
-    return out
+class SceneReader:
+    """Reads what is drawn of one specification; each mesh and texture once. Raises `SceneBuildError` for what cannot
+    be read."""
+
+    def __init__(self, spec: SceneSpec, store: AssetStore, bodies: Sequence[BodyInfo]) -> None:
+        self._spec = spec
+        self._store = store
+        self._places = places(spec, bodies)
+        self._meshes: dict[tuple[int, int], MeshArrays] = {}
+        self._textures: dict[int, Pixels | None] = {}
+        self._tints: dict[int, tuple[float, float, float]] = {}
+
+    def shown(self, thing: Visual | Deformable) -> bool:
+        """Whether it is drawn at all."""
+        return thing.rgba[3] > 0 and thing.group in self._spec.groups_shown
+
+    def place(self, visual: Visual) -> tuple[str, PoseTuple]:
+        """Frame, and T_frame_visual."""
+        frame, T_frame_body = self._places[visual.body]
+        return frame, compose(T_frame_body, _tuple(visual.T_body_visual))
+
+    def form(self, visual: Visual) -> Form:
+        """Shape and surface."""
+        geometry = visual.geometry
+        texture, tint = self.surface(visual.material)
+        mesh = self._mesh(geometry)
+        if mesh is None and texture is not None:
+            mesh = primitive(_ended(geometry))
+        if mesh is None:
+            return Form(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
+        if texture is None:
+            return Form(MESH, mesh=mesh, tint=tint)
+        uv = mesh.uv
+        if uv is None:
+            uv = generated_uv(mesh.position, geometry, self._spec.materials[visual.material])
+        return Form(MESH, mesh=mesh, uv=uv, texture=texture)
+
+    def surface(self, material: int) -> tuple[Pixels | None, tuple[float, float, float]]:
+        """The 2d texture of a material, red, green, blue and perhaps alpha; else what it tints with."""
+        index = -1 if material < 0 else self._spec.materials[material].texture()
+        if index < 0:
+            return None, _WHITE
+        if index not in self._textures:
+            self._textures[index], self._tints[index] = self._texture(index)
+        return self._textures[index], self._tints[index]
+
+    def arrays(self, deformable: Deformable) -> dict[str, NDArray[Any]]:
+        """The asset of a deformable."""
+        return decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
+
+    def _mesh(self, geometry: Geometry) -> MeshArrays | None:
+        key = (geometry.mesh, geometry.hfield)
+        if key == (-1, -1):
+            return None
+        if key not in self._meshes:
+            self._meshes[key] = self._read_mesh(*key)
+        return self._meshes[key]
+
+    def _read_mesh(self, mesh: int, hfield: int) -> MeshArrays:
+        if mesh >= 0:
+            return decode_mesh(self._store.get(self._spec.meshes[mesh].levels[0].address))
+        field = self._spec.hfields[hfield]
+        return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+
+    def _texture(self, index: int) -> tuple[Pixels | None, tuple[float, float, float]]:
+        texture = self._spec.textures[index]
+        drawn = texture.kind == TextureKind.IMAGE
+        levels = [level for level in texture.levels if level.encoding != AssetEncoding.OPAQUE]
+        if not levels:
+            return None, _WHITE
+        # A cube has no form in Rerun and gives its mean colour, for which the coarsest level will do.
+        fitting = [level for level in levels if max(level.width, level.height) <= TEXTURE_SIDE] if drawn else []
+        level = (fitting or levels[-1:])[0]
+        pixels = decode_image(self._store.get(level.address), level.encoding)
+        if pixels.shape[2] < 3:
+            pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
+        if drawn:
+            return pixels, _WHITE
+        red, green, blue = (pixels[:, :, :3].reshape(-1, 3).mean(axis=0) / 255.0).tolist()
+        return None, (red, green, blue)
 
 
-def _frames(model: Any, bodies: Sequence[BodyInfo]) -> list[tuple[int, str]]:
-    """For every body of the model: the nearest moving streamed body at or above it, as (id, frame name)."""
+def places(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, Place]:
+    """For every body: the nearest moving streamed body at or above it, and where it is in that one's frame."""
     moving = {body.id: body.name for body in bodies if body.moving}
-    out: list[tuple[int, str]] = [(0, WORLD)]
-    for body in range(1, model.nbody):
-        name = moving.get(body)
-        out.append((body, name) if name is not None else out[int(model.body_parentid[body])])
-    return out
+    found: dict[int, Place] = {-1: Place(WORLD, IDENTITY_POSE)}
+    for body in spec.bodies:  # parents before their children
+        name, above = moving.get(body.id), found[body.parent]
+        if name is not None:
+            found[body.id] = Place(name, IDENTITY_POSE)
+        elif above.frame == WORLD:
+            found[body.id] = Place(WORLD, _tuple(body.T_world_body))
+        else:
+            found[body.id] = Place(above.frame, compose(above.T, _tuple(body.T_parent_body)))
+    return found
 
 
-def _pose_in(data: Any, body: int, geom: int) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """`T_body_geom` from the kinematics at hand."""
-    R_world_body = data.xmat[body].reshape(3, 3)
-    p = R_world_body.T @ (data.geom_xpos[geom] - data.xpos[body])
-    q = np.empty(4)
-    mujoco.mju_mat2Quat(q, (R_world_body.T @ data.geom_xmat[geom].reshape(3, 3)).ravel())
-    return (float(p[0]), float(p[1]), float(p[2])), (float(q[0]), float(q[1]), float(q[2]), float(q[3]))
+def colour(rgba: Rgba, tint: tuple[float, float, float] = _WHITE) -> Rgba8:
+    """As Rerun has colours: 0 to 255."""
+    r, g, b, a = (min(255, max(0, round(v * t * 255.0))) for v, t in zip(rgba, (*tint, 1.0), strict=True))
+    return r, g, b, a
 
 
-def _size(model: Any, geom: int) -> tuple[float, ...]:
-    a, b, c = (float(v) for v in model.geom_size[geom])
-    kind = int(model.geom_type[geom])
-    if kind == int(mujoco.mjtGeom.mjGEOM_PLANE):
-        return (a or INFINITE_PLANE_M, b or INFINITE_PLANE_M, PLANE_HALF_THICKNESS_M)
-    if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
-        return (a, a, a)
-    if kind in {int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)}:
-        return (a, b)
-    return (a, b, c)
+def _tuple(pose: Pose) -> PoseTuple:
+    return pose.p, pose.q
 
 
-def _rgba(model: Any, geom: int) -> tuple[int, int, int, int]:
-    """Colour of the geom: its own, times its material's; a textured material counts with its texture's mean colour."""
-    rgba = np.array(model.geom_rgba[geom], float)
-    material = int(model.geom_matid[geom])
-    if material >= 0:
-        # A geom without a colour of its own has MuJoCo's default grey, which gives way to the material.
-        if np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):
-            rgba[:] = 1.0
-        rgba = rgba * model.mat_rgba[material]
-        rgba[:3] *= _texture_mean(model, material)
-    values = [int(v) for v in np.clip(np.rint(rgba * 255.0), 0, 255)]
-    return values[0], values[1], values[2], values[3]
+def _ended(geometry: Geometry) -> Geometry:
+    """A plane without end as it is drawn."""
+    if geometry.kind != GeometryKind.PLANE:
+        return geometry
+    x, y, z = geometry.size
+    return msgspec.structs.replace(geometry, size=(x or INFINITE_PLANE_M, y or INFINITE_PLANE_M, z))
 
 
-def _texture_mean(model: Any, material: int) -> NDArray[np.float64]:
-    textures = [int(t) for t in np.atleast_1d(model.mat_texid[material]) if t >= 0]
-    if not textures:
-        return np.ones(3)
-    texture = textures[0]
-    channels = int(model.tex_nchannel[texture])
-    begin = int(model.tex_adr[texture])
-    n = int(model.tex_height[texture]) * int(model.tex_width[texture]) * channels
-    if channels < 3 or n == 0:
-        return np.ones(3)
-    texels = np.asarray(model.tex_data[begin : begin + n]).reshape(-1, channels)
-    return np.asarray(texels[:, :3].mean(axis=0) / 255.0, float)
-
-
-def _with_mesh(model: Any, geom: int, shape: Shape) -> Shape:
-    """Adds the triangles. Corners that share position and normal are one vertex, so that sharp edges stay sharp."""
-    mesh = int(model.geom_dataid[geom])
-    v0, nv = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    f0, nf = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-    n0, nn = int(model.mesh_normaladr[mesh]), int(model.mesh_normalnum[mesh])
-    faces = np.asarray(model.mesh_face[f0 : f0 + nf])
-    corners = np.stack([faces.ravel(), np.asarray(model.mesh_facenormal[f0 : f0 + nf]).ravel()], axis=1)
-    pairs, index = np.unique(corners, axis=0, return_inverse=True)
-    return msgspec.structs.replace(
-        shape,
-        vertices=np.asarray(model.mesh_vert[v0 : v0 + nv], np.float32)[pairs[:, 0]],
-        normals=np.asarray(model.mesh_normal[n0 : n0 + nn], np.float32)[pairs[:, 1]],
-        faces=np.ascontiguousarray(index.reshape(-1, 3), np.int32),
-    )
+def _half_sizes(geometry: Geometry) -> tuple[float, float, float]:
+    x, y, z = _ended(geometry).size
+    return (x, y, PLANE_HALF_THICKNESS_M) if geometry.kind == GeometryKind.PLANE else (x, y, z)

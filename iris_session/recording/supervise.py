@@ -42,6 +42,7 @@ class RecorderProcess:
         self._folder = tempfile.mkdtemp(prefix="iris-rec-", dir=None if short else "/tmp")
         self.feed_endpoint = f"ipc://{self._folder}/feed"
         self.samples_endpoint = f"ipc://{self._folder}/samples"
+        self.vertices_endpoint = f"ipc://{self._folder}/vertices"
         self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
         self._process: subprocess.Popen[bytes] | None = None
@@ -115,6 +116,7 @@ class RecorderProcess:
             self.samples_endpoint,
             self._origin_ns,
             os.getpid(),
+            self.vertices_endpoint,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
         environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}

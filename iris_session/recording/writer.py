@@ -1,11 +1,14 @@
 """Writes one part of a recording into a Rerun file: journal and raw data exactly, and a picture of the session.
 
-Moving bodies and people are rows of `/tf` (one transform per body and change, named frames as in ROS); geometry is
-static in those frames. Exact float64 poses, raw samples and the journal lie beside it as plain columns.
+Moving bodies and people are rows of `/tf` (one transform per body and change, named frames as in ROS); geometry stands
+still in those frames, vertices of what bends do not. Exact float64 poses, raw samples and the journal lie beside it as
+plain columns.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -30,24 +33,32 @@ from iris_session.recording.messages import (
     DenialRecord,
     EndMark,
     MetricRecord,
+    SceneAssets,
     SceneModel,
     StateFrame,
+    VertexFrame,
     encode_header,
     encode_scene,
 )
-from iris_session.recording.pictures import ScenePicture, entity_part
+from iris_session.recording.pictures import Moment, ScenePicture, Source, entity_part
 from iris_session.recording.rrd_stream import RrdStream
 from iris_session.recording.text import describe_denial, describe_event, describe_session
+from iris_session.streams.errors import StreamError
 
 #: Colours of participants in the order of their appearance.
 PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 #: A chunk per robot: once a second, because they can be had from `/state` again.
 LATENCIES_NS = 1_000_000_000
+#: States whose moments are known to vertices that come later: 4 s at 60 Hz.
+KNOWN_MOMENTS = 256
+#: Frames of vertices that may wait for the states that they were published with.
+WAITING_VERTICES = 256
 _encode = msgspec.msgpack.Encoder().encode
 
 
 class RrdWriter:
-    """One file. `add` and `add_sample` only collect; `flush` writes and returns when the bytes are with the system."""
+    """One file. `add`, `add_sample` and `add_vertices` only collect; `flush` writes and returns when the bytes are with
+    the system. `vertices_refused`: frames of vertices that are not in the picture."""
 
     def __init__(self, path: str | Path, recording_id: str) -> None:
         self.path = str(path)
@@ -57,6 +68,9 @@ class RrdWriter:
         self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []
+        self._vertices: deque[VertexFrame] = deque()
+        self.vertices_refused = 0
+        self._known: deque[Moment] = deque(maxlen=KNOWN_MOMENTS)  # of the newest states
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
@@ -79,7 +93,7 @@ class RrdWriter:
         self._static(paths.TRANSFORMS + "_static", root)
         self._static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if header.model:
-            self._picture.begin(header.model, header.bodies)
+            self._picture.begin(Source(header.model, header.bodies))
 
     def _use(self, bodies: tuple[BodyInfo, ...]) -> None:
         self._bodies = bodies
@@ -89,9 +103,9 @@ class RrdWriter:
 
     def add(self, batch: Batch) -> None:
         """Collects one batch of the authority. States of one flush are of one scene."""
-        if batch.scenes:
+        if batch.scenes or batch.assets:
             self.flush()
-            self._scenes(batch.scenes)
+            self._scenes(batch.scenes, batch.assets)
         pending = self._pending
         for name in ("rows", "states", "events", "denials", "metrics", "keyframes"):
             getattr(pending, name).extend(getattr(batch, name))
@@ -99,6 +113,13 @@ class RrdWriter:
     def add_sample(self, connection: int, receive_ns: int, data: bytes) -> None:
         """Collects one raw message of a client, as it came."""
         self._samples.append((connection, receive_ns, data))
+
+    def add_vertices(self, frame: VertexFrame) -> None:
+        """Collects what moved of one deformable. Of too many that wait, the oldest are given up."""
+        if len(self._vertices) >= WAITING_VERTICES:
+            self._vertices.popleft()
+            self.vertices_refused += 1
+        self._vertices.append(frame)
 
     def flush(self, timeout_s: float = 10.0) -> None:
         """Writes what was collected. Raises `WriteError`; the file is then good up to an earlier flush."""
@@ -113,6 +134,7 @@ class RrdWriter:
             self._denials(batch.denials)
             self._metrics(batch.metrics)
             self._raw_samples(samples)
+            self._bends()
             self._stream.write(timeout_s)
             if batch.keyframes:
                 self._mark()
@@ -123,6 +145,7 @@ class RrdWriter:
         """Writes the rest and the end mark, and closes the file. Raises `WriteError`."""
         self._write_latencies()
         self.flush()
+        self._picture.draw((-1, 0, 0, 0))  # without a state: it is to be seen all the same
         self._mark()
         mark = EndMark(*self._newest_row)
         self._static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
@@ -172,13 +195,17 @@ class RrdWriter:
         self._send(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
 
-    def _scenes(self, scenes: list[SceneModel]) -> None:
+    def _scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
         """Models for verification, and the picture from here on."""
-        times = [sequence(paths.STEP, [s.step for s in scenes])]
-        self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
+        if scenes:
+            times = [sequence(paths.STEP, [s.step for s in scenes])]
+            self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
         for loaded in scenes:
             self._use(loaded.bodies)
-            self._picture.change(loaded.model, loaded.bodies, (loaded.step, *self._clock, loaded.session_time))
+            source = Source(loaded.model, loaded.bodies, *assets[-1:])
+            self._picture.change(source, (loaded.step, *self._clock, loaded.session_time))
+        for patch in () if scenes else assets:
+            self._picture.patch(patch, (patch.step, *self._clock, patch.session_time))
 
     def _keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
@@ -192,6 +219,8 @@ class RrdWriter:
             return
         poses = np.stack([np.frombuffer(s.poses, np.float64).reshape(-1, 7) for s in states])
         moments = [(s.step, s.tick, round(s.sim_time * 1e9), s.session_time) for s in states]
+        step, _, sim_ns, session_ns = moments[0]
+        self._picture.draw((step, 0, min(0, sim_ns), session_ns))  # a reset begins ticks and simulated time again
         times = np.array(moments, np.int64).T
         columns = [
             matrix("poses", poses.reshape(len(states), -1)),
@@ -204,6 +233,30 @@ class RrdWriter:
         if poses.shape[1] == len(self._bodies):  # a new recorder gets what was on its way of the scene before, too
             self._transforms(states, poses, times)
         self._clock = moments[-1][1:3]
+        self._known.extend(moments)
+
+    def _bends(self) -> None:
+        """Vertices whose states are in the file. What is of another scene than is drawn now is refused."""
+        times = [moment[3] for moment in self._known]
+        rows: dict[str, list[tuple[Moment, Any]]] = {}
+        while self._vertices and times and self._vertices[0].session_time <= times[-1]:
+            frame = self._vertices.popleft()
+            at = bisect_right(times, frame.session_time) - 1
+            bending = self._picture.bending.get(frame.stream)
+            if bending is None:  # hidden, or said to be not drawn
+                continue
+            try:
+                late = at < 0 or frame.session_time < self._picture.since_ns
+                vertices = None if late else bending.taken(frame.frame)
+            except StreamError:
+                late, vertices = True, None
+            self.vertices_refused += late
+            if vertices is not None:
+                rows.setdefault(frame.stream, []).append(((*self._known[at][:3], frame.session_time), vertices))
+        for stream, taken in rows.items():
+            bending = self._picture.bending[stream]
+            moments = np.array([moment for moment, _ in taken], np.int64).T
+            self._send(bending.entity, _times(moments), [*bending.columns([row for _, row in taken])])
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
         """For the plots: from the capture of a sample to the step that it entered, per robot. Written once a second."""

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from iris_session.protocol.client_messages import Marker
+from iris_session.protocol.names import BudgetClass
 from iris_session.recording import (
     CLOSED,
     OPEN,
@@ -122,7 +123,11 @@ class SessionProcesses:
                 self.recorder = RecorderProcess(self.recording, self._origin_ns)
                 self.recorder.start()
                 self.supervisor = RecorderSupervisor(self.recorder)
-                self.feed = RecorderFeed(self.recorder.feed_endpoint, self.recording.parent)
+                self.feed = RecorderFeed(
+                    self.recorder.feed_endpoint,
+                    self.recording.parent,
+                    vertices_endpoint=self.recorder.vertices_endpoint,
+                )
                 self._in_use = RecordingLock(self.recording, shared=True)
                 self._keeper = NoteKeeper(note_path(self.recording))
             self.name = others.free_name(self._config.name, self.session_id)
@@ -210,7 +215,8 @@ class SessionProcesses:
         chain = b""
         if self.feed is not None:
             header = self._header(core, OPEN if user_owned else CLOSED)
-            self.feed.header(header)
+            shown = self.scenes.newest
+            self.feed.header(header, *(() if shown is None else (shown.info.asset_root, shown.info.scene_hash)))
             chain = header_root(header)
         keyframe_ns = round(self._config.keyframe_s * 1e9)
         past = self._past
@@ -219,9 +225,16 @@ class SessionProcesses:
         stepper = Stepper(core, front, feed, clock, self.state_period_ns, keyframe_ns, chain, after)
         stepper.on_scene.append(self._scene_changed)
         bending = flexes(core.world) if self._bending is None else self._bending
-        self._deformables = DeformableStreams(bending, self.front.publish_media)
+        self._deformables = DeformableStreams(bending, self._publish_vertices)
         stepper.beside_state.append(self._deformables.send)
         return stepper
+
+    def _publish_vertices(
+        self, stream: str, frames: dict[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+    ) -> bool:
+        if self.feed is not None:
+            self.feed.vertices(stream, frames[BudgetClass.FULL], capture_ns)
+        return self.front is not None and self.front.publish_media(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _scene_changed(self, scene: NextScene | NextPatch) -> None:
         if self.front is not None:
@@ -303,6 +316,9 @@ class SessionProcesses:
         if self.feed is not None:
             drops["journal_rows"] = self.feed.stats.dropped_rows
             drops["recorded_items"] = self.feed.stats.dropped_items
+            said = self.feed.stats.recorder
+            refused = 0 if said is None else said.vertices_refused
+            drops["recorded_vertices"] = self.feed.stats.dropped_vertices + refused
         drops |= self._trouble
         return {reason: count for reason, count in drops.items() if count}
 

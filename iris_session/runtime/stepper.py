@@ -59,7 +59,16 @@ class RecorderPort(Protocol):
     @property
     def wants_keyframe(self) -> bool: ...
 
-    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None: ...
+    def scene(
+        self,
+        model_hash: str,
+        packed_model: bytes,
+        bodies: tuple[BodyInfo, ...],
+        root: str = "",
+        scene_hash: str = "",
+    ) -> None: ...
+
+    def patch(self, root: str, scene_hash: str) -> None: ...
 
     def row(self, row: JournalRow) -> None: ...
 
@@ -240,14 +249,17 @@ class Stepper:
         """Hands the next scene or patch to everybody who must have it before the step."""
         scene = self._scenes.popleft()
         messages: Sequence[EntryMessage]
+        assets = scene.shown.info.asset_root, scene.shown.info.scene_hash
         if isinstance(scene, NextPatch):
+            if self.recorder is not None:
+                self.recorder.patch(*assets)
             messages = (scene.message,)
         else:
             self.core.prepared[scene.model_hash] = scene.plant
             bodies = scene.plant.world.bodies
             self._poses = np.zeros((len(bodies), 7))
             if self.recorder is not None:
-                self.recorder.scene(scene.model_hash, scene.packed_model, bodies)
+                self.recorder.scene(scene.model_hash, scene.packed_model, bodies, *assets)
             messages = (scene.plant.scene, GetSnapshot())  # the ledger gets the new leases as a client would
         for follow in self.on_scene:
             follow(scene)

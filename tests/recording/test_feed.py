@@ -14,7 +14,7 @@ from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision, Outgoing
 from iris_session.recording import Keyframe, RecorderFeed, make_row
-from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS
+from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, VERTEX_FRAMES
 from iris_session.recording.journal import check_keyframe
 from iris_session.recording.messages import (
     BATCH,
@@ -22,12 +22,15 @@ from iris_session.recording.messages import (
     HEADER,
     Batch,
     RecorderStatus,
+    SceneAssets,
     SceneModel,
     decode_batch,
     decode_header,
-    decode_scene,
+    decode_vertices,
     encode_status,
 )
+from iris_session.streams.deformable import DeformableEncoder
+from iris_session.streams.deformable_topology import DeformableTopology
 from tests.recording.support import make_header
 
 ROOT = b"r" * 16
@@ -236,16 +239,75 @@ def test_a_scene_comes_before_its_row_and_again_with_the_header_for_a_new_record
     recorder, *_ = played
     recorder.say(feed, 1, -1, -1)
     recorder.take(1)
-    assert recorder.more == []
+    assert [decode_batch(frame) for frame in recorder.more] == [Batch(assets=[SceneAssets()])]
     steps(feed, 0, 3)
     bodies = (BodyInfo(1, "cup", moving=True),)
-    feed.scene("hash", b"packed", bodies)
+    feed.scene("hash", b"packed", bodies, "/store", "ab")
     steps(feed, 3, BATCH_ROWS)
     before, scene, after = (decode_batch(body) for _, _, body in recorder.take(3))
     assert [row.step for row in before.rows] == [0, 1, 2]
     assert (scene.scenes, scene.rows) == ([SceneModel(2, 4_000_000, "hash", b"packed", bodies)], [])
+    assert scene.assets == [SceneAssets(2, 4_000_000, "/store", "ab")]
     assert after.rows[0].step == 3
     recorder.say(feed, 1, 3, 2)
     recorder.say(feed, 2, -1, -1)  # everything is in the file of the one before
     recorder.take(1)
-    assert [decode_scene(frame) for frame in recorder.more] == scene.scenes
+    known = [Batch(scenes=scene.scenes, assets=scene.assets)]
+    assert [decode_batch(frame) for frame in recorder.more] == known
+    feed.patch("/store", "cd")
+    (patch,) = (decode_batch(body) for _, _, body in recorder.take(1))
+    assert (patch.scenes, patch.assets) == ([], [SceneAssets(12, 24_000_000, "/store", "cd")])
+    recorder.say(feed, 3, -1, -1)
+    recorder.take(1)
+    assert [decode_batch(frame) for frame in recorder.more] == [Batch(scenes=scene.scenes, assets=patch.assets)]
+
+
+@pytest.fixture
+def square() -> bytes:
+    """A frame of four vertices."""
+    encoder = DeformableEncoder(DeformableTopology(4, faces=[(0, 1, 3), (0, 3, 2)]))
+    frames = encoder.encode(np.arange(12.0).reshape(4, 3))
+    assert frames is not None
+    return frames["full"]
+
+
+def test_vertices_go_by_a_socket_of_their_own_at_their_rate(played, tmp_path: Path, square: bytes) -> None:  # type: ignore[no-untyped-def]
+    recorder, endpoint, folder = played
+    vertices = recorder.context.socket(zmq.PULL)
+    vertices.bind(f"ipc://{tmp_path}/v")
+    feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/v")
+    feed.header(make_header())
+    for now_ns in (0, 20_000_000, 50_000_000):
+        feed.vertices("flex-0", square, now_ns)
+    feed.vertices("flex-1", square, 50_000_000)
+    taken = []
+    while len(taken) < 3:
+        assert vertices.poll(5000)
+        taken.append(decode_vertices(vertices.recv()))
+    assert [(frame.stream, frame.session_time, frame.frame) for frame in taken] == [
+        ("flex-0", 0, square),
+        ("flex-0", 50_000_000, square),
+        ("flex-1", 50_000_000, square),
+    ]
+    recorder.say(feed, 1, -1, -1)  # has seen none of them
+    feed.vertices("flex-0", square, 60_000_000)
+    assert vertices.poll(5000)
+    vertices.close()
+    feed.close(0.0)
+
+
+def test_vertices_that_nobody_takes_are_dropped_and_counted_and_the_journal_goes_on(
+    played,  # type: ignore[no-untyped-def]
+    tmp_path: Path,
+    square: bytes,
+) -> None:
+    recorder, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, vertices_endpoint=f"ipc://{tmp_path}/nobody")
+    feed.header(make_header())
+    for i in range(VERTEX_FRAMES + 7):
+        feed.vertices("flex-0", square, i * 50_000_000)
+    assert (feed.stats.dropped_vertices, feed.stats.window_bytes) == (7, 0)
+    recorder.say(feed, 1, -1, -1)
+    steps(feed, 0, BATCH_ROWS)
+    assert numbers(decode_batch(recorder.take(2)[1][2])) == list(range(BATCH_ROWS))
+    feed.close(0.0)

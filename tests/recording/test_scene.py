@@ -1,18 +1,24 @@
-"""Geometry for the viewer: every visible geom stands where MuJoCo has it, in its frame."""
+"""Geometry for the viewer: every visible shape stands where MuJoCo has it, in its frame, as the specification says."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
 
 from anchors.pose import apply, compose
+from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import scene, unpack_model
+from iris_session.recording import pack_model, scene
+from iris_session.recording.messages import SceneAssets
+from iris_session.scene import AssetMissingError, AssetStore
+from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, make_header
+from tests.scene.models import LOOKS, SHAPES, every_shape
 
 DATA = Path(os.environ.get("IRIS_DATA", Path(__file__).parents[3] / "shared"))
 
@@ -24,66 +30,114 @@ def infos(model: mujoco.MjModel) -> list[BodyInfo]:
     ]
 
 
-def test_the_small_scene() -> None:
-    model = mujoco.MjModel.from_xml_string(XML)
-    shapes = {shape.name: shape for shape in scene.shapes(model, infos(model))}
-    assert set(shapes) == {"floor", "g/ball", "geom2", "geom3", "geom4", "geom5"}, "group 3 is not visible"
-    assert (shapes["floor"].frame, shapes["floor"].kind, shapes["floor"].size[:2]) == ("world", scene.BOX, (10.0, 10.0))
-    assert shapes["floor"].rgba == (204, 204, 204, 255)
-    assert shapes["g/ball"].frame == "ball"
-    assert (shapes["geom2"].kind, shapes["geom2"].frame) == (scene.CAPSULE, "arm/link 1")
-    assert shapes["geom4"].frame == "tip"
+def test_the_small_scene(tmp_path: Path) -> None:
+    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
+    visuals = {visual.id: visual for visual in spec.visuals if reader.shown(visual)}
+    assert sorted(visuals) == [0, 1, 2, 3, 4, 5], "group 3 is not visible"
+    forms = {i: reader.form(visual) for i, visual in visuals.items()}
+    assert [forms[i].kind for i in sorted(forms)] == [
+        scene.BOX,
+        scene.ELLIPSOID,
+        scene.CAPSULE,
+        scene.CYLINDER,
+        scene.BOX,
+        scene.ELLIPSOID,
+    ]
+    assert forms[0].size == (10.0, 10.0, scene.PLANE_HALF_THICKNESS_M)
+    assert forms[2].size == pytest.approx((0.04, 0.04, 0.2))
+    assert scene.colour(visuals[0].rgba) == (204, 204, 204, 255)
+    assert [reader.place(visuals[i])[0] for i in range(6)] == ["world", "ball", *["arm/link 1"] * 2, *["tip"] * 2]
 
 
-def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame() -> None:
-    model = mujoco.MjModel.from_xml_string(XML)
-    bodies = [body for body in infos(model) if body.name != "tip"]
-    tip = next(shape for shape in scene.shapes(model, bodies) if shape.name == "geom4")
-    assert tip.frame == "arm/link 1"
-    assert tip.p == pytest.approx((0.4, 0.0, 0.0))
+def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Path) -> None:
+    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name != "tip"])
+    frame, (p, _) = reader.place(spec.visuals[4])
+    assert frame == "arm/link 1"
+    assert p == pytest.approx((0.4, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("path", ["aloha/scene.xml", "kuka_iiwa_14/scene.xml"])
-def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str) -> None:
-    """In another configuration than the one that the shapes were made in; meshes vertex by vertex."""
-    model = mujoco.MjModel.from_xml_path(str(DATA / "models" / path))
-    shapes = scene.shapes(model, infos(model))
+def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: Path) -> None:
+    """In another configuration than the one that the specification was made in."""
+    model, store = mujoco.MjModel.from_xml_path(str(DATA / "models" / path)), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
     data = mujoco.MjData(model)
     data.qpos[:] += np.linspace(-0.3, 0.3, model.nq)
     mujoco.mj_kinematics(model, data)
-    visible = [
-        g
-        for g in range(model.ngeom)
-        if model.geom_group[g] < 3 and scene._rgba(model, g)[3] and int(model.geom_type[g]) in scene._PRIMITIVES
-    ]
-    assert len(visible) == len(shapes) > 10
-    for geom, shape in zip(visible, shapes, strict=True):
-        body = 0 if shape.frame == "world" else mujoco.mj_name2id(model, 1, shape.frame)
-        body = int(shape.frame.removeprefix("body")) if body < 0 else body
-        T_world_frame = (tuple(data.xpos[body]), tuple(data.xquat[body]))
-        T_world_geom = compose(T_world_frame, (shape.p, shape.q))
-        assert T_world_geom[0] == pytest.approx(data.geom_xpos[geom], abs=1e-9)
-        R = data.geom_xmat[geom].reshape(3, 3)
-        point = R @ (0.1, 0.2, 0.3) + data.geom_xpos[geom]
-        assert apply(T_world_geom, (0.1, 0.2, 0.3)) == pytest.approx(point, abs=1e-9)
-        if shape.kind == scene.MESH:
-            assert shape.vertices.shape == shape.normals.shape
-            assert shape.faces.min() == 0
-            assert shape.faces.max() == len(shape.vertices) - 1
+    visible = [visual for visual in spec.visuals if reader.shown(visual)]
+    assert len(visible) > 10
+    bodies = {body.name: body.id for body in infos(model)}
+    for visual in visible:
+        frame, T_frame_visual = reader.place(visual)
+        body = bodies.get(frame, 0)
+        T_world_visual = compose((tuple(data.xpos[body]), tuple(data.xquat[body])), T_frame_visual)
+        R = data.geom_xmat[visual.id].reshape(3, 3)
+        point = R @ (0.1, 0.2, 0.3) + data.geom_xpos[visual.id]
+        assert apply(T_world_visual, (0.1, 0.2, 0.3)) == pytest.approx(point, abs=1e-9)
 
 
-def test_mesh_corners_keep_position_and_winding() -> None:
-    model = mujoco.MjModel.from_xml_path(str(DATA / "models/kuka_iiwa_14/scene.xml"))
-    shape = next(s for s in scene.shapes(model, infos(model)) if s.kind == scene.MESH)
-    triangles = shape.vertices[shape.faces]
-    geometric = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    mean = shape.normals[shape.faces].mean(axis=1)
-    agree = (geometric * mean).sum(axis=1)
-    assert (agree > 0).mean() > 0.98, "normals point out of the counter-clockwise side"
+def test_every_shape_wears_its_texture_or_the_mean_of_it(tmp_path: Path) -> None:
+    model, store = every_shape(), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
+    looks = set()
+    for visual in spec.visuals:
+        look = spec.materials[visual.material].name if visual.material >= 0 else ""
+        looks.add((visual.geometry.kind, visual.geometry.mesh, look))
+        form = reader.form(visual)
+        if look in ("image", "uniform"):
+            assert form.kind == scene.MESH
+            assert form.texture is not None
+            assert form.texture.shape[2] in (3, 4)
+            assert max(form.texture.shape) <= scene.TEXTURE_SIDE
+            assert form.mesh is not None
+            assert form.uv is not None
+            assert form.uv.shape == (form.mesh.vertices, 2)
+            assert np.ptp(form.uv, axis=0).min() > 0
+        else:
+            assert (form.texture, form.uv) == (None, None)
+            assert (form.tint == (1.0, 1.0, 1.0)) == (look not in ("cube", "cubeuniform"))
+        is_mesh = visual.geometry.mesh >= 0 or visual.geometry.hfield >= 0
+        assert (form.kind == scene.MESH) == (is_mesh or look in ("image", "uniform"))
+    assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
-def test_a_model_survives_the_header() -> None:
-    model = scene.load_model(unpack_model(make_header().model))
-    assert model.nbody == mujoco.MjModel.from_xml_string(XML).nbody
-    with pytest.raises(ValueError):
-        scene.load_model(b"no model")
+def test_a_shape_that_nobody_knows_is_a_box_of_its_size(tmp_path: Path) -> None:
+    model, store = mujoco.MjModel.from_xml_string(XML), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
+    geometry = msgspec.structs.replace(spec.visuals[4].geometry, kind="superquadric", size=(0.1, 0.2, 0.3))
+    form = reader.form(msgspec.structs.replace(spec.visuals[4], geometry=geometry))
+    assert (form.kind, form.size) == (scene.BOX, (0.1, 0.2, 0.3))
+
+
+def test_the_specification_is_read_where_it_lies_and_made_where_there_is_none(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(XML)
+    store = AssetStore(tmp_path)
+    parsed = parse_mujoco(model, store, name="shared")
+    with scene.opened(SceneAssets(0, 0, str(tmp_path), parsed.scene_hash), b"") as (spec, _):
+        assert spec.name == "shared"
+    with scene.opened(SceneAssets(), make_header().model) as (spec, private):
+        assert [visual.T_body_visual for visual in spec.visuals] == [v.T_body_visual for v in parsed.spec.visuals]
+        assert isinstance(spec, SceneSpec)
+        folder = private.root
+        assert folder.exists()
+    assert not folder.exists(), "nothing stays behind"
+
+
+@pytest.mark.parametrize(
+    ("assets", "model", "error"),
+    [
+        (True, b"", AssetMissingError),
+        (False, pack_model(b"no model"), ValueError),
+    ],
+)
+def test_what_cannot_be_read_is_said(tmp_path: Path, assets: bool, model: bytes, error: type[Exception]) -> None:
+    missing = SceneAssets(0, 0, str(tmp_path), "0" * 64) if assets else SceneAssets()
+    with pytest.raises(error), scene.opened(missing, model):
+        pass

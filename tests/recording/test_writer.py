@@ -14,12 +14,18 @@ import pytest
 from anchors.pose import apply
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.protocol.common import Applied, Denial, Pose
+from iris_session.protocol.scene import Geometry, SceneSpec, Visual, encode_scene
+from iris_session.protocol.scene_patch import AddVisual, PatchOp, RemoveVisual, SetVisual, patched
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
 from iris_session.recording import Recording, SessionHeader, pack_model, scene
-from iris_session.recording.messages import Batch, DenialRecord, SceneModel, StateFrame
+from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame
 from iris_session.recording.pictures import drawing
+from iris_session.recording.scene import Form
 from iris_session.recording.writer import RrdWriter
-from tests.recording.support import make_header
+from iris_session.scene import AssetStore
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.recording.support import XML, make_header
+from tests.scene.models import every_shape
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
 
@@ -73,24 +79,35 @@ def test_transforms_are_the_poses_of_moving_bodies_when_they_change(tmp_path: Pa
     assert column(root, "Transform3D:child_frame") == [["world"]]
 
 
-def test_the_scene_is_static_in_the_frames_that_move(tmp_path: Path) -> None:
+def test_the_scene_stands_still_in_the_frames_that_move(tmp_path: Path) -> None:
+    path = tmp_path / "w.rrd"
+    writer = RrdWriter(path, "id")
+    header = make_header()
+    writer.header(header)
+    writer.add(Batch(states=[frame(5, np.zeros((len(header.bodies), 7)))]))
+    writer.close()
+    found = read(path)
+    ball = found["/scene/1/ball/g\\/ball"]
+    assert column(ball, "CoordinateFrame:frame") == [["ball"]]
+    assert column(ball, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
+    assert column(ball, "step") == [5], "from the first state on, and once"
+    assert column(ball, "tick") == [0], "which begins again with a reset"
+    assert column(found["/scene/1/arm\\/link\\ 1/visual_2"], "Capsules3D:lengths") == [[pytest.approx(0.4)]]
+    assert not any("post" in entity for entity in found), "group 3 is not visible"
+    assert "small" in column(found["/session"], "TextDocument:text")[0][0]
+
+
+def test_a_scene_without_a_state_is_drawn_too(tmp_path: Path) -> None:
     path = tmp_path / "w.rrd"
     writer = RrdWriter(path, "id")
     writer.header(make_header())
     writer.close()
-    found = read(path)
-    ball = found["/scene/ball/g\\/ball"][0]
-    assert column([ball], "CoordinateFrame:frame") == [["ball"]]
-    assert column([ball], "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
-    assert "step" not in ball.schema.names, "static"
-    assert found["/scene/arm\\/link\\ 1/geom2"][0].column("Capsules3D:lengths").to_pylist() == [[pytest.approx(0.4)]]
-    assert "small" in column(found["/session"], "TextDocument:text")[0][0]
+    assert column(read(path)["/scene/1/ball/g\\/ball"], "step") == [-1]
 
 
 def test_capsules_begin_at_one_end_in_rerun_and_are_centred_in_mujoco() -> None:
     q = (0.8, 0.2, -0.4, 0.4)
-    shape = scene.Shape("c", "b", "b", scene.CAPSULE, (1.0, 2.0, 3.0), q, (1, 2, 3, 4), (0.1, 0.25))
-    poses = drawing(shape)[1]
+    poses = drawing(Form(scene.CAPSULE, (0.1, 0.1, 0.25)), (1, 2, 3, 4), "b", ((1.0, 2.0, 3.0), q))[1]
     start = tuple(poses.translations.as_arrow_array().to_pylist()[0])
     end = apply((start, q), (0.0, 0.0, 0.5))
     assert [(a + b) / 2 for a, b in zip(start, end, strict=True)] == pytest.approx((1.0, 2.0, 3.0))
@@ -187,10 +204,9 @@ def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp
     writer.add(Batch(scenes=[cup], states=[frame(16, second)]))
     writer.close()
     found = read(path)
-    assert column(found["/scene/ball/g\\/ball"], "InstancePoses3D:translations")[-1] == [], "no longer at all times"
-    was = found["/scene/1/ball/g\\/ball"][0]
-    assert column([was], "step") == [-1]
-    assert column([was], "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
+    was = found["/scene/1/ball/g\\/ball"]
+    assert column(was, "step") == [0]
+    assert column(was, "Ellipsoids3D:half_sizes") == [[[pytest.approx(0.1)] * 3]]
     assert column(found["/scene/1"], "step") == [8]
     assert column(found["/scene/1"], "Clear:is_recursive") == [[True]]
     box = found["/scene/2/cup/g"][0]
@@ -218,6 +234,112 @@ def test_states_of_the_scene_before_may_come_after_another_scene(tmp_path: Path)
     writer.close()
     with Recording.open(path, warn=False) as recording:
         assert [len(state.poses) for state in recording.states()] == [len(before), len(before), 1]
+
+
+def shared(store: AssetStore, model: mujoco.MjModel, **changes: Any) -> tuple[SceneSpec, SceneAssets]:
+    """The specification of a model in a store, and where it lies."""
+    spec = msgspec.structs.replace(parse_mujoco(model, store).spec, **changes)
+    return spec, SceneAssets(-1, 0, str(store.root), store.put(encode_scene(spec)))
+
+
+def begun(path: Path, assets: SceneAssets) -> tuple[RrdWriter, Any]:
+    """A file of the small session, and one state of it at step 0."""
+    writer, header = RrdWriter(path, "id"), make_header()
+    writer.header(header)
+    writer.add(Batch(assets=[assets]))
+    poses = np.zeros((len(header.bodies), 7))
+    writer.add(Batch(states=[frame(0, poses)]))
+    return writer, poses
+
+
+def test_what_is_shared_is_drawn_and_not_the_model(tmp_path: Path) -> None:
+    """As of a world without shapes of its own, whose owner says what it looks like."""
+    store = AssetStore(tmp_path / "assets")
+    post = Visual(
+        7, 4, "post", Pose((0.0, 0.0, 0.5), IDENTITY_Q), 0, Geometry("box", (0.1, 0.1, 0.5)), -1, (1, 0, 0, 1)
+    )
+    twins = tuple(msgspec.structs.replace(post, id=i, name="twin", body=1) for i in (8, 9))
+    _, assets = shared(store, mujoco.MjModel.from_xml_string(XML), visuals=(post, *twins))
+    writer, _ = begun(tmp_path / "w.rrd", assets)
+    writer.close()
+    found = {entity: batches for entity, batches in read(tmp_path / "w.rrd").items() if entity.startswith("/scene")}
+    assert sorted(found) == ["/scene/1/ball/twin", "/scene/1/ball/twin\\ \\(2\\)", "/scene/1/post/post"]
+    assert column(found["/scene/1/post/post"], "CoordinateFrame:frame") == [["world"]]
+    assert column(found["/scene/1/post/post"], "InstancePoses3D:translations") == [[[1.0, 1.0, 0.5]]]
+    assert column(found["/scene/1/post/post"], "Boxes3D:colors") == [[0xFF0000FF]]
+
+
+def test_a_patch_changes_the_picture_from_its_moment_on(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path / "assets")
+    spec, assets = shared(store, mujoco.MjModel.from_xml_string(XML))
+    writer, poses = begun(tmp_path / "w.rrd", assets)
+    arrow = Visual(
+        50, 1, "arrow", Pose((0.0, 0.0, 0.2), IDENTITY_Q), 0, Geometry("cylinder", (0.01, 0.01, 0.1)), -1, (0, 1, 0, 1)
+    )
+    moved = Pose((0.5, 0.0, 0.0), IDENTITY_Q)
+    steps: list[list[PatchOp]] = [
+        [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0)), AddVisual(arrow), SetVisual(4, T_body_visual=moved)],
+        [SetVisual(1, rgba=(1.0, 0.0, 0.0, 0.0)), RemoveVisual(50), SetVisual(6, group=0)],
+        [SetVisual(1, rgba=(0.0, 0.0, 1.0, 1.0))],
+    ]
+    for i, ops in enumerate(steps, 1):
+        spec = patched(spec, ops)
+        address = store.put(encode_scene(spec))
+        writer.add(Batch(assets=[SceneAssets(10 * i, 100 * i, str(store.root), address)]))
+        writer.add(Batch(states=[frame(10 * i, poses)]))
+    writer.close()
+    found = read(tmp_path / "w.rrd")
+    ball = found["/scene/1/ball/g\\/ball"]
+
+    def told(entity: str, name: str) -> list[tuple[int, Any]]:
+        batches = [batch for batch in found[entity] if name in batch.schema.names]
+        pairs = zip(column(batches, "step"), column(batches, name), strict=True)
+        return [(step, value) for step, value in pairs if value is not None]
+
+    assert [step for step, _ in told("/scene/1/ball/g\\/ball", "Ellipsoids3D:half_sizes")] == [0], "the form once"
+    assert column(ball, "step") == [0, 10, 20, 30]
+    assert told("/scene/1/ball/g\\/ball", "Ellipsoids3D:colors")[1:] == [
+        (10, [0xFF0000FF]),
+        (20, [0xFF000000]),
+        (30, [0x0000FFFF]),
+    ]
+    hidden = told("/scene/1/ball/g\\/ball", "InstancePoses3D:scales")
+    assert hidden == [(20, [[0.0, 0.0, 0.0]])]
+    shown = told("/scene/1/ball/g\\/ball", "InstancePoses3D:translations")
+    assert [step for step, _ in shown] == [0, 20, 30], "a pose without a scale has its full size again"
+    assert told("/scene/1/tip/visual_4", "InstancePoses3D:translations")[-1] == (10, [[0.5, 0.0, 0.0]])
+    assert told("/scene/1/ball/arrow", "Cylinders3D:lengths") == [(10, [pytest.approx(0.2)])]
+    assert [step for step, _ in told("/scene/1/ball/arrow", "Clear:is_recursive")] == [20]
+    assert [step for step, _ in told("/scene/1/post/visual_6", "Boxes3D:half_sizes")] == [20], "hidden until then"
+
+
+def test_a_patch_before_the_first_state_is_how_the_scene_begins(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path / "assets")
+    spec, assets = shared(store, mujoco.MjModel.from_xml_string(XML))
+    address = store.put(encode_scene(patched(spec, [SetVisual(1, rgba=(1.0, 0.0, 0.0, 1.0))])))
+    writer = RrdWriter(tmp_path / "w.rrd", "id")
+    writer.header(make_header())
+    writer.add(Batch(assets=[assets]))
+    writer.add(Batch(assets=[SceneAssets(3, 9, str(store.root), address)]))
+    writer.close()
+    assert column(read(tmp_path / "w.rrd")["/scene/1/ball/g\\/ball"], "Ellipsoids3D:colors") == [[0xFF0000FF]]
+
+
+def test_assets_that_are_gone_are_said_and_everything_else_is_written(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path / "assets")
+    spec, assets = shared(store, every_shape())
+    gone = spec.meshes[0].levels[0].address
+    store.path(gone).unlink()
+    writer, _ = begun(tmp_path / "w.rrd", assets)
+    writer.close()
+    found = read(tmp_path / "w.rrd")
+    (text,) = column(found["/events/recorder"], "TextLog:text")
+    assert "more cannot be drawn" in text[0]
+    assert gone in text[0]
+    drawn = sum(entity.startswith("/scene") for entity in found)
+    whole = sum(visual.rgba[3] > 0 and visual.group < 3 for visual in spec.visuals)
+    lost = sum(visual.geometry.mesh == 0 for visual in spec.visuals)
+    assert (drawn, lost > 5) == (whole - lost, True)
 
 
 def test_a_model_that_was_changed_is_not_used(tmp_path: Path) -> None:

@@ -57,11 +57,23 @@ class Recorder:
         self.states = 0
         self.metrics: list[tuple[str, float]] = []
         self.scenes: list[tuple[int, str]] = []  # rows before it, hash
+        self.drawn: list[tuple[str, str]] = []
 
-    def scene(self, model_hash: str, packed_model: bytes, bodies: tuple[BodyInfo, ...]) -> None:
+    def scene(
+        self,
+        model_hash: str,
+        packed_model: bytes,
+        bodies: tuple[BodyInfo, ...],
+        root: str = "",
+        scene_hash: str = "",
+    ) -> None:
         assert packed_model
         assert bodies
         self.scenes.append((len(self.rows), model_hash))
+        self.drawn.append((root, scene_hash))
+
+    def patch(self, root: str, scene_hash: str) -> None:
+        self.drawn.append((root, scene_hash))
 
     def row(self, row: JournalRow) -> None:
         self.rows.append(row)

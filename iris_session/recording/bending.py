@@ -1,0 +1,140 @@
+"""What bends, in the picture of a recording: topology once, then the vertices whenever frames of them came.
+
+Cloths and surfaces of soft bodies are meshes, ropes are lines. The viewer shades by normals and computes none, so these
+are in the file beside the positions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from iris_session.protocol.scene import Deformable
+from iris_session.recording.scene import WORLD, Pixels, Rgba8, colour
+from iris_session.scene import AssetError
+from iris_session.scene.arrays import require
+from iris_session.scene.simplify import unit
+from iris_session.streams.deformable import DeformableDecoder
+from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.streams.errors import StreamError
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+class Bending:
+    """One deformable. `arrays`: of its asset. Raises `AssetError` for another one's."""
+
+    def __init__(
+        self,
+        entity: str,
+        deformable: Deformable,
+        arrays: dict[str, NDArray[Any]],
+        texture: Pixels | None = None,
+        tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> None:
+        corners = 2 if deformable.dim == 1 else 3
+        self.entity = entity
+        self._rest: Floats = require(arrays, "position", "f4", (None, 3))
+        elements = require(arrays, "elements", "u2 u4", (None, corners)).astype(np.int64)
+        if elements.size and int(elements.max()) >= len(self._rest):
+            raise AssetError(f"deformable {deformable.name!r} has no vertex {int(elements.max())}")
+        try:
+            topology = DeformableTopology.from_bytes(require(arrays, "plan", "u1", (None,)).tobytes())
+        except StreamError as error:
+            raise AssetError(f"deformable {deformable.name!r}: {error}") from error
+        if topology.n_vertices != len(self._rest):
+            raise AssetError(f"deformable {deformable.name!r}: {topology.n_vertices} vertices are streamed")
+        self._decoder = DeformableDecoder(topology)
+        self._last: Floats = self._rest
+        self._radius, self._colour = deformable.radius, colour(deformable.rgba, tint)
+        self._form: _Lines | _Surface
+        if deformable.dim == 1:
+            self._form = _Lines(elements)
+        else:
+            uv = require(arrays, "uv", "f4", (len(elements), 3, 2)) if "uv" in arrays else None
+            self._form = _Surface(elements, uv, texture)
+
+    def drawing(self) -> list[Any]:
+        """Rerun components that stay, and the vertices at rest."""
+        return [rr.CoordinateFrame(WORLD), self._form.drawing(self._rest, self._colour, self._radius)]
+
+    def taken(self, frame: bytes) -> Floats | None:
+        """Vertices of a frame of the stream; `None`: the same as before. Raises `StreamError`."""
+        vertices = np.nan_to_num(self._decoder.decode(frame), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        if np.array_equal(vertices, self._last):
+            return None
+        self._last = vertices
+        return vertices
+
+    def columns(self, rows: list[Floats]) -> Any:
+        """What `taken` gave, a row each, as `rerun.send_columns` has it."""
+        return self._form.columns(np.stack(rows))
+
+
+class _Lines:
+    """A rope: a line for every edge."""
+
+    def __init__(self, edges: Ints) -> None:
+        self._edges = edges
+
+    def drawing(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
+        return rr.LineStrips3D(strips=rest[self._edges], radii=[radius], colors=[rgba])
+
+    def columns(self, vertices: Floats) -> Any:
+        strips = vertices[:, self._edges]
+        columns = rr.LineStrips3D.columns(strips=strips.reshape(-1, 2, 3))
+        return columns.partition([len(self._edges)] * len(vertices))
+
+
+class _Surface:
+    """Triangles. Where texture coordinates differ between triangles, a vertex is there several times."""
+
+    def __init__(self, triangles: Ints, uv: Floats | None, texture: Pixels | None) -> None:
+        self._uv, self._texture = uv, texture
+        self._source: Ints | None = None
+        self._corners = triangles
+        self._drawn = triangles
+        flat = triangles.ravel()
+        self._order = np.argsort(flat, kind="stable")
+        self._owners, self._starts = np.unique(flat[self._order], return_index=True)
+        if uv is not None and texture is not None:
+            rows = np.column_stack([flat, uv.reshape(-1, 2)])
+            different, index = np.unique(rows, axis=0, return_inverse=True)
+            self._source, self._drawn = different[:, 0].astype(np.int64), index.reshape(-1, 3)
+            self._uv = different[:, 1:].astype(np.float32)
+
+    def drawing(self, rest: Floats, rgba: Rgba8, radius: float) -> Any:
+        position, normal = self._arranged(rest)
+        worn = {} if self._source is None else {"vertex_texcoords": self._uv, "albedo_texture": self._texture}
+        return rr.Mesh3D(
+            vertex_positions=position,
+            vertex_normals=normal,
+            triangle_indices=self._drawn.astype(np.uint32),
+            albedo_factor=rgba,
+            **worn,
+        )
+
+    def columns(self, vertices: Floats) -> Any:
+        both = [self._arranged(row) for row in vertices]
+        columns = rr.Mesh3D.columns(
+            vertex_positions=np.concatenate([position for position, _ in both]),
+            vertex_normals=np.concatenate([normal for _, normal in both]),
+        )
+        return columns.partition([len(position) for position, _ in both])
+
+    def _arranged(self, vertices: Floats) -> tuple[Floats, Floats]:
+        normal = self._normals(vertices)
+        return (vertices, normal) if self._source is None else (vertices[self._source], normal[self._source])
+
+    def _normals(self, vertices: Floats) -> Floats:
+        """The mean of the triangles at a vertex, by their area."""
+        normal = np.zeros_like(vertices)
+        if len(self._starts):
+            a, b, c = (vertices[self._corners[:, k]] for k in range(3))
+            across = np.cross(b - a, c - a)
+            normal[self._owners] = np.add.reduceat(across[self._order // 3], self._starts, axis=0)
+        return unit(normal).astype(np.float32)

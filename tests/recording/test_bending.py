@@ -1,0 +1,197 @@
+"""What bends is in the file: topology once, vertices when they moved, on the timelines of the states they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.protocol.server_messages import BodyInfo
+from iris_session.recording import SessionHeader, pack_model
+from iris_session.recording.bending import Bending
+from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
+from iris_session.recording.writer import WAITING_VERTICES, RrdWriter
+from iris_session.scene import AssetError, AssetStore, decode_arrays
+from iris_session.scene.mujoco_deformables import flex_mesh
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.streams.deformable import DeformableEncoder
+from tests.recording.test_writer import column, frame, read
+from tests.scene.models import flexes
+
+BOUND_M = 0.0005
+CLOTH, ROPE, SOFT = "/scene/1/world/cloth", "/scene/1/world/rope", "/scene/1/world/soft"
+
+
+class World:
+    """The model with flexes, a file of a session with it, and encoders as the session has them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.model = flexes()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+        self.meshes = [flex_mesh(self.model, i) for i in range(self.model.nflex)]
+        self.encoders = [DeformableEncoder(mesh.topology, BOUND_M) for mesh in self.meshes]
+        self.store = AssetStore(folder / "assets")
+        self.parsed = parse_mujoco(self.model, self.store)
+        self.assets = SceneAssets(-1, 0, str(self.store.root), self.parsed.scene_hash)
+        self.packed = pack_model(bytes(model_bytes(self.model)))
+        self.path, self.closed = folder / "w.rrd", False
+        self.writer = RrdWriter(self.path, "id")
+        self.writer.header(SessionHeader("s", "n", "closed", 2_000_000, model=self.packed))
+        self.writer.add(Batch(assets=[self.assets]))
+
+    def vertices(self, index: int) -> np.ndarray:
+        return self.data.flexvert_xpos[self.meshes[index].vertices].copy()
+
+    def publish(self, step: int, index: int, vertices: np.ndarray) -> None:
+        """Vertices, and then the state they belong to: by two sockets, either may be first."""
+        self.encoders[index].reset()
+        frames = self.encoders[index].encode(vertices)
+        assert frames is not None
+        self.writer.add_vertices(VertexFrame(f"flex-{index}", step * 2_000_000 + 7, frames["full"]))
+
+    def state(self, step: int) -> None:
+        self.writer.add(Batch(states=[frame(step, np.zeros((0, 7)))]))
+
+    def read(self) -> dict[str, list[Any]]:
+        self.writer.close()
+        self.closed = True
+        return read(self.path)
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    world = World(tmp_path)
+    yield world
+    if not world.closed:
+        world.writer.close()
+
+
+def told(batches: list[Any], name: str) -> dict[int, Any]:
+    """By step."""
+    found = [batch for batch in batches if name in batch.schema.names]
+    return dict(zip(column(found, "step"), column(found, name), strict=True))
+
+
+def test_topology_comes_once_and_vertices_as_they_move(world: World) -> None:
+    first, then = world.vertices(0), world.vertices(0) + np.array((0.01, 0.02, 0.03))
+    world.state(0)
+    world.publish(8, 0, first)
+    world.publish(16, 0, then)
+    world.state(8)
+    world.writer.flush()
+    world.state(16)
+    world.publish(16, 0, then)  # came late, and says nothing new
+    found = world.read()
+    cloth = found[CLOTH]
+    assert list(told(cloth, "Mesh3D:triangle_indices")) == [0]
+    positions = told(cloth, "Mesh3D:vertex_positions")
+    assert sorted(positions) == [0, 8, 16]
+    for step, expected in ((0, first), (8, first), (16, then)):
+        assert np.linalg.norm(np.array(positions[step]) - expected, axis=1).max() <= BOUND_M + 1e-6
+    assert sorted(column(cloth, "tick")) == [0, 9, 17], "the ticks of the states"
+    times = [value.value for batch in cloth for value in batch.column("session_time")]
+    assert sorted(times) == [7, 16_000_007, 32_000_007]
+    assert told(cloth, "CoordinateFrame:frame") == {0: ["world"]}
+    assert world.writer.vertices_refused == 0
+
+
+def test_normals_are_those_of_the_triangles_around(world: World) -> None:
+    """A tilted plane has one normal everywhere."""
+    vertices = world.vertices(0)
+    vertices[:, 2] = 1.0 + 0.5 * vertices[:, 0]
+    world.state(0)
+    world.publish(8, 0, vertices)
+    world.state(8)
+    normals = np.array(told(world.read()[CLOTH], "Mesh3D:vertex_normals")[8])
+    expected = np.array((-0.5, 0.0, 1.0)) / np.sqrt(1.25)
+    assert normals == pytest.approx(np.broadcast_to(expected, normals.shape), abs=0.02)
+
+
+def test_ropes_are_lines_and_soft_bodies_surfaces(world: World) -> None:
+    rope, soft = world.vertices(1) + 0.5, world.vertices(2) + 0.5
+    world.state(0)
+    world.publish(8, 1, rope)
+    world.publish(8, 2, soft)
+    world.state(8)
+    found = world.read()
+    strips = np.array(told(found[ROPE], "LineStrips3D:strips")[8])
+    assert strips == pytest.approx(rope[world.meshes[1].elements], abs=BOUND_M)
+    assert told(found[ROPE], "LineStrips3D:radii")[0] == [pytest.approx(0.02)]
+    indices = np.array(told(found[SOFT], "Mesh3D:triangle_indices")[0])
+    moved = np.array(told(found[SOFT], "Mesh3D:vertex_positions")[8])
+    assert moved[indices] == pytest.approx(soft[world.meshes[2].elements], abs=BOUND_M)
+
+
+def test_without_a_specification_the_models_flexes_bend(world: World) -> None:
+    world.writer.add(Batch(assets=[SceneAssets()]))
+    world.state(0)
+    world.publish(8, 0, world.vertices(0) + 0.1)
+    world.state(8)
+    assert sorted(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == [0, 8]
+
+
+def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
+    """They may come late; and what is for the next scene waits for its states."""
+    vertices = world.vertices(0)
+    world.state(0)
+    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    scene = SceneModel(8, 16_000_007, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))
+    world.publish(16, 0, vertices + 0.2)
+    world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
+    world.publish(0, 0, vertices + 0.1)
+    world.state(16)
+    found = world.read()
+    assert list(told(found[CLOTH], "Mesh3D:vertex_positions")) == [0]
+    assert sorted(told(found[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")) == [8, 16]
+    assert world.writer.vertices_refused == 1
+
+
+def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
+    world.state(0)
+    for data in (b"", b"\1" * 200):
+        world.writer.add_vertices(VertexFrame("flex-0", 7, data))
+    world.writer.add_vertices(VertexFrame("nobody", 7, b""))
+    frames = world.encoders[1].encode(world.vertices(1))
+    assert frames is not None
+    world.writer.add_vertices(VertexFrame("flex-0", 7, frames["full"]))  # of another mesh
+    found = world.read()
+    assert len(told(found[CLOTH], "Mesh3D:vertex_positions")) == 1
+    assert world.writer.vertices_refused == 3
+
+
+def test_vertices_whose_states_do_not_come_are_bounded(world: World) -> None:
+    world.state(0)
+    for i in range(WAITING_VERTICES + 5):
+        world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
+    assert world.writer.vertices_refused == 5
+    assert len(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == 1
+
+
+def test_vertices_are_split_where_texture_coordinates_differ(world: World) -> None:
+    (cloth, *_) = world.parsed.spec.deformables
+    arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
+    n = len(arrays["elements"])
+    arrays["uv"] = np.tile(np.array([(0, 0), (1, 0), (0, 1)], np.float32), (n, 1, 1))
+    bending = Bending("e", cloth, arrays, np.zeros((2, 2, 3), np.uint8))
+    mesh = bending.drawing()[1]
+    indices = np.array(mesh.triangle_indices.as_arrow_array().to_pylist())
+    uv = np.array(mesh.vertex_texcoords.as_arrow_array().to_pylist())
+    assert np.array_equal(uv[indices], arrays["uv"])
+    positions = np.array(mesh.vertex_positions.as_arrow_array().to_pylist())
+    assert positions[indices] == pytest.approx(arrays["position"][arrays["elements"]])
+    assert len(uv) > cloth.vertices
+
+
+@pytest.mark.parametrize("name", ["elements", "position", "plan"])
+def test_an_asset_that_is_damaged_is_an_error_of_assets(world: World, name: str) -> None:
+    (cloth, *_) = world.parsed.spec.deformables
+    arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
+    arrays[name] = arrays[name][:-1] if name == "position" else np.full_like(arrays[name], 200)
+    with pytest.raises(AssetError):
+        Bending("e", cloth, arrays)
