@@ -10,6 +10,7 @@ import logging
 import os
 import secrets
 import stat
+import tempfile
 from pathlib import Path
 
 import msgspec
@@ -49,16 +50,20 @@ class Identity:
         """
         path = Path(path)
         try:
-            data = path.read_bytes()
-            mode = stat.S_IMODE(path.stat().st_mode)
+            with path.open("rb") as file:
+                status = os.fstat(file.fileno())  # of the very file that is read
+                data = file.read()
         except FileNotFoundError:
             identity = cls(secrets.token_bytes(SECRET_BYTES), path=path)
             identity._write()
             return identity
         except OSError as error:
             raise IdentityError(f"identity file {path} cannot be read: {error.strerror}") from error
+        mode = stat.S_IMODE(status.st_mode)
         if os.name == "posix" and mode & 0o077:
             raise IdentityError(f"identity file {path} may be read by others (mode {mode:o}): run chmod 600 on it")
+        if os.name == "posix" and status.st_uid != os.geteuid():
+            raise IdentityError(f"identity file {path} belongs to another user: give a file of your own")
         try:
             stored = msgspec.json.decode(data, type=_Stored)
         except msgspec.MsgspecError as error:
@@ -92,16 +97,18 @@ class Identity:
         return True
 
     def _write(self) -> None:
-        """Replaces the file in one step, so that a kill leaves the old or the new one."""
+        """Replaces the file in one step, so that a kill leaves the old or the new one. Written is a file that was not
+        there before, under a name that nobody could guess: else somebody may hold it open, or it may lead elsewhere."""
         assert self.path is not None
-        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            handle, temporary = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)  # mode 0600
             try:
-                os.write(handle, msgspec.json.encode(_Stored(self.secret, self._resume_token)))
-            finally:
-                os.close(handle)
-            temporary.replace(self.path)
+                with os.fdopen(handle, "wb") as file:
+                    file.write(msgspec.json.encode(_Stored(self.secret, self._resume_token)))
+                os.replace(temporary, self.path)
+            except BaseException:
+                Path(temporary).unlink(missing_ok=True)
+                raise
         except OSError as error:
             raise IdentityError(f"identity file {self.path} cannot be written: {error.strerror}") from error

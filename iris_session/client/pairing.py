@@ -22,6 +22,9 @@ from iris_session.protocol.security import Pair, Paired
 from iris_session.protocol.server_messages import ProtocolFault, Refused
 
 ANSWER_S: Final = 5.0
+#: Where many pair at once, or the session's disk is slow, it says so: the same is asked again, for so long.
+AGAIN_S: Final = 1.0
+PATIENCE_S: Final = 20.0
 MAX_NAME: Final = 64  # as `protocol.common.Name`
 MAX_ANSWER_BYTES: Final = 65_536
 
@@ -57,8 +60,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
         asking.curve_publickey = own.public.encode()
         asking.curve_secretkey = own.secret.encode()
         asking.connect(f"tcp://{address}")
-        asking.send(encode_client(envelope(request)))
-        answer = yield from _answer(asking, address)
+        answer = yield from _ask(asking, encode_client(envelope(request)), address)
     finally:
         asking.close()
     if not pairing.same(answer.proof, pairing.server_proof(secret, server_public, own.raw_public)):
@@ -67,6 +69,21 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
             "nothing was stored; look at the address and the code"
         )
     return answer
+
+
+def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
+    """Asks until there is an answer that stays. Raises as `pair_key`."""
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        asking.send(request)
+        try:
+            return (yield from _answer(asking, address))
+        except RefusedError as refused:
+            if refused.code != RefusalCode.RATE or time.monotonic() > until:
+                raise
+        again = time.monotonic() + AGAIN_S
+        while time.monotonic() < again:
+            yield
 
 
 def _answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None, Paired]:

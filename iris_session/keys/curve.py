@@ -5,18 +5,21 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import zmq
-from zmq.auth import load_certificate
 from zmq.utils import z85
 
 from iris_session.keys.files import KeysError, PrivateFolder, check_private
 
 Z85_CHARACTERS: Final = 40
+MAX_CERTIFICATE_BYTES: Final = 65_536
+#: A line of a certificate (ZeroMQ's ZPL): the name of a key, and the key in quotes.
+_KEY: Final = re.compile(r"""^[ \t]*(public|secret)-key[ \t]*=[ \t]*["']?([^"'\s]*)["']?[ \t\r]*$""", re.MULTILINE)
 _CERTIFICATE: Final = """#   ZeroMQ CURVE certificate of iris-session.
 #   The secret key is what proves who you are: never pass it on.
 
@@ -77,10 +80,9 @@ def load_public(path: str | os.PathLike[str]) -> str:
 def load_secret(path: str | os.PathLike[str]) -> KeyPair:
     """The key pair in a `*.key_secret` certificate that its owner alone can read. Raises `KeysError`."""
     path = Path(path)
-    public, secret = _load(path)
+    public, secret = _load(path, private=True)
     if not secret:
         raise KeysError(f"{path} holds no secret key: give the *.key_secret file")
-    check_private(path, path.stat(), f"chmod 600 {path}")
     try:
         raw_key(secret)
     except KeysError:  # whose text would show it
@@ -100,25 +102,29 @@ def pair_in(folder: PrivateFolder, name: str) -> KeyPair:
     return load_secret(folder.path / name)
 
 
-def _load(path: Path) -> tuple[str, str]:
-    """Both keys of a certificate, the secret one empty when it has none."""
+def _load(path: Path, *, private: bool = False) -> tuple[str, str]:
+    """Both keys of a certificate, the secret one empty when it has none. `private`: it must be this user's alone if it
+    has one; what is checked is the file that is read, whatever has its name by then."""
     try:
-        public, secret = load_certificate(path)
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            text = file.read(MAX_CERTIFICATE_BYTES).decode(errors="replace")
     except PermissionError:
         raise KeysError(f"key file {path} cannot be read: its owner has to run chmod u+r {path}") from None
     except OSError as error:
-        reason = error.strerror or "No such file or directory"  # pyzmq tells of a missing file without a number
-        raise KeysError(f"key file {path} cannot be used: {reason}") from None
-    except (ValueError, IndexError):  # IndexError: a key without "="
+        raise KeysError(f"key file {path} cannot be used: {error.strerror}") from None
+    keys = dict(reversed(_KEY.findall(text)))  # of two the first
+    public, secret = keys.get("public", ""), keys.get("secret", "")
+    if private and secret:
+        check_private(path, status, f"chmod 600 {path}")
+    if not public:
         text = 'a ZeroMQ certificate with a line public-key = "..."'
-        raise KeysError(f"key file {path} cannot be used: it should be {text}") from None
+        raise KeysError(f"key file {path} cannot be used: it should be {text}")
     try:
-        text = public.decode()
-        raw_key(text)
-    except (UnicodeDecodeError, KeysError):
-        wrong = _wrong(public.decode(errors="replace"))
-        raise KeysError(f"key file {path} cannot be used: its public key {wrong}") from None
-    return text, secret.decode(errors="replace") if secret else ""
+        raw_key(public)
+    except KeysError:
+        raise KeysError(f"key file {path} cannot be used: its public key {_wrong(public)}") from None
+    return public, secret
 
 
 def _wrong(key: str) -> str:

@@ -88,6 +88,8 @@ class PrivateFolder:
                         file.flush()
                         os.fsync(file.fileno())
                 os.replace(temporary, path)
+                if durable:
+                    _settle(self.path)
             except BaseException:
                 Path(temporary).unlink(missing_ok=True)
                 raise
@@ -121,6 +123,19 @@ class PrivateFolder:
             yield
         finally:
             lock.release()
+
+
+def _settle(folder: Path) -> None:
+    """Makes the names in a folder durable: else a power cut may bring back the file that was replaced."""
+    if os.name != "posix":
+        return  # folders cannot be opened there
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # some network folders take none; the file itself is written
+        pass
+    finally:
+        os.close(descriptor)
 
 
 def check_private(path: Path, status: os.stat_result, remedy: str) -> None:

@@ -22,12 +22,15 @@ MAX_CODES: Final = 32
 ATTEMPTS: Final = 5
 #: How long the end of a code can be asked for.
 MEMORY_S: Final = 3600.0
+#: By how much clocks may be put back while a code can still be used.
+CLOCK_SLACK_S: Final = 60.0
 
 
 class JoinCode(msgspec.Struct, frozen=True):
     """One code. `secret`: what it is stretched to, empty when it is used or void. `server`: fingerprint of the
     session's key that it is bound to. `name`: under which the key is listed, empty for the name that the client gives.
-    `expires`: UTC seconds. `paired`: the key that it let in.
+    `expires`, `made`: UTC seconds; a code is not good before it was made, so a clock that is put back by hours gives it
+    no more time. `paired`: the key that it let in.
     """
 
     id: str
@@ -38,10 +41,11 @@ class JoinCode(msgspec.Struct, frozen=True):
     name: str = ""
     attempts_left: int = ATTEMPTS
     paired: AllowedKey | None = None
+    made: float = 0.0
 
     def open(self, now_s: float) -> bool:
         """Whether it can still be used."""
-        return bool(self.secret) and self.attempts_left > 0 and now_s < self.expires
+        return bool(self.secret) and self.attempts_left > 0 and self.made - CLOCK_SLACK_S <= now_s < self.expires
 
 
 class Attempt(msgspec.Struct, frozen=True):
@@ -84,6 +88,7 @@ class JoinCodes:
             now_s + 60.0 * minutes,
             checked_roles(roles),
             name,
+            made=now_s,
         )
         with self._folder.locked():
             codes = self._remembered(now_s)
@@ -102,10 +107,11 @@ class JoinCodes:
         """What has become of a code, `None` when it is forgotten."""
         return next((one for one in self.read() if one.id == code_id), None)
 
-    def expiries(self, server: str) -> tuple[float, ...]:
-        """Until when [UTC s] codes can be used with the session whose key has the fingerprint `server`."""
+    def of(self, server: str) -> tuple[JoinCode, ...]:
+        """Those that are not used, void or expired, for the session whose key has the fingerprint `server`."""
         now_s = time.time()
-        return tuple(one.expires for one in self.read() if one.server == server and one.open(now_s))
+        ours = (one for one in self.read() if one.server == server)
+        return tuple(one for one in ours if one.secret and one.attempts_left > 0 and now_s < one.expires)
 
     def attempt(
         self,

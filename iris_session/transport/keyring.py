@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -141,31 +142,51 @@ def open_keyring(config: FrontConfig, drops: Drops) -> Keyring:
         folder = Path(config.curve_clients_dir)
         if not folder.is_dir():
             raise FrontError(f"{folder} is no folder with the public keys (*.key) of the clients that may connect")
-        return Keyring(key, None, lambda: _certificates(folder), lambda: _folder_signature(folder), drops)
+        certificates = _Certificates(folder, drops)
+        return Keyring(key, None, certificates.read, certificates.signature, drops)
     except KeysError as error:
         raise FrontError(str(error)) from error
 
 
-def _certificates(folder: Path) -> dict[str, AllowedKey]:
-    """Every `*.key` certificate in a folder. A damaged one lets nobody in, and keeps nobody else out."""
-    keys = {}
-    try:
-        paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise KeysError(f"{folder} cannot be read: {error.strerror}") from error
-    for path in paths:
+class _Certificates:
+    """The public keys of a folder. A certificate that is damaged lets nobody in, keeps nobody else out, and is said."""
+
+    def __init__(self, folder: Path, drops: Drops) -> None:
+        self._folder = folder
+        self._drops = drops
+        self._said: dict[str, str] = {}  # what is wrong, by file
+
+    def read(self) -> dict[str, AllowedKey]:
+        """Every `*.key` certificate by fingerprint. Raises `KeysError`."""
+        keys: dict[str, AllowedKey] = {}
+        wrong: dict[str, str] = {}
         try:
-            public = load_public(path)
-        except KeysError:
-            continue
-        keys[fingerprint(raw_key(public))] = AllowedKey(path.stem[:64], public)
-    return keys
+            paths = sorted(path for path in self._folder.iterdir() if path.suffix == ".key")
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise KeysError(f"{self._folder} cannot be read: {error.strerror}") from error
+        for path in paths:
+            try:
+                public = load_public(path)
+            except KeysError as error:
+                wrong[path.name] = str(error)
+                continue
+            keys[fingerprint(raw_key(public))] = AllowedKey(path.stem[:64], public)
+        for name, text in wrong.items():
+            if self._said.get(name) != text:
+                self._drops.count("certificate_unusable")
+                print(f"iris-session: nobody is let in by {name}: {text}", file=sys.stderr, flush=True)
+        self._said = wrong
+        return keys
+
+    def signature(self) -> object:
+        """Changes with every file that comes, goes or is written, whatever time it is given."""
+        try:
+            return tuple(sorted((entry.name, *_identity(entry.stat())) for entry in self._folder.iterdir()))
+        except OSError:
+            return None
 
 
-def _folder_signature(folder: Path) -> object:
-    try:
-        return tuple(sorted((entry.name, entry.stat().st_mtime_ns) for entry in folder.iterdir()))
-    except OSError:
-        return None
+def _identity(status: os.stat_result) -> tuple[int, ...]:
+    return status.st_ino, status.st_ctime_ns, status.st_size, status.st_mode

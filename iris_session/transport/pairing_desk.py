@@ -13,7 +13,7 @@ from collections import deque
 from functools import partial
 from typing import Final, NamedTuple
 
-from iris_session.keys import KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
+from iris_session.keys import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
 from iris_session.keys.join_codes import Attempt
 from iris_session.protocol import pairing
 from iris_session.protocol.names import AuditKind, RefusalCode
@@ -71,7 +71,7 @@ class PairingDesk:
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
         self._unread, self._again_s = "", 0.0  # why the codes could not be read, and when they are read again
-        self._codes: tuple[float, ...] = ()  # when the open codes expire, UTC seconds
+        self._codes: tuple[JoinCode, ...] = ()
 
     @property
     def open(self) -> bool:
@@ -83,12 +83,13 @@ class PairingDesk:
         if signature != self._signature or (self._unread and time.monotonic() >= self._again_s):
             self._signature = signature
             self._read_codes(home, key)
-        return any(time.time() < expires for expires in self._codes)
+        now_s = time.time()
+        return any(code.open(now_s) for code in self._codes)
 
     def _read_codes(self, home: KeyHome, key: KeyPair) -> None:
         """What cannot be read now is read again a second later, and complained about once."""
         try:
-            self._codes, unread = home.codes.expiries(key.fingerprint), ""
+            self._codes, unread = home.codes.of(key.fingerprint), ""
         except KeysError as error:
             self._codes, unread = (), str(error)
             self._again_s = time.monotonic() + AGAIN_S
@@ -149,7 +150,7 @@ class PairingDesk:
     def _sort(self, one: _Waiting, now_ns: int) -> None:
         """Lets an attempt wait on, or ends it: much may have happened since it came."""
         if now_ns - one.since_ns > PATIENCE_NS:
-            self._refuse(one.route, BUSY, "try again")
+            self._put_off(one.route)
         elif fingerprint(raw_key(one.key)) in self._keyring.revoking:
             self._refuse(one.route, REVOKED, "ask for another join code")
         elif self._exhausted(one.address, now_ns):
@@ -162,7 +163,7 @@ class PairingDesk:
         if isinstance(outcome, Attempt):
             self._answer(waiting, outcome, key, now_ns)
         elif isinstance(outcome, KeysBusyError):
-            self._refuse(waiting.route, BUSY, "try again")
+            self._put_off(waiting.route)
         else:
             self._say(outcome)
             advice = "whoever runs the session finds more at its terminal"
@@ -193,6 +194,11 @@ class PairingDesk:
         self._audit.note(kind, now_ns, subject=mark, name=waiting.pair.name, address=waiting.address)
         advice = "run `iris-session pair` anew" if not attempt.open_codes else "look at the code again"
         self._refuse(waiting.route, "this join code is wrong, used or expired", advice)
+
+    def _put_off(self, route: Route) -> None:
+        """Nothing was tried: the same may be asked again, and no attempt is lost."""
+        self._drops.count("pair_busy")
+        self._outbox.send_to_route(route, Refused(RefusalCode.RATE, BUSY, "try again"))
 
     def _refuse(self, route: Route, message: str, advice: str) -> None:
         self._drops.count("pair_refused")

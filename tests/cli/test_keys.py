@@ -142,7 +142,7 @@ def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
 
     monkeypatch.setattr("iris_session.cli.pair.time.sleep", interrupt)
     assert main(["pair"]) == 130
-    assert lab.codes.expiries(lab.server_key().fingerprint) == ()
+    assert lab.codes.of(lab.server_key().fingerprint) == ()
 
 
 def test_pair_waits_on_while_another_process_holds_the_list(
@@ -180,7 +180,7 @@ def test_pair_waits_and_says_who_came(
         if full:
             monkeypatch.setattr(lab.clients, "replace", full_disk)
         server = lab.server_key()
-        while not lab.codes.expiries(server.fingerprint):
+        while not lab.codes.of(server.fingerprint):
             time.sleep(0.01)
         (made,) = [one for one in lab.codes.read() if one.secret]
         proof = pairing.client_proof(made.secret, server.raw_public, ann.raw_public)

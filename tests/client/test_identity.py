@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from pathlib import Path
 
@@ -31,6 +32,28 @@ def test_file_readable_by_others_is_refused(tmp_path: Path) -> None:
     Identity.from_file(path)
     path.chmod(0o644)
     with pytest.raises(IdentityError, match="chmod 600"):
+        Identity.from_file(path)
+
+
+def test_nobody_can_prepare_the_file_that_the_secret_is_written_to(tmp_path: Path) -> None:
+    """In a folder that others may write to: a file that is there already, or a link to one of theirs."""
+    path, theirs = tmp_path / "identity.json", tmp_path / "theirs"
+    theirs.write_text("")
+    theirs.chmod(0o666)
+    for name in (f"{path.name}.{os.getpid()}.tmp", f"{path.name}.tmp"):
+        (tmp_path / name).symlink_to(theirs)
+    identity = Identity.from_file(path)
+    identity.resume_token = b"token"
+    assert theirs.read_text() == ""
+    assert stat.S_IMODE(path.lstat().st_mode) == 0o600
+    assert not path.is_symlink()
+
+
+def test_a_file_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "identity.json"
+    Identity.from_file(path)
+    monkeypatch.setattr(os, "geteuid", lambda: path.stat().st_uid + 1)
+    with pytest.raises(IdentityError, match="belongs to another user"):
         Identity.from_file(path)
 
 

@@ -14,17 +14,19 @@ import zmq
 
 from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client import meeting as meeting_module
+from iris_session.client import pairing as pairing_module
 from iris_session.client.address import Address, pairing_uri
 from iris_session.client.discovery import ask_introduction
 from iris_session.client.joining import wanted
 from iris_session.client.meeting import settle
 from iris_session.client.pairing import pair_key
 from iris_session.keys import KeyHome, KeyPair
+from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Paired
-from iris_session.protocol.server_messages import ServerEnvelope
+from iris_session.protocol.server_messages import Refused, ServerEnvelope
 from tests.client.harness import LiveSession
 
 
@@ -200,6 +202,35 @@ def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
     with pytest.raises(TrustError, match="does not know the join code"):
         deque(steps, maxlen=0)
     thread.join()
+    context.destroy(linger=0)
+
+
+def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a class puts on its headsets: nobody has to type the code again."""
+    monkeypatch.setattr(pairing_module, "AGAIN_S", 0.01)
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
+    server, own, code = KeyPair.new(), KeyPair.new(), "7KQ2-M4XD-9PTR"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    session = context.socket(zmq.ROUTER)
+    session.curve_server = True
+    session.curve_publickey, session.curve_secretkey = server.public.encode(), server.secret.encode()
+    port = session.bind_to_random_port("tcp://127.0.0.1")
+    proof = pairing.server_proof(pairing.stretch(code, server.raw_public), server.raw_public, own.raw_public)
+    busy, yes = Refused(RefusalCode.RATE, "many pair at once", "try again in a second"), Paired(proof)
+    asked: list[bytes] = []
+
+    def answer() -> None:
+        for said in (busy, busy, yes):
+            route, request = session.recv_multipart()
+            asked.append(request)
+            session.send_multipart([route, encode_server(ServerEnvelope(1, 0, said))])
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    deque(pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
+    thread.join()
+    assert len(asked) == 3
+    assert len(set(asked)) == 1
     context.destroy(linger=0)
 
 

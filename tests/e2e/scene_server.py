@@ -21,17 +21,17 @@ from iris_session.protocol.scene_patch import AddVisual, SetVisual
 RED = (1.0, 0.0, 0.0, 1.0)
 
 
-def with_timestep(n_arms: int, timestep: float) -> mujoco.MjModel:
+def with_timestep(timestep: float, n_arms: int, objects: int = 0) -> mujoco.MjModel:
     """The first scene of the session has 2 ms."""
-    spec = n_arms_scene(n_arms)
+    spec = n_arms_scene(n_arms, objects=objects)
     spec.option.timestep = timestep
     return spec.compile()
 
 
 SCENES: dict[str, Callable[[], Any]] = {
-    "table": lambda: n_arms_scene(2, objects=3).compile(),
-    "three": lambda: with_timestep(3, 0.001),
-    "slow": lambda: with_timestep(2, 0.25),
+    "table": lambda: with_timestep(0.001, 2, 3),
+    "three": lambda: with_timestep(0.004, 3),
+    "slow": lambda: with_timestep(0.25, 2),
     "missing": lambda: "no/such/scene.xml",
 }
 

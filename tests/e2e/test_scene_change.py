@@ -53,6 +53,7 @@ def in_epoch(stage: Stage, epoch: int) -> None:
 
 def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     ann, bob = stage.join("ann"), stage.join("bob")
+    assert {client.tick_period_ns for client in stage.clients} == {2_000_000}
     ann.acquire(["left"])
     bob.acquire(["right"])
     hand = stage.hand(ann, "left")
@@ -74,7 +75,7 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     hand.velocity = (0.0, 0.05, 0.0)
     stage.run(lambda: distance(hand.tip[0], still) > 0.02, "she drives on")
 
-    assert {client.tick_period_ns for client in stage.clients} == {2_000_000}
+    assert {client.tick_period_ns for client in stage.clients} == {1_000_000}
     order(stage, "slow", "ConfigError: the model has a timestep of 0.25 s")
     order(stage, "missing", "does not exist")
     hand.sending = False  # her robot is about to be gone
@@ -86,12 +87,12 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     for client in stage.clients:
         state = client.state
         assert state is not None
-        assert client.tick_period_ns == client.mirror.tick_period_ns == 1_000_000
-        assert state.header.sim_time == pytest.approx(1e-3 * state.header.tick)
+        assert client.tick_period_ns == client.mirror.tick_period_ns == 4_000_000
+        assert state.header.sim_time == pytest.approx(4e-3 * state.header.tick)
     welcome = late.connection.welcome
     assert welcome is not None
-    assert welcome.tick_period_ns == 1_000_000
-    stage.run(lambda: late.status().tick_period_ns == 1_000_000, "reports tell it, a second later")
+    assert welcome.tick_period_ns == 4_000_000
+    stage.run(lambda: late.status().tick_period_ns == 4_000_000, "reports tell it, a second later")
     stage.run(lambda: len({c.mirror.event_seq for c in stage.clients}) == 1, "all know the same")
     assert len({c.mirror.mirror_hash() for c in stage.clients}) == 1
     assert not ann.mirror.leases["arm1"].holder
@@ -105,7 +106,7 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     in_epoch(stage, 3)
     assert len(stage.clients[0].mirror.bodies) == len(late.mirror.bodies)
     told = [client.connection.welcome for client in stage.clients]
-    assert [w.tick_period_ns for w in told if w is not None] == [1_000_000] * 3, "the new front knows"
+    assert [w.tick_period_ns for w in told if w is not None] == [4_000_000] * 3, "the new front knows"
     report = stage.server.finish()
     assert (report["ok"], report["unverified_steps"]) == (True, 0)
     with Recording.open(stage.server.recording) as recording:
@@ -145,7 +146,7 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
         stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
         stage.engage(hand)
         assert ann.mirror.leases["arm3"].holder == ann.participant_id
-        assert ann.tick_period_ns == 1_000_000
+        assert ann.tick_period_ns == 4_000_000
         assert resumed.finish()["ok"]
     finally:
         end_all([resumed])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from iris_session.keys import (
     KeyPair,
     KeysBusyError,
     KeysError,
-    curve,
     load_public,
     load_secret,
 )
@@ -81,12 +81,39 @@ def test_a_key_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
 
 
 def test_a_key_file_without_permission_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def closed(path: Path) -> None:
+    def closed(path: Path, *_mode: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))  # root may read everything, so a file cannot show it
 
-    monkeypatch.setattr(curve, "load_certificate", closed)
+    path = certificate(tmp_path, public=PAIR.public)
+    monkeypatch.setattr(Path, "open", closed)
     with pytest.raises(KeysError, match=r"cannot be read: its owner has to run chmod u\+r"):
-        load_public(certificate(tmp_path, public=PAIR.public))
+        load_public(path)
+
+
+def test_the_file_that_is_checked_is_the_one_that_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may write to the folder of a key file must not get a key of theirs in by swapping files."""
+    private = certificate(tmp_path, public=PAIR.public, secret=PAIR.secret).rename(tmp_path / "private")
+    path = certificate(tmp_path, public=OTHER.public, secret=OTHER.secret)
+    path.chmod(0o644)
+    plain = Path.stat
+
+    def swapped(self: Path, **options: bool) -> os.stat_result:
+        if private.name in os.listdir(tmp_path):
+            os.replace(private, path)
+        return plain(self, **options)
+
+    monkeypatch.setattr(Path, "stat", swapped)
+    with pytest.raises(KeysError, match="can be used by other users"):
+        load_secret(path)
+
+
+def test_what_surrounds_the_keys_in_a_certificate_does_not_matter(tmp_path: Path) -> None:
+    path = tmp_path / "ann.key"
+    path.write_bytes(
+        b'#   public-key = "in a comment"\r\nmetadata\r\n    name = "\xff"\r\ncurve\r\n'
+        + f"\tpublic-key='{PAIR.public}'\r\n    public-key = \"{OTHER.public}\"\r\n".encode()
+    )
+    assert load_public(path) == PAIR.public
 
 
 @pytest.fixture

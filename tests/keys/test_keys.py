@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 import time
@@ -147,8 +148,8 @@ def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> 
     text = (home.path / "join_codes.json").read_text()
     assert code not in text
     assert code.replace("-", "") not in text
-    assert len(home.codes.expiries(server.fingerprint)) == 1
-    assert home.codes.expiries(eve.fingerprint) == ()
+    assert len(home.codes.of(server.fingerprint)) == 1
+    assert home.codes.of(eve.fingerprint) == ()
     good = home.codes.attempt(server.raw_public, ann.public, proof_of(code.lower(), server, ann), "ann", home.clients)
     assert good.entry is not None
     assert (good.entry.name, good.entry.roles, good.entry.key) == ("ann", ("observer",), ann.public)
@@ -245,6 +246,35 @@ def test_an_expired_code_lets_nobody_in(home: KeyHome) -> None:
     kept = home.codes.find(made.id)
     assert kept is not None
     assert kept.secret == b"", "what has expired keeps no secret"
+
+
+def test_a_clock_that_is_put_back_does_not_bring_a_code_back(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A laptop without a network sets its clock when it gets one: hours back, after the code was shown."""
+    monkeypatch.setattr(pairing, "ITERATIONS", 1)
+    server, ann = home.server_key(), KeyPair.new()
+    made_s = time.time()
+    code, made = home.codes.make(server, minutes=10.0)
+    proof = proof_of(code, server, ann)
+    for after_s, is_open in ((-7200.0, False), (-30.0, True), (0.0, True), (599.0, True), (601.0, False)):
+        assert made.open(made_s + after_s) is is_open, after_s
+    monkeypatch.setattr("iris_session.keys.join_codes.time.time", lambda: made_s - 7200.0)
+    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
+    monkeypatch.setattr("iris_session.keys.join_codes.time.time", lambda: made_s + 60.0)
+    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is not None
+
+
+def test_what_is_replaced_stays_replaced_after_a_power_cut(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The new file is made durable under its other name: the folder has to be, too."""
+    synced: list[bool] = []
+    plain = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        synced.append(stat.S_ISDIR(os.fstat(descriptor).st_mode))
+        plain(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    home.clients.allow("ann", KeyPair.new().public)
+    assert synced == [False, True]
 
 
 def test_a_cancelled_code_is_void(home: KeyHome) -> None:

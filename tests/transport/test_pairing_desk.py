@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from iris_session.keys import KeyHome, KeyPair, KeysError
+from iris_session.keys import JoinCode, KeyHome, KeyPair, KeysError
 from iris_session.protocol import pairing
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
 from iris_session.transport import pairing_desk
 from iris_session.transport.audit import AuditTrail
 from iris_session.transport.clients import ClientTable, Peer, Route
-from iris_session.transport.config import SECOND
-from iris_session.transport.keyring import STRANGER, Keyring
+from iris_session.transport.config import SECOND, FrontConfig
+from iris_session.transport.keyring import STRANGER, Keyring, open_keyring
 from iris_session.transport.limiter import Drops
 from iris_session.transport.pairing_desk import AGAIN_S, BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
 from iris_session.transport.resume_tokens import ResumeTokens
@@ -194,6 +194,43 @@ def test_a_list_that_could_not_be_read_just_then_is_read_again(
     assert desk.keyring.find(own.fingerprint) is None
 
 
+def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As by `cp -p` or rsync: a key that is replaced is out at once. A certificate that is damaged is said, once."""
+    folder = tmp_path / "clients"
+    folder.mkdir()
+    first, second = KeyPair.new(), KeyPair.new()
+    server = KeyHome(tmp_path / "home")
+    server.server_key()
+    drops = Drops()
+    config = FrontConfig(curve_secret_file=str(server.path / "server.key_secret"), curve_clients_dir=str(folder))
+    keyring = open_keyring(config, drops)
+    path = folder / "ann.key"
+
+    def write(text: str) -> None:
+        path.write_text(text)
+        os.utime(path, ns=(0, 0))
+        keyring.look()
+
+    write(f'public-key = "{first.public}"')
+    assert keyring.find(first.fingerprint) is not None
+    write(f'public-key = "{second.public}"')
+    assert keyring.find(first.fingerprint) is None
+    assert set(keyring.gone) == {first.fingerprint}
+    assert keyring.find(second.fingerprint) is not None
+    (folder / "bob.key").write_text("nothing")
+    for _ in range(3):
+        (folder / "other").touch()
+        keyring.look()
+    said = capsys.readouterr().err
+    assert said.count("nobody is let in by bob.key") == 1
+    assert "it should be a ZeroMQ certificate" in said
+    assert drops.by_reason["certificate_unusable"] == 1
+    assert keyring.find(second.fingerprint) is not None
+    keyring.close()
+
+
 def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(desk: Desk) -> None:
     own = KeyPair.new()
     desk.home.clients.allow("ann", own.public)
@@ -251,6 +288,7 @@ def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeyp
         desk.now_ns += PATIENCE_NS
         desk.turn()
         assert {desk.answer(own).message for own in waiting} == {"the list of keys is busy"}
+        assert {desk.answer(own).code for own in waiting} == {RefusalCode.RATE}, "nothing was tried: ask again"
     assert isinstance(desk.answer(first), Paired)
 
 
@@ -262,12 +300,12 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
     desk.home.codes.make(desk.server)
     with monkeypatch.context() as patch:
 
-        def fails(_server: str) -> tuple[float, ...]:
+        def fails(_server: str) -> tuple[JoinCode, ...]:
             nonlocal tries
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(desk.home.codes, "expiries", fails)
+        patch.setattr(desk.home.codes, "of", fails)
         patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
         for _ in range(3):
             assert not desk.desk.open

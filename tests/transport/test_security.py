@@ -102,7 +102,7 @@ def test_an_address_has_few_attempts_whatever_the_codes(lab: Lab) -> None:
     eve = KeyPair.new()
     answer = lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve)))
     assert (answer.code, answer.message) == (RefusalCode.CODE, "too many wrong codes from this address")
-    assert len(lab.home.codes.expiries(lab.server.fingerprint)) == 1
+    assert len(lab.home.codes.of(lab.server.fingerprint)) == 1
 
 
 def test_a_flood_of_pairing_is_cut(lab: Lab) -> None:
