@@ -24,7 +24,11 @@ from iris_session.protocol.scene_names import ArrayCodec, ArrayFilter
 from iris_session.scene.errors import AssetError
 
 Array = NDArray[Any]
-_DTYPES: Final = {"u1": "u1", "i1": "i1", "u2": "<u2", "u4": "<u4", "f4": "<f4"}
+_DTYPES: Final = {name: np.dtype(f"<{name}") for name in ("u1", "i1", "u2", "u4", "f4")}
+#: Bytes of a number that was quantised.
+_SCALED: Final = 4
+#: Rows of fewer bytes are added up as columns: one call for each row would take longer than it does.
+_SHORT_ROW: Final = 256
 _PREFIX: Final = struct.Struct("<4sI")
 _encoder: Final = msgspec.msgpack.Encoder()
 _decode_header: Final = decoder(ArrayHeader)
@@ -65,11 +69,11 @@ def encode_arrays(kind: str, arrays: Sequence[Stored], max_error: float = 0.0) -
 def decode_arrays(
     data: bytes | bytearray | memoryview, kind: str, max_bytes: int = MAX_ARRAY_BYTES
 ) -> dict[str, Array]:
-    """The arrays of an asset by name, quantised ones as float32. `max_bytes`: of all arrays, decompressed."""
+    """The arrays of an asset by name, quantised ones as float32. `max_bytes`: of all arrays, as they are returned."""
     header, start = read_header(data)
     if header.kind != kind:
         raise AssetError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
-    total = sum(_size(info) for info in header.arrays)
+    total = sum(_size(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays)
     if total > max_bytes:
         raise AssetError(f"arrays of {total} bytes, at most {max_bytes} are read")
     view, found = memoryview(data), {}
@@ -136,13 +140,16 @@ def _bytes(values: Array) -> memoryview:
 
 
 def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
-    dtype = np.dtype(_DTYPES[info.dtype])
+    dtype = _DTYPES[info.dtype]
     if info.filter == ArrayFilter.NONE:
         return np.frombuffer(plain, dtype).reshape(info.shape)
     if info.filter == ArrayFilter.UP:
         rows = np.frombuffer(plain, np.uint8).reshape(info.shape[0], -1).copy()
-        for above, row in itertools.pairwise(rows):  # faster than one accumulate: whole rows vectorise
-            np.add(above, row, row)
+        if rows.shape[1] < _SHORT_ROW:
+            np.cumsum(rows, axis=0, dtype=np.uint8, out=rows)
+        else:
+            for above, row in itertools.pairwise(rows):  # faster than one accumulate: whole rows vectorise
+                np.add(above, row, row)
         return rows.view(dtype).reshape(info.shape)
     flat = np.empty(math.prod(info.shape), dtype)
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
@@ -157,7 +164,10 @@ def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
 def _size(info: ArrayInfo) -> int:
     if info.dtype not in _DTYPES:
         raise AssetError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
-    return math.prod(info.shape) * np.dtype(_DTYPES[info.dtype]).itemsize
+    size = math.prod(info.shape)
+    if not size and max(info.shape) > MAX_ARRAY_BYTES:  # which no array of nothing can be
+        raise AssetError(f"array {info.name!r} has the shape {info.shape}, at most {MAX_ARRAY_BYTES} along an axis")
+    return size * _DTYPES[info.dtype].itemsize
 
 
 def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
@@ -185,7 +195,7 @@ def _decompress(packed: memoryview, size: int) -> bytes:
         # The frame says its size: checked before anything is allocated for it.
         if zstandard.get_frame_parameters(packed).content_size != size:
             raise AssetError("a Zstandard frame of another size than the array")
-        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise AssetError(f"damaged Zstandard frame: {error}") from None
 
@@ -198,5 +208,5 @@ def _scaled(info: ArrayInfo, stored: Array) -> Array:
         raise AssetError(f"array {info.name!r}: scale and offset need {last} values each")
     if not np.isfinite((*info.scale, *info.offset)).all():
         raise AssetError(f"array {info.name!r}: scale and offset are not finite")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         return np.array(info.offset, np.float32) + np.array(info.scale, np.float32) * stored.astype(np.float32)

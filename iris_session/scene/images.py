@@ -67,6 +67,8 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
         raise AssetError(f"damaged {encoding}: {error}") from None
     if image is None or image.dtype != np.uint8:
         raise AssetError(f"damaged {encoding}, or one with more than 8 bits a channel")
+    if image.shape[:2] != (height, width):
+        raise AssetError(f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}")
     return _swapped(image if image.ndim == 3 else image[:, :, None])
 
 
@@ -105,6 +107,11 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
         raise AssetError("these bytes are no JPEG")
     while at + 9 <= len(head) and head[at] == 0xFF:
         marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
+        if marker == 0xFF:  # any number of them may stand before a marker
+            at += 1
+            continue
+        if marker <= 0x01 or 0xD0 <= marker <= 0xDA:  # without a length, or the picture itself: none before its size
+            break
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame, which has the size
             height, width = struct.unpack(">HH", head[at + 5 : at + 9])
             return width, height

@@ -98,3 +98,32 @@ def test_a_bomb_is_refused_before_it_unfolds() -> None:
     honest = asset(ArrayInfo("a", "u1", (50_000_000,), len(bomb), codec="zstd"), body=bomb)
     with pytest.raises(AssetError, match="at most 1000 are read"):
         decode_arrays(honest, "mesh", max_bytes=1_000)
+
+
+def test_an_array_of_nothing_may_not_be_endless_along_an_axis() -> None:
+    for shape in ((0, 2**62), (2**62, 0), (0, 2**31, 2**31, 2**31)):
+        with pytest.raises(AssetError, match="along an axis"):
+            decode_arrays(asset(ArrayInfo("a", "f4", shape, 0)), "mesh")
+    assert decode_arrays(asset(ArrayInfo("a", "f4", (0, 3), 0)), "mesh")["a"].shape == (0, 3)
+
+
+def test_what_is_quantised_counts_as_large_as_it_becomes() -> None:
+    packed = zstandard.ZstdCompressor().compress(bytes(3_000))
+    info = ArrayInfo("a", "u1", (1_000, 3), len(packed), codec="zstd", scale=(1.0,) * 3, offset=(0.0,) * 3)
+    with pytest.raises(AssetError, match="arrays of 12000 bytes, at most 11999"):
+        decode_arrays(asset(info, body=packed), "mesh", 11_999)
+    assert decode_arrays(asset(info, body=packed), "mesh", 12_000)["a"].nbytes == 12_000
+
+
+def test_rows_of_a_byte_cost_no_call_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few kilobytes that hold a hundred million rows must not stop a client for minutes."""
+    tall = np.random.default_rng(0).integers(0, 256, (4_000, 3), np.uint8)
+    data = encode_arrays("image", [Stored("a", tall, "up")])
+    monkeypatch.setattr(np, "add", None)
+    assert np.array_equal(decode_arrays(data, "image")["a"], tall)
+
+
+def test_nothing_may_follow_a_frame() -> None:
+    packed = zstandard.ZstdCompressor().compress(bytes(30)) + b"more"
+    with pytest.raises(AssetError, match="damaged"):
+        decode_arrays(asset(ArrayInfo("a", "u1", (30,), len(packed), codec="zstd"), body=packed), "mesh")

@@ -72,6 +72,23 @@ def test_too_large_is_refused_by_what_the_file_says(encoding: str) -> None:
         decode_image(encode_image(picture(), encoding).data, encoding, max_bytes=1_000)
 
 
+def test_a_jpeg_cannot_hide_its_size_behind_fill_bytes() -> None:
+    """Bytes of 255 before a marker are skipped by every decoder: who reads a length in them is led astray."""
+    good = encode_image(picture(), "jpeg").data
+    assert decode_image(good[:2] + b"\xff" * 3 + good[2:], "jpeg").shape == (60, 80, 3)
+    frame = good.index(b"\xff\xc0")
+    # Skipped as if it were a segment, the real size lies in it, and a harmless one stands where it seems to end.
+    length = int.from_bytes(good[frame : frame + 2], "big")
+    lie = b"\xff\xc0\x00\x11\x08\x00\x01\x00\x01" + bytes(10)
+    bad = good[:frame] + b"\xff" + good[frame:]
+    bad += bytes(max(0, frame + 2 + length - len(bad)))
+    with pytest.raises(AssetError, match="80 x 60 pixels, at most"):
+        decode_image(bad[: frame + 2 + length] + lie, "jpeg", max_bytes=1_000)
+    for marker in (b"\xff\xd8", b"\xff\x01", b"\xff\xda"):
+        with pytest.raises(AssetError, match="without a size"):
+            decode_image(good[:2] + marker + good[2:], "jpeg")
+
+
 def test_unknown_encodings() -> None:
     with pytest.raises(AssetError, match="unknown encoding"):
         decode_image(b"", "webp")

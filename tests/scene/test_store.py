@@ -218,6 +218,7 @@ def test_a_file_that_goes_while_the_store_is_looked_through(tmp_path: Path, monk
 
 
 def test_a_hold_ends_in_whatever_thread(tmp_path: Path) -> None:
+    """A scene is made by one thread and let go by another: a lock that stays open costs a descriptor each time."""
     store = AssetStore(tmp_path)
     with ThreadPoolExecutor(1) as other:
         hold = other.submit(store.hold, [store.put(b"x")]).result()
@@ -225,8 +226,8 @@ def test_a_hold_ends_in_whatever_thread(tmp_path: Path) -> None:
         with pytest.raises(Timeout):
             lock.acquire(blocking=False)
         hold.release()
-        lock.acquire(blocking=False)  # the thread that took it is still there
-        lock.release()
+        assert not other.submit(lambda: hold._lock.is_locked).result()
+    assert not list((tmp_path / "holds").iterdir())
 
 
 def test_when_all_is_in_use_the_disk_is_not_looked_through_each_time(
@@ -236,9 +237,9 @@ def test_when_all_is_in_use_the_disk_is_not_looked_through_each_time(
     looks: list[None] = []
     held = store._held
     monkeypatch.setattr(store, "_held", lambda: looks.append(None) or held())
-    for number in range(100):
+    for number in range(300):
         store.put(number.to_bytes(4, "little") * 250)
-    assert 0 < len(looks) <= 40
+    assert 0 < len(looks) <= 130
     assert store.evicted == 0
 
 
