@@ -13,7 +13,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Camera, Light
 from iris_session.scene.articulation import Articulation
 from iris_session.scene.meshes import MeshArrays
-from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, matrix_of, rigid_and_rest
+from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, matrix_of, rigid_and_rest, solid
 from iris_session.scene.urdf import Robot
 
 
@@ -80,9 +80,14 @@ class World:
         places = [body] * len(loaded.nodes)
         T_world_body = matrix_of(self.things[body].pose) if body >= 0 else np.eye(4)
         used = _with_content(loaded)
+        several = len(used) > 1
         for k, node in enumerate(loaded.nodes):
             matrix = T_body_file @ node.matrix
-            if not flat and len(used) > 1 and k in used:
+            if k in used and not solid(matrix):
+                self.skip((f"{self.things[body].name}: node {node.name!r} is scaled to nothing",))
+                used.discard(k)
+                continue
+            if not flat and several and k in used:
                 pose, rest = rigid_and_rest(T_world_body @ matrix)
                 self.things.append(Thing(node.name, places[node.parent] if node.parent >= 0 else body, pose, False))
                 places[k] = len(self.things) - 1

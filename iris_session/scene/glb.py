@@ -162,7 +162,7 @@ class _Glb:
     def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
         attributes = {
             "POSITION": self._accessor(mesh.position, "VEC3", bounds=True),
-            "NORMAL": self._accessor(unit(mesh.normal).astype(np.float32), "VEC3"),
+            "NORMAL": self._accessor(_normals(mesh.normal), "VEC3"),
         }
         if uv is not None:
             attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2")
@@ -246,6 +246,14 @@ class _Glb:
             image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
             self._textures[index] = self._add("textures", {"source": image, "sampler": 0})
         return self._textures[index]
+
+
+def _normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit vectors; those that are as near to it as float32 gets stay as they are to the bit."""
+    off = np.abs(np.linalg.norm(normal, axis=1) - 1.0) > 1e-6
+    kept = normal.copy()
+    kept[off] = unit(normal[off])
+    return kept
 
 
 def _linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:

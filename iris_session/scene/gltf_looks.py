@@ -196,6 +196,8 @@ def _map(value: object) -> dict[str, Any]:
 def seen(value: float) -> float:
     """A linear factor of glTF as a colour (sRGB)."""
     v = min(max(float(value), 0.0), 1.0)
+    if v >= 1.0:
+        return 1.0  # which the formula misses by a bit
     return v * 12.92 if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055
 
 

@@ -132,12 +132,10 @@ def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     """`matrix` (4, 4) as a pose and what is left of its turning part (3, 3), to be applied before it: scale, shear,
     reflection; `None` where nothing is left. Raises `SceneBuildError` for one that flattens or is not finite.
     """
-    if not np.isfinite(matrix).all():
-        raise SceneBuildError("a place in the file is not finite")
+    if not solid(matrix):
+        raise SceneBuildError("a scale is 0: give every axis one")
     turn = np.asarray(matrix[:3, :3], np.float64)
     U, scale, Vt = np.linalg.svd(turn)
-    if scale[-1] <= 1e-12 * max(1.0, float(scale[0])):
-        raise SceneBuildError("a scale in the file is 0: give every axis one")
     R = U @ Vt
     if np.linalg.det(R) < 0:
         R = -R
@@ -145,6 +143,14 @@ def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
     rest = np.round(R.T @ turn, digits) + 0.0  # so that one scale is the same at every angle, and its mesh is one
     rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
     return pose_of(R, matrix[:3, 3]), None if rigid else rest
+
+
+def solid(matrix: Matrix) -> bool:
+    """Whether something is left of what is placed by `matrix`. Raises `SceneBuildError` for one that is not finite."""
+    if not np.isfinite(matrix).all():
+        raise SceneBuildError("a place in the file is not finite")
+    scale = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    return bool(scale[-1] > 1e-12 * max(1.0, float(scale[0])))
 
 
 def pose_of(R: NDArray[np.float64], p: Any) -> Pose:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene_looks import Rgba
-from iris_session.scene.meshes import MeshArrays, unique_rows
+from iris_session.scene.meshes import MeshArrays, index_corners, unique_rows
 from iris_session.scene.parts import Matrix
 from iris_session.scene.simplify import unit
 
@@ -19,13 +19,14 @@ def scaled(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
     if scale is None:
         return mesh
     across = np.linalg.inv(scale)  # normals go with the inverse's transpose
-    index = mesh.index if np.linalg.det(scale) > 0 else np.ascontiguousarray(mesh.index[:, [0, 2, 1]])
-    return replace(
-        mesh,
-        position=(mesh.position.astype(np.float64) @ scale.T).astype(np.float32),
-        normal=unit(mesh.normal.astype(np.float64) @ across).astype(np.float32),
-        index=index,
-    )
+    position = (mesh.position.astype(np.float64) @ scale.T).astype(np.float32)
+    normal = unit(mesh.normal.astype(np.float64) @ across).astype(np.float32)
+    if np.linalg.det(scale) > 0:
+        return replace(mesh, position=position, normal=normal)
+    index = mesh.index[:, [0, 2, 1]]  # and with it the order in which corners are used, by which they are numbered
+    uv = None if mesh.uv is None else mesh.uv[index]
+    color = None if mesh.color is None else mesh.color[index]
+    return index_corners(position[index], normal[index], uv, color)
 
 
 def closed(mesh: MeshArrays) -> bool:
