@@ -213,8 +213,13 @@ class Coalescer:
         return items
 
     def forget(self, connection: int) -> None:
-        """The authority is done with a connection: nothing that waits of it matters any more."""
-        self._lanes.pop(connection, None)
+        """The authority is done with a connection, or never heard of it: nothing that waits of it matters any more, but
+        that it stops the session."""
+        lane = self._lanes.pop(connection, None)
+        stops = [] if lane is None else [item for item in lane.urgent if isinstance(item[1].message, EStop)]
+        if stops:
+            kept = self._lanes[connection] = _Lane()
+            kept.urgent = stops
 
 
 def _arrival(item: tuple[int, Entry]) -> int:

@@ -95,13 +95,13 @@ class Keyring:
             self.seen[mark] = utc_now()
 
     def paired(self, mark: str) -> bool:
-        """A key was put on the list by the session itself. True: it still is, and may join whatever it was before."""
+        """A key was put on the list by the session itself. True: it still is, and may join whatever it was before; also
+        where the file cannot be read just now: it is known a moment later."""
         self.look()  # the file decides: somebody may have taken the key off again since
         entry = self._keys.get(mark)
-        if entry is None:
-            return False
-        self.come[mark] = entry
-        return True
+        if entry is not None:
+            self.come[mark] = entry
+        return entry is not None or self._signature() != self._seen
 
     def look(self) -> None:
         """Reads the list again if its file has changed. One that is damaged changes nothing, and is said.

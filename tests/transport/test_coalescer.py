@@ -147,6 +147,25 @@ def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> 
     assert waiting.take() == []
 
 
+@pytest.mark.parametrize("how", ["lost before it was let in", "let go by the authority"])
+def test_an_estop_counts_whatever_becomes_of_its_sender(how: str) -> None:
+    """Pressed, and the headset is switched off, or was given up in that very moment."""
+    waiting, _ = coalescer()
+    if how == "lost before it was let in":
+        waiting.offer(entry(Join("key", "operator", "Ann")))
+    else:
+        waiting.offer(entry(Release(1)))
+    waiting.offer(entry(EStop()))
+    waiting.offer(entry(sample(1)))
+    if how == "lost before it was let in":
+        waiting.offer(entry(Lost("closed")))
+    else:
+        waiting.forget(1)
+    assert waiting.urgent
+    assert [type(e.message) for e in waiting.take()] == [EStop]
+    assert not waiting
+
+
 def test_an_estop_always_has_room_and_is_said_once() -> None:
     waiting, drops = coalescer(pending_urgent=2)
     for _ in range(5):

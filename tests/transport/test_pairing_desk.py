@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.keys import JoinCode, KeyHome, KeyPair, KeysError
+from iris_session.keys import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
 from iris_session.protocol import pairing
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
@@ -192,6 +192,24 @@ def test_a_list_that_could_not_be_read_just_then_is_read_again(
     assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
     desk.keyring.look()
     assert desk.keyring.find(own.fingerprint) is None
+
+
+def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The code is used up: to be told that one was revoked would be wrong, and of no use."""
+    own = KeyPair.new()
+    code, _ = desk.home.codes.make(desk.server)
+
+    def unreadable() -> dict[str, AllowedKey]:
+        raise KeysError("Too many open files") from OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(desk.keyring, "_read", unreadable)
+        desk.asks(own, desk.proof(code, own))
+        assert isinstance(desk.answer(own), Paired)
+    desk.turn()
+    assert desk.keyring.find(own.fingerprint) is not None
 
 
 def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_given(
