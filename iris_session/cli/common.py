@@ -119,8 +119,19 @@ def expect_session(arguments: argparse.Namespace) -> None:
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
-            f"(TCP port {address.port}: {error.strerror or error})"
+            f"(TCP port {address.port}: {error.strerror or error}){'' if arguments.address else own_sessions()}"
         ) from None
+
+
+def own_sessions() -> str:
+    """Where the encrypted sessions of this user are, for who has typed no address."""
+    from iris_session.keys import KeyHome, KeysError
+
+    try:
+        notes = KeyHome().sessions.read()
+    except KeysError:
+        return ""
+    return "".join(f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:

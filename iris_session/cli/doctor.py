@@ -15,6 +15,7 @@ from iris_session.protocol.names import Role
 if TYPE_CHECKING:
     from iris_session.doctor.findings import Finding
 
+BAD: Final = ("failed", "warning", "skipped")
 MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "skipped": "-      "}
 
 
@@ -87,9 +88,10 @@ def lines(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[st
 
 
 def verdict(findings: Iterable[Finding]) -> str:
-    """The last line."""
-    states = [one.state for one in findings]
-    failed, warned, skipped = (states.count(state) for state in ("failed", "warning", "skipped"))
+    """The last line: which checks to read above."""
+    failed, warned, skipped = ([one.check for one in findings if one.state == state] for state in BAD)
+    look = f"to look at: {', '.join(warned)}" if warned else ""
     if failed:
-        return f"{failed} failed, {warned} to look at" + (f", {skipped} not possible" if skipped else "")
-    return "all well" if not warned else f"nothing failed, {warned} to look at"
+        left = f"{len(skipped)} not possible" if skipped else ""
+        return "; ".join(text for text in (f"FAILED: {', '.join(failed)}", look, left) if text)
+    return f"nothing failed; {look}" if warned else "all well"

@@ -20,6 +20,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session keys list\n"
         "  iris-session keys revoke quest-3\n"
         "  iris-session keys allow ann ann.key --role operator    a key that came by another way than a join code\n"
+        "  iris-session keys allow me                             this user, on the machine that serves\n"
         "  iris-session keys show                                 fingerprints of this user",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -29,7 +30,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     one.set_defaults(run=run_list)
     one = actions.add_parser("allow", help="let a key in", description="Puts a key on the list, or changes its roles.")
     one.add_argument("name", help="under which it is listed")
-    one.add_argument("key", help="ZeroMQ certificate (*.key), or the public key itself: 40 characters of Z85")
+    one.add_argument(
+        "key",
+        nargs="?",
+        default="",
+        help="ZeroMQ certificate (*.key), or the public key itself: 40 characters of Z85 (default: this user's own)",
+    )
     add_role(one)
     one.set_defaults(run=run_allow)
     one = actions.add_parser(
@@ -77,8 +83,10 @@ def run_list(arguments: argparse.Namespace) -> int:
 def run_allow(arguments: argparse.Namespace) -> int:
     from iris_session.keys import KeyHome, load_public
 
-    key = load_public(arguments.key) if _names_a_file(arguments.key) else arguments.key
-    entry = KeyHome().clients.allow(arguments.name, key, roles_of(arguments.role))
+    home = KeyHome()
+    given = arguments.key or home.identity().public
+    key = load_public(given) if _names_a_file(given) else given
+    entry = home.clients.allow(arguments.name, key, roles_of(arguments.role))
     print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'anything'}")
     return 0
 

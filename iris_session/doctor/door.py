@@ -15,9 +15,11 @@ from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.keys import KeyHome, KeysError, fingerprint, raw_key
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.names import DenialReason, RefusalCode
+from iris_session.protocol.pairing import normal_code
 from iris_session.protocol.status import StatusReport, quantiles
 
-JOIN_S: Final = 4.0
+#: Greeting, keys and hello are seven ways there and back: enough for one of a second.
+JOIN_S: Final = 8.0
 STATE_S: Final = 3.0
 #: A report of ours is a second old at most by then, and those of all others are there.
 LOOK_S: Final = 1.5
@@ -26,6 +28,9 @@ ANSWER_S: Final = 2.0
 OLD_MS: Final = 100.0
 UNSURE_CLOCK_MS: Final = 20.0
 NAME: Final = "doctor"
+NOT_LISTED: Final = "this machine's key is not on the session's list"
+PAIR: Final = "on the server's machine: iris-session pair; then here: iris-session doctor {} --code CODE"
+NEW_CODE: Final = "ask for a new one, on the server's machine: iris-session pair"
 
 
 @dataclass
@@ -62,19 +67,25 @@ def server_key(address: Address, said: Introduction | None) -> Finding:
     return ok("server_key", f"its key {mark} is the known one")
 
 
-def knock(address: str, code: str, role: str) -> Visit:
-    """Joins as `doctor`, looks around, and leaves."""
+def knock(target: Address, typed: str, code: str, role: str, said: Introduction | None) -> Visit:
+    """Joins as `doctor` at the address as it was `typed`, looks around, and leaves. `said`: as it introduced itself."""
     visit = Visit()
     states: list[SceneState] = []
     try:
-        client = Client(address, role=role, name=NAME, alignment="not_needed", join_code=code, on_state=states.append)
+        if code:
+            normal_code(code)
+    except ValueError as error:
+        visit.findings.append(failed("code", str(error), "", NEW_CODE))
+        return visit
+    try:
+        client = Client(typed, role=role, name=NAME, alignment="not_needed", join_code=code, on_state=states.append)
     except ClientError as error:
         visit.findings.append(failed("join", str(error)))
         return visit
     try:
         client.connect(JOIN_S)
     except ClientError as error:
-        _not_let_in(client, error, visit)
+        _not_let_in(client, error, visit, target, said)
     else:
         _let_in(client, states, role, bool(code), visit)
     finally:
@@ -82,7 +93,7 @@ def knock(address: str, code: str, role: str) -> Visit:
     return visit
 
 
-def _not_let_in(client: Client, error: ClientError, visit: Visit) -> None:
+def _not_let_in(client: Client, error: ClientError, visit: Visit, target: Address, said: Introduction | None) -> None:
     if isinstance(error, NotConnectedError):
         try:
             visit.report = client.status(ANSWER_S)
@@ -92,7 +103,32 @@ def _not_let_in(client: Client, error: ClientError, visit: Visit) -> None:
             text = "the session listens, but lets nobody in: it does not step"
             visit.findings.append(failed("join", text, "see the check `session`", "look at the program that owns it"))
             return
-    visit.findings.append(refusal(error))
+    if isinstance(error, NotConnectedError) and said is not None:
+        text = f"the session introduces itself, but did not let us in within {JOIN_S:g} s"
+        why = f"a link that is very slow or loses much, or a session that stands still ({error})"
+        visit.findings.append(
+            failed("join", text, why, "look at the network, and at the program that owns the session")
+        )
+    elif isinstance(error, RefusedError) and error.code == RefusalCode.UNPAIRED:
+        visit.findings.append(unpaired(target, said))
+    else:
+        visit.findings.append(refusal(error))
+
+
+def unpaired(target: Address, said: Introduction | None) -> Finding:
+    """Our key is not on the list: of a session of our own, of one that has let us in before, or of one that is new."""
+    pair = PAIR.format(target)
+    try:
+        home = KeyHome()
+        mark = fingerprint(raw_key(said.server_key)) if said is not None and said.server_key else ""
+        if any(note.server == mark for note in home.sessions.read()):
+            why = "the session is this user's own; even so this user's key must be let in once"
+            return failed("key", NOT_LISTED, why, "iris-session keys allow me")
+        before = home.servers.by_address(str(target)) is not None
+    except KeysError as error:
+        return failed("key", NOT_LISTED, str(error), pair)
+    why = "it was let in before, and has been taken off since (`iris-session keys revoke`)" if before else ""
+    return failed("key", NOT_LISTED, why, f"ask who runs the session; {pair}" if before else pair)
 
 
 def refusal(error: ClientError) -> Finding:
@@ -106,14 +142,16 @@ def refusal(error: ClientError) -> Finding:
         return failed("beacon", text, "", "give the address of the one you mean")
     if isinstance(error, RefusedError):
         if error.code == RefusalCode.UNPAIRED:
-            advice = "on the server's machine: iris-session pair; then here: iris-session doctor ADDRESS --code CODE"
-            return failed("key", "this machine's key is not on the session's list", error.message, advice)
+            return failed("key", NOT_LISTED, "", PAIR.format("ADDRESS"))
         if error.code == RefusalCode.CODE:
-            advice = error.advice or "ask for a new one: iris-session pair (they live for minutes, and work once)"
-            return failed("code", f"the join code was not taken: {error.message}", "", advice)
+            why = "codes work once, and expire after ten minutes unless `pair --minutes` said otherwise"
+            advice = f"{error.advice}; else {NEW_CODE}" if error.advice else NEW_CODE
+            return failed("code", f"the join code was not taken: {error.message}", why, advice)
         if error.code == DenialReason.ROLE:
-            advice = error.advice or "join in another role, or let the key have this one: iris-session keys allow"
-            return failed("role", f"this key may not join in this role: {error.message}", "", advice)
+            advice = (
+                "join in another role, or let the key have this one, on the server's machine: iris-session keys allow"
+            )
+            return failed("role", f"this key may not join in this role: {error.message}", error.advice, advice)
         return failed("join", f"refused ({error.code}): {error.message}", "", error.advice)
     if isinstance(error, NotConnectedError):
         return failed(
@@ -158,6 +196,7 @@ def _state(client: Client, states: list[SceneState]) -> Finding:
     if ages is None:
         port = 0 if welcome is None else welcome.endpoints.state
         address = Address.parse(client.address)
+        client.close()  # the next takes seconds, in which we would say nothing and be kept as somebody who was lost
         try:
             finding = reach.tcp(address, reach.resolved(address)[1], port, "state", "state")
         except OSError as error:

@@ -17,6 +17,7 @@ from iris_session.client.meeting import is_loopback
 from iris_session.doctor import condition, door, reach
 from iris_session.doctor.findings import Findings, failed, ok
 from iris_session.doctor.machine import machine
+from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport
 
@@ -76,14 +77,14 @@ def examine(
     role: str = Role.OBSERVER,
     told: Callable[[str], None] = lambda _: None,
 ) -> Examination:
-    """Looks at the session at `address` (or called `session`; neither: the one on this machine). Takes seconds.
+    """Looks at the session at `address` (or called `session`; neither: that of this user, see `here`). Takes seconds.
 
     `told` hears what is done next. Nothing is changed there: it joins as `doctor`, and leaves. A `code` is used up.
     """
     result = Examination()
     findings = result.findings
     try:
-        target = None if session else Address.parse(address or LOCAL)
+        target = None if session else Address.parse(address or here())
     except ClientError as error:
         findings.add(failed("address", str(error)))
         findings.skip("tcp", *DOOR, *ARRIVAL, *CONDITION)
@@ -98,19 +99,29 @@ def examine(
         return result
     result.address = str(target)
     told(f"looking for {target}")
-    if not _way(target, findings):
+    if not _way(target, findings, found):
         findings.skip("introduction", "version", *DOOR, *ARRIVAL, *CONDITION)
         return result
     _door(result, target, address or str(target), code or target.join_code, role, told)
     return result
 
 
-def _way(target: Address, findings: Findings) -> bool:
+def here() -> str:
+    """Address of the encrypted session that this user serves on this machine, if it is the only one; else that of a
+    session on loopback at the usual port."""
+    try:
+        notes = KeyHome().sessions.read()
+    except KeysError:  # the check `key_home` tells
+        notes = []
+    return str(Address(notes[0].hosts[0], notes[0].control)) if len(notes) == 1 and notes[0].hosts else LOCAL
+
+
+def _way(target: Address, findings: Findings, heard: list[FoundSession]) -> bool:
     named, ip = reach.resolved(target)
     findings.add(named)
     if not ip:
         return False
-    findings.add(reach.subnet(ip), reach.tcp(target, ip))
+    findings.add(reach.subnet(ip), reach.heard_elsewhere(reach.tcp(target, ip), target, heard))
     return not findings["tcp"].failed
 
 
@@ -126,7 +137,7 @@ def _door(result: Examination, target: Address, typed: str, code: str, role: str
         findings.skip(*DOOR, *ARRIVAL, *CONDITION)
         return
     told(f"joining {target} as {role}")
-    visit = door.knock(typed, code, role)
+    visit = door.knock(target, typed, code, role, said)
     findings.add(*visit.findings)
     if any(one.check == "join" and not one.failed for one in visit.findings):
         plain = is_loopback(target.host) and not (said is not None and said.server_key)
@@ -142,10 +153,10 @@ def _door(result: Examination, target: Address, typed: str, code: str, role: str
 def examine_server(address: str, recordings: Path, *, told: Callable[[str], None] = lambda _: None) -> Examination:
     """Looks at this machine, and at the session that runs on it, if one does. `recordings`: the folder for them.
 
-    `address`: of that session; empty: the one at the usual port, else the first that tells of itself from here.
+    `address`: of that session; empty: that of this user, see `here`, else the first that tells of itself from here.
     """
     told("looking at this machine")
-    target = Address.parse(address or LOCAL)
+    target = Address.parse(address or here())
     result = Examination(str(target))
     result.findings.add(*machine(recordings, target.port))
     named, ip = reach.resolved(target)
@@ -154,8 +165,8 @@ def examine_server(address: str, recordings: Path, *, told: Callable[[str], None
         return result
     if reach.tcp(target, ip).failed and not address:
         own = {one.address for addresses in psutil.net_if_addrs().values() for one in addresses}
-        here = [found for found in map(_address, reach.beacon("", None)[1]) if found.host in own]
-        target = here[0] if here else target
+        local = [found for found in map(_address, reach.beacon("", None)[1]) if found.host in own]
+        target = local[0] if local else target
         ip = reach.resolved(target)[1]
     if not reach.tcp(target, ip).failed:
         inside = examine(str(target), told=told)

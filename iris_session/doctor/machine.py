@@ -116,9 +116,14 @@ def ports(control: int) -> Finding:
             taken[connection.laddr.port] = _who(connection.pid)
     if not taken:
         return ok("ports", f"TCP {min(wanted)} to {max(wanted)} and UDP {DISCOVERY_PORT} are free for a session")
-    text = "; ".join(f"{port} ({wanted[port]}): {who}" for port, who in sorted(taken.items()))
-    advice = "join that session, end it, or start another with --port-base"
-    return warning("ports", f"in use: {text}", "a session runs here, or another program has its ports", advice)
+    text = "; ".join(
+        f"{', '.join(f'{port} ({wanted[port]})' for port, one in sorted(taken.items()) if one == who)}: {who}"
+        for who in dict.fromkeys(taken[port] for port in sorted(taken))
+    )
+    if all("iris_session.transport" in who for who in taken.values()):
+        return ok("ports", f"a session has {text}; another one here needs --port-base")
+    advice = "end that program, or start the session with --port-base"
+    return warning("ports", f"in use: {text}", "another program has ports of a session", advice)
 
 
 def _in_use(port: int) -> bool:

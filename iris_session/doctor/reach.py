@@ -18,7 +18,8 @@ from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
 from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
 
-CONNECT_S: Final = 3.0
+#: The system takes 3 s to find that a network has no machine of an address; a firewall is silent for longer.
+CONNECT_S: Final = 4.0
 LISTEN_S: Final = 1.2
 _UNREACHABLE: Final = frozenset({errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN})
 
@@ -69,6 +70,14 @@ def beacon(session: str, address: Address | None) -> tuple[Finding, list[FoundSe
     ), found
 
 
+def heard_elsewhere(finding: Finding, target: Address, found: list[FoundSession]) -> Finding:
+    """A failed `finding` about `target`, with the sessions that are heard at other addresses: one may be meant."""
+    others = ", ".join(f"{one.name} ({one.address})" for one in found if one.address != str(target))
+    if not finding.failed or not others:
+        return finding
+    return failed(finding.check, finding.text, finding.why, f"heard on this network: {others}; else {finding.advice}")
+
+
 def resolved(address: Address) -> tuple[Finding, str]:
     """The address, and the IP address it stands for (empty when there is none)."""
     try:
@@ -101,7 +110,7 @@ def subnet(ip: str) -> Finding:
 
 
 def own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Network]]:
-    """Interface names and networks of this machine that are up, loopback left out."""
+    """Interface names and networks of this machine that are up, without loopback and IPv6 link-local ones."""
     up = psutil.net_if_stats()
     found = []
     for name, addresses in sorted(psutil.net_if_addrs().items()):
@@ -114,7 +123,7 @@ def own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Netw
             if one.family == socket.AF_INET6:
                 mask = str(bin(int(ipaddress.IPv6Address(mask))).count("1"))
             network = ipaddress.ip_network(f"{one.address.split('%')[0]}/{mask}", strict=False)
-            if not network.is_loopback:
+            if not network.is_loopback and not (network.version == 6 and network.is_link_local):
                 found.append((name, network))
     return found
 
@@ -146,11 +155,12 @@ def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str 
                     f"nothing listens at {ip} port {port} ({what})",
                     "the machine answers, but no program has this port: no session runs, it has another port, "
                     "or it listens on another address (127.0.0.1 is for its own machine only)",
-                    "look at the address that `iris-session serve` prints; for other machines it needs --host",
+                    "look at the address that `iris-session serve` prints; for other machines it needs --interface",
                 )
             if error.errno in _UNREACHABLE:
                 text = f"{ip} cannot be reached ({error.strerror})"
-                return failed(check, text, "no such machine in this network", "look at the address and the cable")
+                why = "no machine of this network has that address, it is switched off, or its cable or Wi-Fi is"
+                return failed(check, text, why, "look at the address that `iris-session serve` prints, and the cable")
             return failed(check, f"no connection to {ip} port {port} ({what}): {error.strerror or error}")
     return ok(check, f"{ip} port {port} ({what}) takes connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import socket
 import threading
 import time
 from contextlib import AbstractContextManager, nullcontext
@@ -13,8 +15,10 @@ import cv2
 import pytest
 from zmq.auth import create_certificates
 
+from iris_session.cli.common import CommandError, expect_session, own_sessions
 from iris_session.cli.main import main
 from iris_session.client.address import Address
+from iris_session.doctor.examination import LOCAL, here
 from iris_session.keys import KeyHome, KeyPair, KeysBusyError, KeysError, SessionNote
 from iris_session.keys.files import PrivateFolder
 from iris_session.protocol import pairing
@@ -57,6 +61,31 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
     assert main(["keys", "revoke", "ann"]) == 2
     assert "no key 'ann' on the list, there are: bob" in capsys.readouterr().err
     assert list(home.clients.read()) == [bob.fingerprint]
+
+
+def test_who_serves_lets_in_themselves(home: KeyHome, capsys: Capture) -> None:
+    assert main(["keys", "allow", "me", "--role", "any"]) == 0
+    own = home.identity()
+    assert [(one.name, one.roles) for one in home.clients.read().values()] == [("me", ())]
+    assert own.fingerprint in capsys.readouterr().out
+
+
+def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> None:
+    """A session that listens on one network is not at 127.0.0.1, where a command looks by itself."""
+    home.sessions.add(SessionNote("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.server_key().fingerprint))
+    assert here() == "192.0.2.7:7721"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nobody = f"127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(CommandError) as told:
+        expect_session(argparse.Namespace(session="", address=nobody))
+    assert "your session" not in str(told.value)
+    assert own_sessions() == "; your session 'lab-1' is at 192.0.2.7:7721"
+    home.sessions.add(SessionNote("s2", "lab-2", os.getpid(), ("192.0.2.8",), 7731, home.server_key().fingerprint))
+    assert here() == LOCAL
+    home.sessions.remove("s1", os.getpid())
+    home.sessions.remove("s2", os.getpid())
+    assert (here(), own_sessions()) == (LOCAL, "")
 
 
 @pytest.mark.parametrize(

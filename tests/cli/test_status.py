@@ -160,9 +160,9 @@ def test_lines_of_the_doctor() -> None:
     shown = lines(found)
     assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
     assert all(line.isprintable() for line in shown)
-    assert verdict(found) == "1 failed, 1 to look at, 1 not possible"
+    assert verdict(found) == "FAILED: key; to look at: age; 1 not possible"
     assert len(lines(found, show_skipped=True)) == len(shown) + 1
-    assert verdict(found[:2]) == "nothing failed, 1 to look at"
+    assert verdict(found[:2]) == "nothing failed; to look at: age"
     assert verdict(found[:1]) == "all well"
 
 

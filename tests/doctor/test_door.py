@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from iris_session.client.address import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
-from iris_session.doctor.door import refusal, server_key
-from iris_session.keys import KeyHome, KeyPair
+from iris_session.doctor.door import knock, refusal, server_key, unpaired
+from iris_session.keys import KeyHome, KeyPair, SessionNote
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused
@@ -77,3 +78,27 @@ def test_damaged_list_of_servers(home: KeyHome) -> None:
 def test_nothing_to_compare() -> None:
     assert server_key(ADDRESS, None).state == "skipped"
     assert server_key(ADDRESS, said("")).state == "ok"
+
+
+def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
+    new = unpaired(ADDRESS, said(KeyPair.new().public))
+    assert (new.check, new.state, new.why) == ("key", "failed", "")
+    assert "iris-session pair" in new.advice
+    assert f"iris-session doctor {ADDRESS} --code" in new.advice
+    key = KeyPair.new().public
+    home.servers.pin(str(ADDRESS), "lab", key)
+    assert "let in before" in unpaired(ADDRESS, said(key)).why
+
+
+def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
+    key = KeyPair.new()
+    home.sessions.add(SessionNote("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
+    assert unpaired(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
+    assert "pair" in unpaired(ADDRESS, said(KeyPair.new().public)).advice
+
+
+def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:
+    [found] = knock(ADDRESS, str(ADDRESS), "abc", "observer", None).findings
+    assert (found.check, found.state) == ("code", "failed")
+    assert "like 7KQ2-M4XD-9PTR" in found.text
+    assert "iris-session pair" in found.advice

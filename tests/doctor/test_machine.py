@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -38,6 +39,22 @@ def test_ports_name_who_has_them() -> None:
     assert found.state == "warning"
     assert f"{port} (control)" in found.text
     assert "python" in found.text or "pytest" in found.text
+
+
+def test_ports_of_a_session_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each program is told once, with all its ports."""
+    monkeypatch.setattr(machine, "_in_use", lambda port: port != 7725)
+    monkeypatch.setattr(machine, "_connections", list)
+    assert machine.ports(7721).state == "warning"
+    listening = [
+        SimpleNamespace(status="LISTEN", laddr=SimpleNamespace(port=port), pid=1) for port in range(7720, 7727)
+    ]
+    monkeypatch.setattr(machine, "_connections", lambda: listening)
+    monkeypatch.setattr(machine, "_who", lambda pid: "python -m iris_session.transport.front (process 1)")
+    found = machine.ports(7721)
+    assert found.state == "ok"
+    assert found.text.count("process 1") == 1
+    assert "7720 (introduction), 7721 (control), " in found.text
 
 
 def test_every_port_of_a_session_is_looked_at() -> None:

@@ -13,6 +13,7 @@ import pytest
 from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
 from iris_session.doctor import reach
+from iris_session.doctor.findings import failed, ok
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -178,3 +179,20 @@ def test_beacon(
     found, _ = reach.beacon(name, None)
     assert found.state == state
     assert text in found.text
+
+
+def test_sessions_that_are_heard_elsewhere_may_be_meant() -> None:
+    typed = Address("10.0.0.9", 7721)
+    there = [heard("lab", "10.0.0.1:7721"), heard("itself", str(typed))]
+    dead = failed("tcp", "nothing listens", "why", "look")
+    told = reach.heard_elsewhere(dead, typed, there)
+    assert "lab (10.0.0.1:7721)" in told.advice
+    assert "itself" not in told.advice
+    assert (told.text, told.why) == (dead.text, dead.why)
+    assert reach.heard_elsewhere(dead, typed, there[1:]) is dead
+    well = ok("tcp", "takes connections")
+    assert reach.heard_elsewhere(well, typed, there) is well
+
+
+def test_networks_that_cannot_be_used_are_not_told() -> None:
+    assert not any(network.version == 6 and network.is_link_local for _, network in reach.own_networks())
