@@ -86,12 +86,24 @@ class Tree:
             found.extend([child] if self.scalar_joints_of(child) else self.jointed_below(child))
         return found
 
-    def flex_vertex_bodies(self) -> frozenset[int]:
-        """Bodies that MuJoCo made for the vertices or nodes of a flex: three slides, no geom, no child.
+    def moving(self) -> list[bool]:
+        """Of every body, whether it can move: what a joint or the user moves, and all that is fixed on it."""
+        mocap = (self.model.body_mocapid >= 0).tolist()
+        moving = [False] * len(mocap)
+        for b, parent in enumerate(self.model.body_parentid.tolist()):
+            # Before MuJoCo 3.4 mocap bodies, and what is fixed on them, are welded to the world.
+            moving[b] = b > 0 and (self.weld[b] != 0 or mocap[b] or moving[parent])
+        return moving
 
-        Pinned and rigid vertices belong to ordinary bodies, which are not among them.
+    def flex_vertex_bodies(self) -> frozenset[int]:
+        """Bodies that MuJoCo made for the vertices or nodes of a flex: three slides, and nothing on them or below.
+
+        Pinned and rigid vertices belong to ordinary bodies, which are not among them. What a light or camera looks at
+        is not either.
         """
         model = self.model
+        used = {*model.light_bodyid.tolist(), *model.cam_bodyid.tolist(), *model.site_bodyid.tolist()}
+        used |= {*model.light_targetbodyid.tolist(), *model.cam_targetbodyid.tolist()}
         listed: set[int] = set()
         for array in ("flex_vertbodyid", "flex_nodebodyid"):
             if model.nflex and hasattr(model, array):
@@ -100,6 +112,7 @@ class Tree:
             b
             for b in listed
             if b > 0
+            and b not in used
             and not self.children[b]
             and int(model.body_geomnum[b]) == 0
             and int(model.body_jntnum[b]) == 3

@@ -294,9 +294,9 @@ def _body_infos(model: mujoco.MjModel, tree: Tree, objects: Sequence[ObjectSpec]
     """All bodies but the world and the vertices of flexes, by id."""
     vertices = tree.flex_vertex_bodies()
     taken = {spec.body for spec in objects}
-    mocap = set(np.flatnonzero(model.body_mocapid >= 0).tolist())  # before MuJoCo 3.4 these are welded to the world
+    moving = tree.moving()
     return tuple(
-        BodyInfo(index, name, moving=tree.weld[index] != 0 or index in mocap, object=name in taken)
+        BodyInfo(index, name, moving=moving[index], object=name in taken)
         for index, name in enumerate(body_names(model))
         if index and index not in vertices
     )

@@ -110,6 +110,10 @@ def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
     vertices = _flex_vertex_bodies(model)
     weld = model.body_weldid.tolist()
     mocap = model.body_mocapid.tolist()
+    moving = [False] * len(weld)
+    for i, parent in enumerate(model.body_parentid.tolist()):
+        # Before MuJoCo 3.4 mocap bodies, and what is fixed on them, are welded to the world.
+        moving[i] = i > 0 and (weld[i] != 0 or mocap[i] >= 0 or moving[parent])
     return tuple(
         Body(
             id=i,
@@ -117,7 +121,7 @@ def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
             parent=int(model.body_parentid[i]) if i else -1,
             T_parent_body=pose(model.body_pos[i], model.body_quat[i]),
             T_world_body=pose(data.xpos[i], data.xquat[i]),
-            moving=i > 0 and (weld[i] != 0 or mocap[i] >= 0),
+            moving=moving[i],
         )
         for i in range(model.nbody)
         if i not in vertices
@@ -125,7 +129,7 @@ def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
 
 
 def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
-    """Bodies that hold nothing but a vertex or node of a flex: they are not streamed."""
+    """Bodies that hold nothing but a vertex or node of a flex, which nothing looks at: they are not streamed."""
     listed: set[int] = set()
     for field in ("flex_vertbodyid", "flex_nodebodyid"):
         if model.nflex and hasattr(model, field):
@@ -135,6 +139,8 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
         *model.light_bodyid.tolist(),
         *model.cam_bodyid.tolist(),
         *model.site_bodyid.tolist(),
+        *model.light_targetbodyid.tolist(),
+        *model.cam_targetbodyid.tolist(),
     }
     return frozenset(
         body

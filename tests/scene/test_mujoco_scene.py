@@ -187,6 +187,42 @@ def test_an_image_that_lights_the_scene(tmp_path: Path) -> None:
     assert (light.kind, light.texture, light.intensity) == ("image", 0, 20)
 
 
+WATCHED_CLOTH = """<mujoco><worldbody>
+    <body name="hand" mocap="true"><geom size=".1"/><body name="ring" pos="0 0 .2"><geom size=".05"/></body></body>
+    <body name="table"><geom size=".1"/></body>
+    <body name="swing"><joint/><geom size=".1"/><body name="seat"><geom size=".1"/></body></body>
+    <flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" pos="0 0 1" radius=".01" dim="2">
+      <edge equality="true"/></flexcomp>
+    <camera name="watch" pos="0 -1 1" mode="targetbody" target="cloth_4"/>
+    <light mode="targetbody" target="cloth_7" pos="0 0 3"/>
+  </worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("older", [False, True], ids=["as it is", "as before MuJoCo 3.4"])
+def test_bodies_are_those_of_the_state_stream(tmp_path: Path, older: bool) -> None:
+    """What one side leaves out and the other moves would stand still for everybody."""
+    model = mujoco.MjModel.from_xml_string(WATCHED_CLOTH)
+    if older:
+        model.body_weldid[1:3] = 0  # of a mocap body and what is fixed on it
+    spec = parse_mujoco(model, AssetStore(tmp_path)).spec
+    streamed = [(info.id, info.moving) for info in World(model, (), ()).bodies]
+    assert [(body.id, body.moving) for body in spec.bodies] == [(0, False), *streamed]
+    named = {body.name: body.moving for body in spec.bodies}
+    assert named == {
+        "world": False,
+        "hand": True,
+        "ring": True,
+        "table": False,
+        "swing": True,
+        "seat": True,
+        "cloth_4": True,
+        "cloth_7": True,
+    }
+    targets = {spec.cameras[0].target, spec.lights[0].target}
+    assert targets == {body.id for body in spec.bodies if body.name.startswith("cloth")}
+    assert decode_scene(encode_scene(spec)) == spec
+
+
 def test_skins_are_named_as_left_out(tmp_path: Path) -> None:
     xml = """<mujoco><asset/><deformable><skin name="s" vertex="0 0 0 1 0 0 0 1 0" face="0 1 2">
     <bone body="b" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/></skin></deformable>
