@@ -16,7 +16,7 @@ from anchors.pose import distance
 from iris_session.client import Client
 from iris_session.emulator.impairment_process import ImpairmentProcess
 from iris_session.protocol.server_messages import EngagementChanged, SamplesRejected
-from tests.e2e.conftest import DEADLINE_S, Hand, Stage
+from tests.e2e.conftest import Hand, Stage
 
 pytestmark = pytest.mark.e2e
 
@@ -79,7 +79,8 @@ class Linked:
 
     def driving(self, client: Client, robot: str) -> Hand:
         """`client` joins and moves `robot`."""
-        client.connect(DEADLINE_S)
+        client.open()
+        self.stage.run(lambda: client.ready, f"{client.name} is in")
         client.acquire([robot])
         hand = self.stage.hand(client, robot)
         self.stage.engage(hand)

@@ -52,9 +52,7 @@ class Lab(Stage):
             curve=self.curve(pair or self.listed(name)),
             on_event=log.append,
         )
-        self.clients.append(client)
-        client.connect(DEADLINE_S)
-        return client
+        return self.come_in(client)
 
     def audits(self, name: str, kind: str) -> list[Audited]:
         """What `name` was told of a kind."""
