@@ -10,6 +10,7 @@ import contextlib
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
@@ -20,8 +21,10 @@ THREADS: Final = 2
 #: Nice value of the threads above that of the process: a third of the weight. Not less, as they hold Python's lock for
 #: moments, and whoever polls then waits for them.
 NICER: Final = 5
-#: Who polls is woken after so many bytes: what comes next wakes it as well.
+#: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything
+#: that may have come costs it as much as a chunk does.
 WAKE_BYTES: Final = 1 << 20
+WAKE_NS: Final = 5_000_000
 Decode = Callable[[str, memoryview], Any]
 
 
@@ -157,7 +160,7 @@ class AssetWorkers:
 
     def _run(self, jobs: queue.SimpleQueue[_Job | None]) -> None:
         _give_way()
-        untold = 0
+        untold, woken_ns = 0, 0
         while (job := jobs.get()) is not None:
             address, work, size = job
             if self._closing and not size:
@@ -165,8 +168,10 @@ class AssetWorkers:
             result = self._done(address, work, size)
             self._results.put(result)
             untold += size
-            if not isinstance(result, Stored) or untold >= WAKE_BYTES or jobs.empty():
-                untold = 0
+            now_ns = time.monotonic_ns()
+            news = untold >= WAKE_BYTES or (not isinstance(result, Stored) and now_ns - woken_ns >= WAKE_NS)
+            if news or jobs.empty():
+                untold, woken_ns = 0, now_ns
                 self._wake()
 
     def _done(self, address: str, work: Callable[[], Result], size: int) -> Result:

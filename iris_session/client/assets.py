@@ -94,6 +94,10 @@ class Assets:
                         self._workers.leave(address)
             self._sockets.wake()
 
+    @property
+    def _loads_assets(self) -> bool:
+        return not self._loader.idle
+
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _tend_assets(self) -> bool:

@@ -45,6 +45,7 @@ class Driving(SceneView, Media, Assets, Joining):
     _thread: threading.Thread | None
     _stopping: bool
     _crash: BaseException | None
+    _looked: bool = False
 
     def poll(self, timeout_s: float = 0.0) -> bool:
         """Receives, answers, keeps the connection alive. Waits up to `timeout_s` for something to come.
@@ -55,8 +56,12 @@ class Driving(SceneView, Media, Assets, Joining):
         if not self._polls_here:
             raise ClientError("poll() while the thread of start() polls: use wait_for(), callbacks and attributes")
         deadline = time.monotonic_ns() + int(timeout_s * 1e9)
+        # A scene that loads brings something every moment: each time once is enough, what came since ends the wait.
+        looked = self._looked and timeout_s > 0.0
         while True:
-            progressed = self._pump()
+            progressed = not looked and self._pump()
+            self._looked = progressed and self.connection.joined and self._loads_assets
+            looked = False
             now = time.monotonic_ns()
             if progressed or now >= deadline:
                 break

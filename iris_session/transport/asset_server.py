@@ -40,6 +40,9 @@ YIELD_MS: Final = 5
 NICER: Final = 10
 #: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
 FAULT_S: Final = 0.25
+#: As plain integers: operations on the enumerations take longer than what they are for.
+_DONTWAIT: Final = int(zmq.DONTWAIT)
+_MORE: Final = int(zmq.DONTWAIT | zmq.SNDMORE)
 #: Of one reader, that wait to be read: far more than all its requests.
 REQUEST_BYTES: Final = 65_536
 
@@ -224,12 +227,12 @@ class AssetServer:
         for _ in range(ROUND):
             if not readable(self._socket):
                 return
-            route = self._socket.recv(zmq.DONTWAIT)
-            frame = self._socket.recv(zmq.DONTWAIT, copy=False)
+            route = self._socket.recv(_DONTWAIT)
+            frame = self._socket.recv(_DONTWAIT, copy=False)
             lengths = [len(frame)]
             more = frame.more
             while more:
-                extra = self._socket.recv(zmq.DONTWAIT, copy=False)
+                extra = self._socket.recv(_DONTWAIT, copy=False)
                 lengths.append(len(extra))
                 more = extra.more
             try:
@@ -271,7 +274,7 @@ class AssetServer:
     def _told(self, route: bytes, refusal: bytes) -> bool:
         """False: who is to be told reads nothing, or is gone."""
         try:
-            self._socket.send_multipart((route, refusal), zmq.DONTWAIT)
+            self._socket.send_multipart((route, refusal), _DONTWAIT)
         except zmq.ZMQError:
             return False
         return True
@@ -293,11 +296,12 @@ class AssetServer:
             if chunk is None:  # or the scene changed twice since it was asked for
                 reason = wanted.refused or AssetRefusal.UNKNOWN
                 refusal = _refusal(wanted.request_id, wanted.address, reason)
-                self._socket.send_multipart((reader.route, refusal), zmq.DONTWAIT)
+                self._socket.send_multipart((reader.route, refusal), _DONTWAIT)
             else:
                 head = AssetChunk(PROTOCOL_VERSION, wanted.request_id, wanted.address, wanted.offset, wanted.total)
-                self._socket.send_multipart((reader.route, encode_asset_header(head)), zmq.DONTWAIT | zmq.SNDMORE)
-                self._socket.send(chunk, zmq.DONTWAIT, copy=False)
+                self._socket.send(reader.route, _MORE)
+                self._socket.send(encode_asset_header(head), _MORE)
+                self._socket.send(chunk, _DONTWAIT, copy=False)
         except zmq.Again:
             self._hub.full(reader, self._now_ns())
             return

@@ -34,9 +34,10 @@ CONTROL_BUFFER_BYTES = 131_072
 MEDIA_HWM = 2
 MEDIA_BUFFER_BYTES = 65_536
 INGEST_HWM = 8
-#: Assets: chunks that wait in libzmq for one reader, mapped files all of them. The system holds no more than a link of
-#: 300 Mbit/s and 7 ms: what waits there delays the state that shares the link.
-ASSET_HWM = 4
+#: Assets: chunks that wait in libzmq for one reader, mapped files all of them: as many as a reader asks for at once, as
+#: each that finds no room costs as much work as one that does. The system holds no more than a link of 300 Mbit/s and
+#: 7 ms: what waits there delays the state that shares the link.
+ASSET_HWM = 8
 ASSET_BUFFER_BYTES = 262_144
 ASSET_MESSAGE_BYTES = 1024
 #: I/O threads of the front, as bits of ZMQ_AFFINITY: encrypting media must not delay state.
