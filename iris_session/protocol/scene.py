@@ -31,6 +31,9 @@ from iris_session.protocol.scene_names import SCENE_VERSION, AssetEncoding, Foll
 
 #: Largest specification in bytes that is read: some 100,000 visuals.
 MAX_SCENE_BYTES: Final = 32_000_000
+#: Most bodies of a specification, and most of everything else but visuals: small things that a few bytes describe.
+MAX_BODIES: Final = 1 << 17
+MAX_THINGS: Final = 1 << 16
 
 
 class Body(msgspec.Struct, frozen=True):
@@ -145,7 +148,7 @@ class Tendon(msgspec.Struct, frozen=True):
     name: Text
     group: Int32
     width: float
-    sites: tuple[Count, ...]
+    sites: Annotated[tuple[Count, ...], msgspec.Meta(max_length=4096)]
     material: Ref
     rgba: Rgba
 
@@ -212,6 +215,9 @@ class Totals(msgspec.Struct, frozen=True):
     asset_bytes: Count = 0
 
 
+_SOME: Final = msgspec.Meta(max_length=MAX_THINGS)
+
+
 class SceneSpec(msgspec.Struct, frozen=True):
     """A whole scene. `bodies`: parents before their children. `source`: what it was made from, for people.
 
@@ -221,17 +227,17 @@ class SceneSpec(msgspec.Struct, frozen=True):
     version: Count = SCENE_VERSION
     name: Text = ""
     source: Text = ""
-    bodies: tuple[Body, ...] = ()
+    bodies: Annotated[tuple[Body, ...], msgspec.Meta(max_length=MAX_BODIES)] = ()
     visuals: tuple[Visual, ...] = ()
-    materials: tuple[Material, ...] = ()
-    textures: tuple[Texture, ...] = ()
-    meshes: tuple[Mesh, ...] = ()
-    hfields: tuple[HeightField, ...] = ()
-    lights: tuple[Light, ...] = ()
-    cameras: tuple[Camera, ...] = ()
-    sites: tuple[Site, ...] = ()
-    tendons: tuple[Tendon, ...] = ()
-    deformables: tuple[Deformable, ...] = ()
+    materials: Annotated[tuple[Material, ...], _SOME] = ()
+    textures: Annotated[tuple[Texture, ...], _SOME] = ()
+    meshes: Annotated[tuple[Mesh, ...], _SOME] = ()
+    hfields: Annotated[tuple[HeightField, ...], _SOME] = ()
+    lights: Annotated[tuple[Light, ...], _SOME] = ()
+    cameras: Annotated[tuple[Camera, ...], _SOME] = ()
+    sites: Annotated[tuple[Site, ...], _SOME] = ()
+    tendons: Annotated[tuple[Tendon, ...], _SOME] = ()
+    deformables: Annotated[tuple[Deformable, ...], _SOME] = ()
     environment: Environment = Environment()
     groups_shown: Annotated[tuple[Int32, ...], msgspec.Meta(max_length=256)] = (0, 1, 2)
     totals: Totals = Totals()
@@ -262,8 +268,13 @@ _decode: Final = decoder(SceneSpec)
 
 
 def encode_scene(spec: SceneSpec) -> bytes:
-    """The bytes of the specification: an asset, whose address is the scene's hash."""
-    return _encoder.encode(spec)
+    """The bytes of the specification: an asset, whose address is the scene's hash. Raises `SceneError` for one that
+    nobody would read."""
+    data = _encoder.encode(spec)
+    if len(data) > MAX_SCENE_BYTES:
+        what = f"{len(spec.visuals)} visuals, {len(spec.bodies)} bodies"
+        raise SceneError(f"a specification of {len(data)} bytes ({what}), at most {MAX_SCENE_BYTES} are read")
+    return data
 
 
 def decode_scene(data: Bytes) -> SceneSpec:
@@ -298,7 +309,11 @@ def asset_addresses(spec: SceneSpec) -> dict[str, int]:
 
 
 def check_scene(spec: SceneSpec) -> None:
-    """Raises `SceneError` unless every reference has its target, and no id occurs twice."""
+    """Raises `SceneError` unless every reference has its target, no id occurs twice, and there is not too much of
+    anything."""
+    for kind, most in _MOST.items():
+        if len(getattr(spec, kind)) > most:
+            raise SceneError(f"{len(getattr(spec, kind))} {kind}, at most {most} are read")
     bodies, sites = _ids("bodies", spec.bodies), _ids("sites", spec.sites)
     _ids("visuals", spec.visuals)
     before = {-1}
@@ -331,6 +346,14 @@ def check_scene(spec: SceneSpec) -> None:
             raise SceneError(f"tendon {tendon.name!r} runs through a site that is not there")
     if not (all(mesh.levels for mesh in spec.meshes) and all(texture.levels for texture in spec.textures)):
         raise SceneError("a mesh or texture has no level")
+
+
+#: Of what the types bound, for specifications that are made and not read.
+_MOST: Final = {
+    "bodies": MAX_BODIES,
+    **dict.fromkeys(("materials", "textures", "meshes", "hfields", "lights", "cameras"), MAX_THINGS),
+    **dict.fromkeys(("sites", "tendons", "deformables"), MAX_THINGS),
+}
 
 
 def _ids(what: str, things: Sequence[Identified]) -> set[int]:

@@ -13,7 +13,16 @@ import pytest
 
 from iris_session.protocol import scene_names
 from iris_session.protocol.generate import schema
-from iris_session.protocol.scene import MAX_SCENE_BYTES, SceneError, SceneSpec, decode_scene, encode_scene
+from iris_session.protocol.scene import (
+    MAX_SCENE_BYTES,
+    MAX_THINGS,
+    SceneError,
+    SceneSpec,
+    check_scene,
+    decode_scene,
+    encode_scene,
+)
+from iris_session.protocol.scene_looks import Material
 from iris_session.protocol.scene_patch import PatchOp, patched
 from tests.protocol.test_interop import reordered, same, unpack
 
@@ -100,6 +109,23 @@ def test_what_is_deep_or_long_is_refused_before_it_costs_anything() -> None:
         decode_scene(b"\x81\xa4deep" + b"\x91" * 100_000 + b"\xc0")
     with pytest.raises(SceneError, match="at most 32000000 are read"):
         decode_scene(bytes(MAX_SCENE_BYTES + 1))
+
+
+def test_many_small_things_are_refused_before_they_take_memory() -> None:
+    """32 MB may hold two million materials, which would take 600 MiB."""
+    one = msgspec.msgpack.encode({"name": "", "rgba": [0, 0, 0, 0]})
+    data = b"\x81\xa9materials\xdd" + (MAX_THINGS + 1).to_bytes(4, "big") + one * (MAX_THINGS + 1)
+    with pytest.raises(SceneError, match="length <= 65536"):
+        decode_scene(data)
+    with pytest.raises(SceneError, match="65537 materials, at most 65536"):
+        check_scene(SceneSpec(materials=(Material("", (0.0, 0.0, 0.0, 0.0)),) * (MAX_THINGS + 1)))
+
+
+def test_what_nobody_would_read_is_not_written() -> None:
+    whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
+    many = msgspec.structs.replace(whole, visuals=whole.visuals * 15_000)
+    with pytest.raises(SceneError, match=r"150000 visuals, 3 bodies\), at most 32000000"):
+        encode_scene(many)
 
 
 def test_every_struct_and_kind_of_thing_has_a_vector() -> None:
