@@ -70,11 +70,7 @@ def _parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
         from lxml import etree
     except ImportError:
         raise SceneBuildError("URDF files need yourdfpy: pip install 'iris-session[files]'") from None
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False)
-    try:
-        root = etree.fromstring(data, parser)
-    except etree.XMLSyntaxError as error:
-        raise SceneBuildError(f"{path} is no XML: {error}") from None
+    root = _xml(etree, path, data)
     if root.getroottree().docinfo.doctype:
         raise SceneBuildError(f"{path} has a DOCTYPE: remove it")
     if root.tag != "robot":
@@ -99,6 +95,25 @@ def _parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
         load_collision_meshes=False,
     )
     return made.robot, skipped
+
+
+def _xml(etree: Any, path: Path, data: bytes) -> Any:
+    """The document, without what has a prefix that nobody declared: extensions of one simulator, often found so."""
+    safe = {"resolve_entities": False, "no_network": True, "huge_tree": False}
+    parser = etree.XMLParser(**safe)
+    try:
+        return etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        if any(entry.domain_name != "NAMESPACE" for entry in parser.error_log):
+            raise SceneBuildError(f"{path} is no XML: {error}") from None
+    root = etree.fromstring(data, etree.XMLParser(recover=True, **safe))
+    for element in list(root.iter(etree.Element)):
+        if element.prefix is None and ":" in element.tag and not element.tag.startswith("{"):
+            element.getparent().remove(element)
+            continue
+        for name in [name for name in element.attrib if ":" in name and not name.startswith("{")]:
+            del element.attrib[name]
+    return root
 
 
 class _Reader:

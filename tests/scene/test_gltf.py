@@ -64,7 +64,7 @@ def furniture(path: Path) -> Path:
     scene = trimesh.Scene()
     painted = trimesh.creation.cylinder(0.3, 0.8, sections=12)
     painted.visual = trimesh.visual.TextureVisuals(
-        RNG.random((len(painted.vertices), 2)),
+        np.random.default_rng(4).random((len(painted.vertices), 2)),
         trimesh.visual.material.PBRMaterial("painted", baseColorTexture=Image.fromarray(PIXELS), metallicFactor=0.25),
     )
     plain = trimesh.creation.icosphere(subdivisions=1, radius=0.5)

@@ -155,6 +155,16 @@ def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
     assert any("material 'lost'" in line for line in skipped)
 
 
+def test_prefixes_that_nobody_declared_are_left_out(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    before = composed(urdf, tmp_path)
+    text = urdf.read_text().replace('effort="1"', 'effort="1" drake:acceleration="15"')
+    urdf.write_text(
+        text.replace("</robot>", '<drake:filter name="a"><drake:member link="base"/></drake:filter></robot>')
+    )
+    assert composed(urdf, tmp_path).scene_hash == before.scene_hash
+
+
 def test_collision_shapes_on_request(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     assert "leave out collisions=True" in composed(urdf, tmp_path, collisions=True).skipped[0]

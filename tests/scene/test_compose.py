@@ -1,0 +1,253 @@
+"""Scenes from shapes, arrays and files: who gets which number, what is refused, the same hash in every process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import iris_session
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.scene import Environment, decode_scene
+from iris_session.scene import AssetStore, SceneBuildError, decode_arrays, decode_mesh
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.streams.deformable import DeformableEncoder
+from tests.scene.arm import write_arm
+from tests.scene.test_files import write_obj
+from tests.scene.test_gltf import furniture
+
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+SQUARE = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
+HALF = 0.5**0.5
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AssetStore:
+    return AssetStore(tmp_path / "store")
+
+
+def full_scene(folder: Path) -> SceneBuilder:
+    """Something of everything."""
+    scene = SceneBuilder("Lab")
+    scene.add_plane(half_size=(2, 2), texture=np.arange(48, dtype=np.uint8).reshape(4, 4, 3), repeat=(3, 3))
+    scene.add_box("shelf", half_size=(0.1, 0.2, 0.3), rgba=(1, 0, 0))
+    scene.add_sphere("ball", radius=0.1, movable=True, position=(1, 2, 3), metallic=0.5, roughness=0.25)
+    scene.add_capsule(radius=0.1, half_length=0.2, on="ball")
+    scene.add_file(furniture(folder / "furniture.glb"), position=(0, 1, 0))
+    scene.add_file(write_obj(folder), name="part", movable=True, scale=0.5)
+    scene.add_urdf(write_arm(folder), name="arm", position=(0, 0, 0.8))
+    scene.add_mesh("sheet", vertices=SQUARE, triangles=TRIANGLES, colors=np.uint8([[9, 8, 7]] * 3 + [[1, 2, 3]]))
+    scene.add_deformable("cloth", SQUARE, TRIANGLES, rgba=(0, 1, 0, 1), uvs=SQUARE[:, :2])
+    scene.add_deformable("rope", SQUARE, edges=TRIANGLES[:, :2], radius=0.01)
+    scene.add_light("sun", direction=(0, 1, -1))
+    scene.add_camera("eye", on="arm/link5", position=(0, 0, 0.1))
+    scene.set_skybox(np.zeros((12, 2, 3), np.uint8))
+    return scene
+
+
+def test_moving_bodies_come_first_and_are_numbered_in_order(tmp_path: Path, store: AssetStore) -> None:
+    made = full_scene(tmp_path).build(store)
+    spec = made.spec
+    assert decode_scene(store.get(made.scene_hash)) == spec
+    assert made.moving == ("ball", "part", *made.articulations["arm"].bodies)
+    moving = spec.bodies[1 : len(made.moving) + 1]
+    assert [body.id for body in spec.bodies] == list(range(len(spec.bodies)))
+    assert tuple(body.name for body in moving) == made.moving
+    assert all(body.moving and body.parent == 0 for body in moving)
+    assert made.poses == tuple(body.T_world_body for body in moving)
+    assert made.poses[0] == Pose((1.0, 2.0, 3.0), IDENTITY.q)
+    assert made.poses[2] == Pose((0.0, 0.0, 0.8), IDENTITY.q)
+    assert not any(body.moving for body in spec.bodies[len(moving) + 1 :])
+    assert [visual.id for visual in spec.visuals] == list(range(len(spec.visuals)))
+    on_ball = [visual.geometry.kind for visual in spec.visuals if visual.body == 1]
+    assert on_ball == ["sphere", "capsule"]
+    assert spec.bodies[spec.cameras[0].body].name == "arm/link5"
+    assert all(store.get(address) for address in made.addresses)
+    assert spec.textures[spec.environment.skybox].kind == "skybox"
+    assert spec.textures[spec.environment.skybox].height == 2
+
+
+def test_every_process_makes_the_same_scene(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from iris_session.scene import AssetStore; "
+        "from tests.scene.test_compose import full_scene; folder = Path(sys.argv[1]); folder.mkdir(); "
+        "print(full_scene(folder).build(AssetStore(folder / 'store'), threads=3).scene_hash)"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "12345", "PYTHONPATH": str(Path(__file__).parents[2])}
+    other = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "other")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (tmp_path / "here").mkdir()
+    here = full_scene(tmp_path / "here").build(AssetStore(tmp_path / "store"))
+    assert other.stdout.strip() == here.scene_hash
+    # and from the store that knows it all
+    again = full_scene_again(tmp_path / "here").build(AssetStore(tmp_path / "store"))
+    assert again.scene_hash == here.scene_hash
+    assert again.built == 0
+    assert again.recalled == here.built + here.recalled
+
+
+def full_scene_again(folder: Path) -> SceneBuilder:
+    """The same from files that are there."""
+    (folder / "arm_description").rename(folder / "before")
+    return full_scene(folder)
+
+
+def test_shapes_are_mujocos(store: AssetStore) -> None:
+    """The same shapes by MJCF and by hand."""
+    scene = SceneBuilder()
+    turned = (HALF, HALF, 0.0, 0.0)
+    scene.add_plane(half_size=(3, 4))
+    scene.add_sphere(radius=0.1, position=(1, 0, 0), rgba=(1, 0, 0, 1))
+    scene.add_capsule(radius=0.1, half_length=0.3, quaternion=turned)
+    scene.add_ellipsoid(half_size=(0.1, 0.2, 0.3))
+    scene.add_cylinder(radius=0.2, half_length=0.4)
+    scene.add_box(half_size=(0.1, 0.2, 0.3), rgba=(0, 0.25, 1, 0.5))
+    ours = scene.build(store).spec
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+        <geom type="plane" size="3 4 1"/><geom type="sphere" size=".1" pos="1 0 0" rgba="1 0 0 1"/>
+        <geom type="capsule" size=".1 .3" quat="1 1 0 0"/><geom type="ellipsoid" size=".1 .2 .3"/>
+        <geom type="cylinder" size=".2 .4"/><geom type="box" size=".1 .2 .3" rgba="0 .25 1 .5"/>
+        </worldbody></mujoco>"""
+    )
+    theirs = parse_mujoco(model, store).spec
+    for a, b in zip(ours.visuals, theirs.visuals, strict=True):
+        assert a.geometry == b.geometry
+        np.testing.assert_allclose(a.T_body_visual.q, b.T_body_visual.q, atol=1e-12)
+        np.testing.assert_allclose(a.rgba, b.rgba, atol=1e-6)
+
+
+def test_looks(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_sphere(radius=1, rgba=(1, 1, 0))
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    picture = np.zeros((2, 2, 4), np.uint8)
+    scene.add_box(half_size=(1, 1, 1), texture=picture, repeat=(2, 3), uniform=True)
+    scene.add_box(half_size=(1, 1, 1), texture=picture.copy(), rgba=(1, 0, 0))
+    spec = scene.build(store).spec
+    assert spec.visuals[0].material == -1
+    assert spec.visuals[1].material == spec.visuals[2].material
+    material = spec.materials[spec.visuals[1].material]
+    assert (material.metallic, material.roughness, material.shininess) == (1.0, 0.25, 0.75)
+    assert len(spec.textures) == 1
+    first, second = (spec.materials[visual.material] for visual in spec.visuals[3:])
+    assert (first.repeat, first.uniform, first.rgba) == ((2.0, 3.0), True, (1.0, 1.0, 1.0, 1.0))
+    assert second.texture("rgba") == 0
+    assert second.rgba == (1.0, 0.0, 0.0, 1.0)
+
+
+def test_meshes_given_as_arrays(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    picture = np.zeros((2, 2, 3), np.uint8)
+    colors = np.uint8([[1, 2, 3], [4, 5, 6], [7, 8, 9], [10, 11, 12]])
+    uvs = SQUARE[:, :2]
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, uvs=uvs, texture=picture)
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, uvs=uvs)
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, colors=colors, normals=np.tile([0, 0, -2.0], (4, 1)))
+    spec = scene.build(store).spec
+    painted, plain, colored = (decode_mesh(store.get(mesh.levels[0].address)) for mesh in spec.meshes)
+    assert painted.uv is not None
+    np.testing.assert_array_equal(painted.uv, painted.position[:, :2])
+    np.testing.assert_array_equal(painted.normal, np.tile(np.float32([0, 0, 1]), (4, 1)))
+    assert plain.uv is None  # without a texture they say nothing
+    assert colored.color is not None
+    assert colored.color.tolist() == [[*color, 255] for color in colors.tolist()]
+    np.testing.assert_array_equal(colored.normal, np.tile(np.float32([0, 0, -1]), (4, 1)))
+    assert spec.visuals[2].rgba == (1.0, 1.0, 1.0, 1.0)
+    assert spec.visuals[1].rgba == (0.5, 0.5, 0.5, 1.0)
+
+
+def test_deformables_fit_their_stream(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_deformable("cloth", SQUARE, TRIANGLES, rgba=(0, 1, 0, 1), radius=0.002)
+    scene.add_deformable("rope", SQUARE, edges=[[0, 1], [1, 2]])
+    made = scene.build(store)
+    for name, entry in zip(("cloth", "rope"), made.spec.deformables, strict=True):
+        source = made.deformables[name]
+        assert (entry.name, entry.stream) == (name, source.stream)
+        arrays = decode_arrays(store.get(entry.address), "deformable")
+        assert bytes(arrays["plan"]) == source.topology.to_bytes()
+        np.testing.assert_array_equal(arrays["position"], source.vertices)
+        assert DeformableEncoder(source.topology, 0.0005).encode(source.vertices.astype(np.float64)) is not None
+        assert not source.vertices.flags.writeable
+    assert [entry.dim for entry in made.spec.deformables] == [2, 1]
+    assert made.spec.deformables[0].rgba == (0.0, 1.0, 0.0, 1.0)
+    assert made.spec.environment.center == (0.5, 0.5, 1.0)
+
+
+def test_surroundings(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    assert scene.build(store).spec.environment == Environment()
+    scene.add_box(half_size=(30, 40, 1), position=(1, 2, 3))
+    found = scene.build(store).spec.environment
+    assert found.center == (1.0, 2.0, 3.0)
+    assert found.extent == pytest.approx(np.linalg.norm([30, 40, 1]))
+    assert found.zfar == pytest.approx(10 * found.extent)
+    scene.environment = Environment(extent=2.0)
+    assert scene.build(store).spec.environment == Environment(extent=2.0)
+
+
+BOX = {"half_size": (1, 1, 1)}
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "text"),
+    [
+        ("add_box", {**BOX, "name": "cup", "movable": True}, "'cup' already"),
+        ("add_box", {**BOX, "movable": True}, "needs a name"),
+        ("add_box", {**BOX, "name": "x" * 65, "movable": True}, "1 to 64 characters"),
+        ("add_box", {**BOX, "name": "b", "movable": True, "on": "cup"}, "one of both"),
+        ("add_box", {**BOX, "on": "cap"}, "Movable: cup"),
+        ("add_box", {"half_size": (1, 1)}, "3 finite numbers"),
+        ("add_box", {"half_size": (1, 1, 0)}, "greater than 0"),
+        ("add_box", {**BOX, "position": (0, 0)}, "no pose"),
+        ("add_box", {**BOX, "quaternion": (0, 0, 0, 0)}, "no pose"),
+        ("add_box", {**BOX, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
+        ("add_box", {**BOX, "rgba": (1, 0)}, "4 finite numbers"),
+        ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "uint8"),
+        ("add_box", {**BOX, "texture": "/lost.png"}, "no such file"),
+        ("add_sphere", {"radius": float("inf")}, "finite"),
+        ("add_plane", {"half_size": (-1, 0)}, "half_size of a plane"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1, 4]]}, "numbers go from 0 to 3"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1]]}, r"shape \(m, 3\)"),
+        ("add_mesh", {"vertices": SQUARE * np.nan, "triangles": TRIANGLES}, "finite"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "uvs": SQUARE[:2, :2]}, "one each"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": SQUARE}, "uint8"),
+        ("add_deformable", {"name": "cup", "vertices": SQUARE, "triangles": TRIANGLES}, "'cup' already"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE}, "one of them"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE, "edges": TRIANGLES}, r"shape \(m, 2\)"),
+        ("add_light", {"kind": "laser"}, "directional, spot or point"),
+        ("add_light", {"direction": (0, 0, 0)}, "direction"),
+        ("add_camera", {"fovy": 0}, "fovy"),
+        ("set_skybox", {"pixels": np.zeros((5, 2, 3), np.uint8)}, "six squares"),
+        ("add_file", {"path": "/lost.glb"}, "no such file"),
+        ("add_urdf", {"path": "/lost.urdf"}, "no such file"),
+        ("add_urdf", {"path": "/lost.urdf", "name": "cup"}, "'cup' already"),
+    ],
+)
+def test_refusals_say_what_would_be_right(
+    store: AssetStore, method: str, arguments: dict[str, object], text: str
+) -> None:
+    scene = SceneBuilder()
+    scene.add_box("cup", half_size=(1, 1, 1), movable=True)
+    before = scene.build(store).scene_hash
+    with pytest.raises(SceneBuildError, match=text):
+        getattr(scene, method)(**arguments)
+    assert scene.build(store).scene_hash == before  # what was refused left nothing behind
+
+
+def test_public_names() -> None:
+    assert iris_session.SceneBuilder is SceneBuilder
+    assert iris_session.SceneBuildError is SceneBuildError

@@ -1,0 +1,206 @@
+"""OBJ, STL, PLY, OFF, DAE, 3MF: geometry, colours and textures as the files have them; what a file may refer to."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.composed import ComposedScene
+from iris_session.scene.files import load_file
+from iris_session.scene.parts import MAX_FILE_BYTES, matrix_of
+from iris_session.scene.references import References
+
+PIXELS = np.random.default_rng(2).integers(0, 255, (4, 8, 3), dtype=np.uint8)
+OBJ = """mtllib parts.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 0 0.25
+usemtl red
+f 1 2 3
+usemtl painted
+f 1/1 2/2 4/3
+"""
+MTL = """newmtl red
+Kd 0.8 0.2 0.2
+d 0.4
+newmtl painted
+Kd 1 1 1
+map_Kd picture.png
+"""
+
+
+def built(path: Path, tmp_path: Path, **options: object) -> tuple[ComposedScene, AssetStore]:
+    store = AssetStore(tmp_path / "store")
+    scene = SceneBuilder("test")
+    scene.add_file(path, **options)
+    return scene.build(store), store
+
+
+def write_obj(folder: Path) -> Path:
+    Image.fromarray(PIXELS).save(folder / "picture.png")
+    (folder / "parts.mtl").write_text(MTL)
+    (folder / "parts.obj").write_text(OBJ)
+    return folder / "parts.obj"
+
+
+def test_obj_with_materials_and_a_texture(tmp_path: Path) -> None:
+    scene, store = built(write_obj(tmp_path), tmp_path)
+    assert scene.skipped == ()
+    by_name = {visual.name: visual for visual in scene.spec.visuals}
+    assert by_name["red"].rgba == pytest.approx((0.8, 0.2, 0.2, 0.4), abs=0.003)
+    painted = by_name["painted"]
+    level = scene.spec.textures[scene.spec.materials[painted.material].texture()].levels[0]
+    np.testing.assert_array_equal(decode_image(store.get(level.address), level.encoding), PIXELS)
+    mesh = decode_mesh(store.get(scene.spec.meshes[painted.geometry.mesh].levels[0].address))
+    assert mesh.uv is not None
+    at = {tuple(p): tuple(uv) for p, uv in zip(mesh.position.tolist(), mesh.uv.tolist(), strict=True)}
+    assert at == {(0, 0, 0): (0, 1), (1, 0, 0): (1, 1), (0, 0, 1): (0, 0.75)}  # v goes down here, up in the file
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj", "dae", "3mf"])
+def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
+    mesh = trimesh.creation.annulus(0.2, 0.5, 0.3)
+    path = tmp_path / f"ring.{kind}"
+    mesh.export(path)
+    scene, store = built(path, tmp_path, name="ring", movable=True, up="z")
+    assert scene.moving == ("ring",)
+    visual = scene.spec.visuals[0]
+    found = decode_mesh(store.get(scene.spec.meshes[visual.geometry.mesh].levels[0].address))
+    again = trimesh.Trimesh(found.position, found.index, process=True).apply_transform(matrix_of(visual.T_body_visual))
+    unit = 0.001 if kind == "3mf" else 1.0  # which counts in millimetres
+    np.testing.assert_allclose(again.bounds, unit * mesh.bounds, atol=1e-6)
+    assert again.volume == pytest.approx(unit**3 * mesh.volume, rel=1e-5)
+
+
+def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "a.stl")
+    for up, size in ((None, (1, 2, 3)), ("z", (1, 2, 3)), ("y", (1, 3, 2))):
+        scene, _ = built(tmp_path / "a.stl", tmp_path, scale=0.01, up=up, position=(0, 0, 5))
+        assert scene.spec.environment.center == pytest.approx((0, 0, 5))
+        mesh = scene.spec.meshes[0]
+        T = matrix_of(scene.spec.visuals[0].T_body_visual)[:3, :3]
+        extent = np.abs(T @ (np.array(mesh.high) - mesh.low))
+        np.testing.assert_allclose(extent, 0.01 * np.array(size), atol=1e-7)
+    with pytest.raises(SceneBuildError, match="up is 'x'"):
+        built(tmp_path / "a.stl", tmp_path, up="x")
+    with pytest.raises(SceneBuildError, match="scale is 0"):
+        built(tmp_path / "a.stl", tmp_path, scale=0)
+    with pytest.raises(SceneBuildError, match="scale"):
+        built(tmp_path / "a.stl", tmp_path, scale=float("nan"))
+
+
+def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
+    box.visual.vertex_colors = colors
+    box.export(tmp_path / "a.ply")
+    scene, store = built(tmp_path / "a.ply", tmp_path)
+    mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
+    assert mesh.color is not None
+    for position, color in zip(mesh.position, mesh.color, strict=True):
+        vertex = int(np.flatnonzero((box.vertices == position).all(axis=1))[0])
+        assert color.tolist() == colors[vertex].tolist()
+    assert scene.spec.visuals[0].rgba == (1.0, 1.0, 1.0, 1.0)
+    box = trimesh.creation.box()
+    box.visual.face_colors = [[255, 0, 0, 255]] * 6 + [[0, 0, 255, 255]] * 6
+    box.export(tmp_path / "b.ply")
+    scene, store = built(tmp_path / "b.ply", tmp_path)
+    mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
+    assert mesh.color is not None
+    assert sorted({tuple(c) for c in mesh.color[mesh.index].reshape(-1, 4).tolist()}) == [
+        (0, 0, 255, 255),
+        (255, 0, 0, 255),
+    ]
+    # a colour that is given takes their place
+    scene, store = built(tmp_path / "b.ply", tmp_path, rgba=(0, 1, 0, 1))
+    assert decode_mesh(store.get(scene.spec.meshes[0].levels[0].address)).color is None
+    assert scene.spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
+
+
+def test_what_is_missing_is_told(tmp_path: Path) -> None:
+    path = write_obj(tmp_path)
+    (tmp_path / "picture.png").unlink()
+    scene, _ = built(path, tmp_path)
+    assert any("picture.png: there is no file" in line for line in scene.skipped)
+    (tmp_path / "parts.mtl").write_text(MTL.replace("picture.png", "../../etc/passwd"))
+    scene, _ = built(path, tmp_path)
+    assert any("outside of its own folders" in line for line in scene.skipped)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "text"),
+    [
+        ("a.stl", b"", "nothing that can be drawn|damaged"),
+        ("a.stl", b"solid x\nfacet", "nothing that can be drawn|damaged"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "nothing|damaged"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
+        ("a.dae", b"<COLLADA>", "damaged"),
+        ("a.3mf", b"PK\3\4", "damaged"),
+        ("a.glb", b"glTF", "cut"),
+        ("a.gltf", b"[]", "no glTF"),
+        ("a.gltf", b"{", "no glTF"),
+        ("a.step", b"", "are not read. These are: "),
+        ("a", b"", "are not read"),
+    ],
+)
+def test_what_is_no_such_file_is_refused(tmp_path: Path, name: str, data: bytes, text: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SceneBuildError, match=text):
+        load_file(tmp_path / name)
+
+
+def test_missing_and_large_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneBuildError, match="no such file"):
+        load_file(tmp_path / "lost.stl")
+    (tmp_path / "folder.stl").mkdir()
+    with pytest.raises(SceneBuildError, match="no such file"):
+        load_file(tmp_path / "folder.stl")
+    with (tmp_path / "large.stl").open("wb") as file:
+        file.truncate(MAX_FILE_BYTES + 1)
+    with pytest.raises(SceneBuildError, match="at most 512 MiB"):
+        load_file(tmp_path / "large.stl")
+    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a", "w") as entry:
+        for _ in range(33):
+            entry.write(bytes(16 << 20))
+    with pytest.raises(SceneBuildError, match="unpacks to 528 MiB"):
+        load_file(tmp_path / "bomb.3mf")
+
+
+def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
+    package = tmp_path / "package"
+    for folder in ("urdf/deep", "meshes", "secret"):
+        (package / folder).mkdir(parents=True)
+    (tmp_path / "other").mkdir()
+    for path in ("urdf/deep/a.stl", "meshes/a b.stl", "secret/a.stl", "../other/a.stl"):
+        (package / path).write_bytes(b"x")
+    (package / "urdf" / "meshes").symlink_to(tmp_path / "other")
+    model = package / "urdf" / "robot.urdf"
+    model.write_text("")
+    references = References(model)
+    assert references.find("deep/a.stl") == package / "urdf/deep/a.stl"
+    assert references.find("../meshes/a%20b.stl") == package / "meshes/a b.stl"
+    assert references.find(f"file://{package}/meshes/a b.stl") == package / "meshes/a b.stl"
+    assert references.find("package://package/secret/a.stl") == package / "secret/a.stl"
+    for outside in ("../secret/a.stl", "../../other/a.stl", "meshes/a.stl", "/etc/passwd", "file:///etc/passwd"):
+        with pytest.raises(SceneBuildError, match="outside of its own folders"):
+            references.find(outside)
+    for wrong in ("package://package/../other/a.stl", "package://../other/a.stl", "package:///etc/passwd"):
+        with pytest.raises(SceneBuildError, match="package"):
+            references.find(wrong)
+    (package / "package.xml").write_text("<package> <name> official </name> </package>")
+    assert References(model).find("../secret/a.stl") == package / "secret/a.stl"
+    assert References(model).find("package://official/secret/a.stl") == package / "secret/a.stl"
+    assert References(model, [tmp_path / "other"]).find("../../other/a.stl") == tmp_path / "other/a.stl"
+    with pytest.raises(SceneBuildError, match="no such folder"):
+        References(model, [tmp_path / "lost"])
