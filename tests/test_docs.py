@@ -201,7 +201,7 @@ def test_joining_by_code_as_on_the_network_page_works(tmp_path: Path, run_python
 
 @pytest.mark.e2e
 def test_examples_of_user_loops_run(run_python: Callable[..., str]) -> None:
-    for name in ("share_a_script", "own_loop"):
+    for name in ("share_a_script", "own_loop", "publish_scene"):
         output = run_python((ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8"), "0.3")
         assert re.search(r"join at 127\.0\.0\.1:[1-9]\d*", output), output
 
@@ -226,7 +226,8 @@ def test_examples_of_recordings_run(tmp_path: Path, run_python: Callable[..., st
 
 
 def test_every_example_is_run_here() -> None:
-    assert {path.stem for path in EXAMPLES} == {"share_a_script", "own_loop", "policy", "read_recording"}
+    loops = {"share_a_script", "own_loop", "publish_scene"}
+    assert {path.stem for path in EXAMPLES} == {*loops, "policy", "read_recording"}
 
 
 # --- commands ---

@@ -73,8 +73,8 @@ class SceneDraft:
             for row, name in enumerate(names):  # one of them is wrong, and this says which
                 _position(p[row].tolist(), name)
                 _unit(q[row].tolist(), name)
+        rows = [self._rows[name] if name in self._rows else self._row(name) for name in names]
         with self._lock:
-            rows = [self._row(name) for name in names]
             self._poses[rows, :3] = p
             self._poses[rows, 3:] = q / lengths[:, None]
 
