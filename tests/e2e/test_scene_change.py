@@ -18,6 +18,7 @@ from iris_session.protocol.server_messages import SceneChanged
 from iris_session.recording import Recording
 from tests.e2e.conftest import COMMAND, Server, Stage, end_all
 from tests.e2e.scene_server import RED
+from tests.recording.support import read
 
 pytestmark = pytest.mark.e2e
 
@@ -119,6 +120,8 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     with Recording.open(stage.server.recording) as recording:
         loads = [e.message for row in recording.rows() for e in decode_entries(row.entries)]
         assert [len(m.robots) for m in loads if isinstance(m, SceneLoaded)] == [2, 3]
+    drawn = {entity.split("/")[2] for entity in read(stage.server.recording) if entity.startswith("/scene/")}
+    assert drawn == {"1", "2", "3"}, "each in its time"
 
 
 def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stage, tmp_path: Path) -> None:
@@ -202,5 +205,7 @@ def test_what_is_painted_is_the_same_for_those_who_were_there_and_who_came_late_
         stage.run(lambda: ann.ready and "name=ann " in resumed.output, "she is back")
         assert ann.mirror.scene_hash == changes[-1].scene_hash
         assert resumed.finish()["ok"]
+        for part in (stage.server.folder / "session.rrd", resumed_file):
+            assert "/scene/1/world/lamp" in read(part), "the picture shows what was painted"
     finally:
         end_all([resumed])

@@ -16,6 +16,7 @@ from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
 from tests.e2e.conftest import Server, Stage
+from tests.recording.support import column, read
 
 pytestmark = pytest.mark.e2e
 
@@ -81,6 +82,10 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     lengths = np.linalg.norm(now[edges[:, 0]] - now[edges[:, 1]], axis=1)
     assert lengths.max() < 0.2, "neighbours are still neighbours"
     assert stage.server.finish()["ok"]
+    rows = column(read(stage.server.recording)["/scene/1/world/cloth"], "Mesh3D:vertex_positions")
+    lowest = [min(z for _, _, z in row) for row in rows if row is not None]
+    assert max(lowest) == pytest.approx(1.5)
+    assert min(lowest) < 1.2, "the picture of the recording shows it too"
 
 
 def test_who_comes_again_or_late_needs_nothing_anew(stage: Stage, tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import struct
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -159,7 +161,7 @@ def recorder(path: Path) -> Iterator[tuple[RecorderProcess, RecorderFeed]]:
     feed: RecorderFeed | None = None
     try:
         process.start()
-        feed = RecorderFeed(process.feed_endpoint, path.parent)
+        feed = RecorderFeed(process.feed_endpoint, path.parent, vertices_endpoint=process.vertices_endpoint)
         yield process, feed
     finally:
         if feed is not None:
@@ -215,3 +217,20 @@ def write(path: Path, header: SessionHeader, batch: Batch, rows_per_chunk: int =
         writer.flush()
     writer.close()
     return path
+
+
+def read(path: Path) -> dict[str, list[Any]]:
+    """What Rerun itself reads from a file: record batches by entity path."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[Any]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for chunk in RrdReader(str(path)).stream():
+            found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def column(batches: list[Any], name: str) -> list[Any]:
+    """Its values, a row each."""
+    return [value for batch in batches for value in batch.column(name).to_pylist()]

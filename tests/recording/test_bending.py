@@ -20,7 +20,8 @@ from iris_session.scene import AssetError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_deformables import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
-from tests.recording.test_writer import column, frame, read
+from tests.recording.support import column, read
+from tests.recording.test_writer import frame
 from tests.scene.models import flexes
 
 BOUND_M = 0.0005

@@ -17,11 +17,26 @@ import numpy as np
 import pytest
 import zmq
 
+from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import RecorderError, RecorderProcess, Recording, verify
 from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
-from tests.recording.support import SmallCore, SmallSession, record, recorder, wait_until
+from iris_session.scene import AssetStore, decode_arrays
+from iris_session.scene.mujoco_deformables import flex_mesh
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.streams.deformable import DeformableEncoder
+from tests.recording.support import (
+    TICK_NS,
+    SmallCore,
+    SmallSession,
+    column,
+    read,
+    record,
+    recorder,
+    wait_until,
+)
+from tests.scene.models import flexes
 
 pytestmark = pytest.mark.e2e
 REPOSITORY = Path(__file__).parents[2]
@@ -213,6 +228,37 @@ def test_ctrl_c_does_not_end_the_recorder(tmp_path: Path) -> None:
         assert feed.close()
         assert process.close()
     assert verify(path, SmallCore).ok
+
+
+def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: Path) -> None:
+    """Also those that were sent while the recorder stood still, as many as there is room for."""
+    path, model = tmp_path / "session.rrd", flexes()
+    store = AssetStore(tmp_path / "assets")
+    parsed = parse_mujoco(model, store)
+    encoder = DeformableEncoder(flex_mesh(model, 0).topology)
+    rest = decode_arrays(store.get(parsed.spec.deformables[0].address), ArrayKind.DEFORMABLE)["position"]
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        feed.patch(str(store.root), parsed.scene_hash)
+        for i in range(40):
+            if i == 10:
+                wait_until(lambda: _status(feed).written >= 4)
+                os.kill(process.pid, signal.SIGSTOP)
+            if i == 30:
+                os.kill(process.pid, signal.SIGCONT)
+            session.take(25)
+            frames = encoder.encode(rest + 0.01 * i)
+            assert frames is not None
+            feed.vertices("flex-0", frames["full"], (session.step_count - 8) * TICK_NS)  # a state is every eighth
+        assert feed.close(20.0)
+        assert _status(feed).vertices_refused == 0
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert (report.ok, report.steps) == (True, 1000), report.line()
+    rows = [row for row in column(read(path)["/scene/1/world/cloth"], "Mesh3D:vertex_positions") if row is not None]
+    assert len(rows) >= 30
+    highest = max(max(z for _, _, z in row) for row in rows)
+    assert highest == pytest.approx(rest[:, 2].max() + 0.39, abs=0.001)
 
 
 def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -24,26 +23,10 @@ from iris_session.recording.scene import Form
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco
-from tests.recording.support import XML, make_header
+from tests.recording.support import XML, column, make_header, read
 from tests.scene.models import every_shape
 
 IDENTITY_Q = (1.0, 0.0, 0.0, 0.0)
-
-
-def read(path: Path) -> dict[str, list[Any]]:
-    """Record batches by entity path."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, list[Any]] = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for chunk in RrdReader(str(path)).stream():
-            found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-    return found
-
-
-def column(batches: list[Any], name: str) -> list[Any]:
-    return [value for batch in batches for value in batch.column(name).to_pylist()]
 
 
 def frame(step: int, poses: np.ndarray, presence: tuple[PresenceItem, ...] = ()) -> StateFrame:
