@@ -128,6 +128,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 
 def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
     """The scene, with its assets in a store."""
+    from iris_session.protocol.scene import SceneError
     from iris_session.scene import AssetStore
 
     path = Path(arguments.scene)
@@ -137,6 +138,8 @@ def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
         return _compose(path, arguments.package_dir, store) if composed else _parse_model(arguments.scene, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
+    except SceneError as error:  # more than clients read
+        raise CommandError(str(error)) from None
 
 
 def _parse_model(scene: str, store: AssetStore) -> _Found:

@@ -7,7 +7,7 @@
 
 from iris_session.scene.arrays import decode_arrays, encode_arrays
 from iris_session.scene.build import Builder, EncodeOptions
-from iris_session.scene.errors import AssetError, AssetMissingError, SceneBuildError, SceneUnsupportedError
+from iris_session.scene.errors import AssetError, AssetMissingError, SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, encode_mesh, encode_mesh_quantised
 from iris_session.scene.store import AssetStore, Hold, default_root
@@ -29,5 +29,4 @@ __all__ = [
     "SceneBuildError",
     "AssetError",
     "AssetMissingError",
-    "SceneUnsupportedError",
 ]

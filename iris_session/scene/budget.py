@@ -10,7 +10,7 @@ import msgspec
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.scene_looks import Mesh
 from iris_session.protocol.scene_names import GeometryKind
-from iris_session.scene.totals import texture_memory, triangles
+from iris_session.scene.totals import bending, texture_memory, triangles
 
 #: Where a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].
 QUEST_OBJECTS: Final = 200
@@ -45,16 +45,20 @@ class Choice(NamedTuple):
 
 
 def choose_levels(spec: SceneSpec, budget: Budget) -> Choice:
-    """Finest levels that fit: coarsened first is what loses least detail, relative to its size, per triangle saved."""
+    """Finest levels that fit: coarsened first is what loses least detail, relative to its size, per triangle saved.
+
+    Deformables have no levels and are never left out.
+    """
+    n_bending, bending_triangles = bending(spec)
     drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
-    hidden = _hidden(spec, drawn, budget.objects)
+    hidden = _hidden(spec, drawn, max(1, budget.objects - n_bending) if budget.objects else 0)
     kept = [i for i in drawn if spec.visuals[i].id not in hidden]
-    meshes, n_triangles = _mesh_levels(spec, kept, budget.triangles)
+    meshes, n_triangles = _mesh_levels(spec, kept, budget.triangles, bending_triangles)
     textures, memory = _texture_levels(spec, budget.texture_bytes)
-    fits = (not budget.triangles or n_triangles <= budget.triangles) and (
-        not budget.texture_bytes or memory <= budget.texture_bytes
-    )
-    return Choice(meshes, textures, hidden, n_triangles, memory, len(kept), fits)
+    objects = len(kept) + n_bending
+    spent = ((n_triangles, budget.triangles), (memory, budget.texture_bytes), (objects, budget.objects))
+    fits = all(not limit or used <= limit for used, limit in spent)
+    return Choice(meshes, textures, hidden, n_triangles, memory, objects, fits)
 
 
 def _hidden(spec: SceneSpec, drawn: list[int], objects: int) -> frozenset[int]:
@@ -79,13 +83,14 @@ def _side(mesh: Mesh) -> float:
     return max(high - low for low, high in zip(mesh.low, mesh.high, strict=True))
 
 
-def _mesh_levels(spec: SceneSpec, kept: list[int], limit: int) -> tuple[tuple[int, ...], int]:
+def _mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: int) -> tuple[tuple[int, ...], int]:
+    """`besides`: triangles of what has no levels."""
     levels = [0] * len(spec.meshes)
     uses = [0] * len(spec.meshes)
     for i in kept:
         if spec.visuals[i].geometry.mesh >= 0:
             uses[spec.visuals[i].geometry.mesh] += 1
-    total = sum(triangles(spec, i) for i in kept)
+    total = besides + sum(triangles(spec, i) for i in kept)
     queue = [(_loss(spec.meshes[m], 1, uses[m]), m) for m in range(len(levels)) if _loss(spec.meshes[m], 1, uses[m])]
     heapq.heapify(queue)
     while limit and total > limit and queue:

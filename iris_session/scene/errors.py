@@ -2,8 +2,7 @@
 
 SceneBuildError           base
 |-- AssetError            bytes of an asset that cannot be decoded: damaged, hostile, or made by a newer version
-|-- AssetMissingError     an asset that the store does not have
-`-- SceneUnsupportedError something in a model that has no form in the specification
+`-- AssetMissingError     an asset that the store does not have
 """
 
 from __future__ import annotations
@@ -19,7 +18,3 @@ class AssetError(SceneBuildError):
 
 class AssetMissingError(SceneBuildError):
     """The store has no such asset."""
-
-
-class SceneUnsupportedError(SceneBuildError):
-    """The model holds what the specification cannot say."""

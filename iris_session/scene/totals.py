@@ -26,15 +26,22 @@ def with_totals(spec: SceneSpec) -> SceneSpec:
     level_bytes = {level.address: level.bytes for mesh in spec.meshes for level in mesh.levels[:1]}
     image_bytes = {level.address: level.bytes for texture in spec.textures for level in texture.levels[:1]}
     drawn = [i for i, v in enumerate(spec.visuals) if v.rgba[3] > 0 and v.group in spec.groups_shown]
+    n_bending, bending_triangles = bending(spec)
     totals = Totals(
-        objects=len(drawn) + len(spec.deformables),
-        triangles=sum(triangles(spec, i) for i in drawn),
+        objects=len(drawn) + n_bending,
+        triangles=sum(triangles(spec, i) for i in drawn) + bending_triangles,
         mesh_bytes=sum(level_bytes.values()),
         texture_bytes=sum(image_bytes.values()),
         texture_memory=sum(texture_memory(texture, texture.levels[0]) for texture in spec.textures),
         asset_bytes=sum(asset_addresses(spec).values()),
     )
     return msgspec.structs.replace(spec, totals=totals)
+
+
+def bending(spec: SceneSpec) -> tuple[int, int]:
+    """How many deformables are drawn at first, and their triangles; ropes are lines."""
+    shown = [part for part in spec.deformables if part.rgba[3] > 0 and part.group in spec.groups_shown]
+    return len(shown), sum(part.elements for part in shown if part.dim > 1)
 
 
 def triangles(spec: SceneSpec, visual: int, level: int = 0) -> int:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from iris_session.protocol.scene import SceneSpec
+from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget, choose_levels
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import report, tree
+from iris_session.scene.totals import with_totals
 from tests.scene.models import many_objects
 
 
@@ -25,6 +27,20 @@ def test_without_a_budget_everything_is_exact(spec: SceneSpec) -> None:
     assert choice.triangles == spec.totals.triangles == sum(10 * mesh.levels[0].triangles for mesh in spec.meshes)
     assert choice.objects == spec.totals.objects == 30
     assert choice.fits
+
+
+def test_what_bends_is_drawn_too(spec: SceneSpec) -> None:
+    """Hidden ones and ropes cost no triangles; none of them has levels, or is left out."""
+    cloth = Deformable("", 2, 0, 60, 5_000, 0.01, False, -1, (1.0, 1.0, 1.0, 1.0), "flex-0", "0" * 64, 100)
+    rope, hidden = msgspec.structs.replace(cloth, dim=1), msgspec.structs.replace(cloth, group=4)
+    bending = with_totals(msgspec.structs.replace(spec, deformables=(cloth, rope, hidden)))
+    assert bending.totals.objects == spec.totals.objects + 2
+    assert bending.totals.triangles == spec.totals.triangles + 5_000
+    limit = spec.totals.triangles // 2
+    choice = choose_levels(bending, Budget(triangles=limit, objects=20))
+    assert (choice.fits, choice.objects, len(choice.hidden)) == (True, 20, 12)
+    assert 5_000 < choice.triangles <= limit
+    assert not choose_levels(bending, Budget(objects=2)).fits
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.1])

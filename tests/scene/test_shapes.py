@@ -116,6 +116,14 @@ def test_inspect(tmp_path: Path, capsys: pytest.CaptureFixture[str], *, json_too
         assert "headset: nothing here" in shown
 
 
+def test_a_scene_that_no_client_would_read_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("iris_session.protocol.scene.MAX_SCENE_BYTES", 1_000)
+    assert main(["scene", "inspect", "handover", "--assets", str(tmp_path)]) == 2
+    assert "at most 1000 are read" in capsys.readouterr().err
+
+
 def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "handover.glb"
     assert main(["scene", "export", "handover", str(out), "--assets", str(tmp_path / "assets")]) == 0
