@@ -156,13 +156,14 @@ class Part:
     def append(self, data: bytes | memoryview) -> None:
         """The next bytes. Raises `AssetError` when they cannot be written."""
         rest = memoryview(data)
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError as error:
-            raise _unusable(self._cache.folder, error) from error
-        self._hash.update(data)
-        self.offset += len(data)
+        while rest:
+            try:
+                written = self._file.write(rest)
+            except OSError as error:
+                raise _unusable(self._cache.folder, error) from error
+            self._hash.update(rest[:written])
+            self.offset += written
+            rest = rest[written:]
         self._cache.stored(len(data))
 
     def finish(self) -> bool:

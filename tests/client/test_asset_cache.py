@@ -126,6 +126,30 @@ def stored(cache: AssetCache, data: bytes) -> str:
     return address
 
 
+FULL_DISK = """
+import resource, sys
+from iris_session.client import AssetCache, AssetError
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+part = AssetCache(sys.argv[1]).begin(sys.argv[2])
+try:
+    part.append(sys.stdin.buffer.read())
+except AssetError as error:
+    part.close()
+    print(error.reason, error)
+"""
+
+
+def test_a_disk_that_takes_no_more_says_so_and_what_it_took_is_gone_on_with(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path), ADDRESS]
+    done = subprocess.run(command, input=DATA, stdout=subprocess.PIPE, check=True, timeout=120)
+    assert done.stdout.startswith(b"cache the cache of assets")
+    again = AssetCache(tmp_path).begin(ADDRESS)
+    assert again.offset == 50_000
+    again.append(DATA[50_000:])
+    assert again.finish()
+    assert AssetCache(tmp_path).find(ADDRESS) == DATA
+
+
 def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) -> None:
     """A link that stood still for longer than assets are kept: what then comes is not lost."""
     cache = AssetCache(tmp_path, max_bytes=100_000)

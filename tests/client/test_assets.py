@@ -8,7 +8,9 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
+import zmq
 
 from iris_session.client import (
     AssetCache,
@@ -20,6 +22,8 @@ from iris_session.client import (
     asset_loading,
 )
 from iris_session.client.waiting import ClientGroup
+from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRequest
+from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.names import AssetRefusal
 from tests.client.harness import LiveSession
 from tests.transport.asset_rig import noise, put
@@ -258,3 +262,111 @@ def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
     until_done(client, fetch)
     fetch.check()
     assert {address: fetch.read(address) for address in store.addresses} == store.data
+
+
+# --- a session that means harm ---------------------------------------------------------------------------------------
+
+
+class Liar:
+    """Answers requests for assets in a thread: `answers(request)` makes the frames of each message."""
+
+    def __init__(self, answers: Callable[[AssetRequest], list[list[bytes]]]) -> None:
+        self._answers = answers
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self.port = self._socket.bind_to_random_port("tcp://127.0.0.1")
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            if not self._socket.poll(20):
+                continue
+            route, data = self._socket.recv_multipart()
+            request = decode_asset_request(data)
+            for frames in self._answers(request):
+                self._socket.send_multipart([route, *frames])
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._context.destroy(linger=0)
+
+
+def chunk(request: AssetRequest, total: int, data: bytes, **other: int) -> list[bytes]:
+    header = AssetChunk(1, request.request_id, request.address, request.offset, total)
+    return [encode_asset_header(msgspec.structs.replace(header, **other)), data]
+
+
+@pytest.fixture
+def turn_to(join: Callable[..., Client]) -> Iterator[Callable[..., tuple[Client, Liar]]]:
+    liars: list[Liar] = []
+
+    def make(answers: Callable[[AssetRequest], list[list[bytes]]], name: str = "ann") -> tuple[Client, Liar]:
+        liars.append(Liar(answers))
+        client = join(name)
+        welcome = client.connection.welcome
+        assert welcome is not None
+        endpoints = msgspec.structs.replace(welcome.endpoints, assets=liars[-1].port)
+        client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
+        return client, liars[-1]
+
+    yield make
+    for liar in liars:
+        liar.close()
+
+
+@pytest.mark.parametrize(
+    ("answers", "reason"),
+    [
+        (lambda r: [chunk(r, 5, b"wrong")], "hash"),
+        (lambda r: [chunk(r, 2**50, b"x")], "protocol"),
+        (lambda r: [chunk(r, 10**9 + r.request_id, b"x" * 1000)], "protocol"),
+        (lambda r: [chunk(r, 9, b"")], "protocol"),
+        (
+            lambda r: [chunk(r, 5, b"wrong", offset=1), chunk(r, 5, b"wrong", request_id=77), chunk(r, 5, b"wrong")],
+            "hash",
+        ),
+        (lambda r: [[b"\xc1"], [b"", b"", b""], chunk(r, 5, b"wrong")], "hash"),
+    ],
+    ids=["other bytes", "without end", "another size each time", "nothing", "for something else", "no protocol"],
+)
+def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
+    store: Store,
+    join: Callable[..., Client],
+    turn_to: Callable[..., tuple[Client, Liar]],
+    answers: Callable[[AssetRequest], list[list[bytes]]],
+    reason: str,
+) -> None:
+    client, _ = turn_to(answers)
+    address = store.addresses[0]
+    fetch = client.fetch_assets([address])
+    until_done(client, fetch)
+    assert fetch.failed[address].reason == reason
+    assert client.asset_cache.find(address) is None
+    honest = join("bob")
+    again = honest.fetch_assets([address])
+    until_done(honest, again)
+    assert again.read(address) == store.data[address], "what the liar left in the cache does no harm"
+
+
+def test_a_frame_larger_than_any_is_not_taken_into_memory(
+    store: Store, turn_to: Callable[..., tuple[Client, Liar]]
+) -> None:
+    """libzmq ends the connection; the client asks again by another."""
+    address, data = store.addresses[0], store.data[store.addresses[0]]
+    told: list[int] = []
+
+    def answers(request: AssetRequest) -> list[list[bytes]]:
+        told.append(request.offset)
+        large = bytes(MAX_ASSET_CHUNK_BYTES + 1)
+        return [chunk(request, len(large), large) if len(told) == 1 else chunk(request, len(data), data)]
+
+    client, _ = turn_to(answers)
+    fetch = client.fetch_assets([address])
+    assert client.wait_for(lambda _: len(told) == 1, DEADLINE_S)
+    client._drop_asset_link()  # as after `PATIENCE_NS`
+    until_done(client, fetch)
+    assert told == [0, 0]
+    assert (fetch.read(address), fetch.bytes_received, client.assets_malformed) == (data, len(data), 0)
