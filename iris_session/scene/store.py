@@ -210,9 +210,10 @@ class AssetStore:
                 break
             if entry.name not in held:
                 with contextlib.suppress(FileNotFoundError):
-                    os.unlink(entry.path)
-                    self._total -= size
-                    self.evicted += 1
+                    if os.stat(entry.path, follow_symlinks=False).st_mtime == used:  # nobody has used it meanwhile
+                        os.unlink(entry.path)
+                        self._total -= size
+                        self.evicted += 1
         # Where everything is in use, not every file is looked at again for each that comes.
         self._look_at = max(self.limit_bytes, self._total + n_bytes + self.limit_bytes // 64)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +224,24 @@ def test_bodies_are_those_of_the_state_stream(tmp_path: Path, older: bool) -> No
     targets = {spec.cameras[0].target, spec.lights[0].target}
     assert targets == {body.id for body in spec.bodies if body.name.startswith("cloth")}
     assert decode_scene(encode_scene(spec)) == spec
+
+
+def test_the_hash_of_a_scene_is_the_same_wherever_it_is_made(tmp_path: Path) -> None:
+    """With another number of threads, another order of sets, and nothing remembered."""
+    program = (
+        "import sys; from iris_session.scene import AssetStore\n"
+        "from iris_session.scene.mujoco_scene import parse_mujoco; from tests.scene.models import every_shape, flexes\n"
+        "for n, model in enumerate((every_shape(), flexes())):\n"
+        "    print(parse_mujoco(model, AssetStore(f'{sys.argv[1]}/{n}'), threads=1, sites=True).scene_hash)"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "4321", "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    elsewhere = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120, env=environment)
+    here = [
+        parse_mujoco(model, AssetStore(tmp_path / f"here{n}"), threads=8, sites=True).scene_hash
+        for n, model in enumerate((every_shape(), flexes()))
+    ]
+    assert elsewhere.stdout.split() == here
 
 
 def test_skins_are_named_as_left_out(tmp_path: Path) -> None:

@@ -217,6 +217,25 @@ def test_a_file_that_goes_while_the_store_is_looked_through(tmp_path: Path, monk
     assert address not in AssetStore(tmp_path)
 
 
+def test_what_another_process_takes_up_while_room_is_made_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It marks as used what it has built before, and then holds it: both may come after we have looked."""
+    store = AssetStore(tmp_path, limit_bytes=1_500)
+    taken, other = store.put(b"t" * 1_000), store.put(b"o" * 400)
+    for address in (taken, other):
+        age(store, address, GRACE_S + 100)
+    files = store._files
+
+    def taken_up_after() -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
+        yield from files()
+        AssetStore(tmp_path).used(taken, 1_000)
+
+    monkeypatch.setattr(store, "_files", taken_up_after)
+    store.put(b"n" * 1_000)
+    assert (taken in store, other in store, store.evicted) == (True, False, 1)
+
+
 def test_a_hold_ends_in_whatever_thread(tmp_path: Path) -> None:
     """A scene is made by one thread and let go by another: a lock that stays open costs a descriptor each time."""
     store = AssetStore(tmp_path)
