@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import ipaddress
-import select
+import selectors
 import socket
 import time
 from collections.abc import Generator
@@ -92,7 +92,9 @@ class BeaconListener:
 
     def wait(self, timeout_s: float) -> None:
         """Until something comes, at most `timeout_s`."""
-        select.select([self._socket], [], [], max(0.0, timeout_s))
+        with selectors.DefaultSelector() as selector:  # `select` takes no descriptor above 1023
+            selector.register(self._socket, selectors.EVENT_READ)
+            selector.select(max(0.0, timeout_s))
 
     def _take(self, data: bytes, sender: str) -> None:
         try:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import resource
 import socket
 import threading
 import time
@@ -71,6 +73,22 @@ def test_somebody_else_cannot_send_us_to_a_port_of_our_own() -> None:
         listener._take(other(host="::1"), "10.0.0.9")
         assert listener.sessions() == []
         assert listener.ignored == {"foreign_loopback": 2}
+
+
+def test_sessions_are_found_by_a_process_with_a_thousand_open_files() -> None:
+    wanted = 1100
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    assert hard == resource.RLIM_INFINITY or hard > wanted, "this test needs more open files"
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, wanted + 100), hard))
+    with BeaconListener(0) as listener, contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
+        port = listener._socket.getsockname()[1]
+        high = fcntl.fcntl(listener._socket.fileno(), fcntl.F_DUPFD, wanted)
+        listener._socket.close()
+        listener._socket = socket.socket(fileno=high)
+        sender.sendto(other(), ("127.0.0.1", port))
+        listener.wait(30.0)
+        assert [one.name for one in listener.sessions()] == ["lab-1"]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_a_port_that_cannot_be_listened_on_is_told() -> None:
