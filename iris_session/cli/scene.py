@@ -143,9 +143,12 @@ def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
 
 
 def _parse_model(scene: str, store: AssetStore) -> _Found:
+    from iris_session.physics import World
     from iris_session.scene.mujoco_scene import parse_mujoco
 
-    parsed = parse_mujoco(open_scene(scene).model, store, name=Path(scene).stem)
+    model = open_scene(scene).model
+    beginning = World(model, (), ()).initial_data()  # as a session begins: in the keyframe `home`, if there is one
+    parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
     return _Found(parsed.spec, parsed.scene_hash, parsed.skipped)
 
 

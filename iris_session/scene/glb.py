@@ -16,10 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from anchors.pose import compose, inverse
 from iris_session.protocol.common import Pose
-from iris_session.protocol.scene import SceneSpec, Visual
+from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.collected import composed
 from iris_session.scene.glb_views import add_viewpoints
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
@@ -60,7 +62,11 @@ class _Glb:
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
 
     def finish(self) -> bytes:
-        nodes = {body.id: self._node(body.name or f"body_{body.id}", body.T_parent_body) for body in self._spec.bodies}
+        T_world = {body.id: body.T_world_body for body in self._spec.bodies}
+        nodes = {
+            body.id: self._node(body.name or f"body_{body.id}", _as_it_stands(body, T_world.get(body.parent)))
+            for body in self._spec.bodies
+        }
         for body in self._spec.bodies:
             self._children(nodes.get(body.parent, 0)).append(nodes[body.id])
         for visual in self._spec.visuals:
@@ -262,6 +268,18 @@ def _linear_colors(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     shone = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     shone[:, 3] = v[:, 3]
     return shone.astype(np.float32)
+
+
+def _as_it_stands(body: Body, T_world_parent: Pose | None) -> Pose:
+    """In its parent, as the scene begins: joints need not be at zero then."""
+    T_world_body = body.T_world_body
+    if T_world_parent is None:
+        return T_world_body
+    at_zero = composed(T_world_parent, body.T_parent_body)
+    if np.allclose((*at_zero.p, *at_zero.q), (*T_world_body.p, *T_world_body.q), rtol=0, atol=1e-9):
+        return body.T_parent_body  # to the bit
+    T_parent_world = inverse((T_world_parent.p, T_world_parent.q))
+    return Pose(*compose(T_parent_world, (T_world_body.p, T_world_body.q)))
 
 
 def _linear(value: float) -> float:

@@ -116,6 +116,30 @@ def test_inspect(tmp_path: Path, capsys: pytest.CaptureFixture[str], *, json_too
         assert "headset: nothing here" in shown
 
 
+def test_a_scene_is_exported_as_a_session_begins(tmp_path: Path) -> None:
+    """In the keyframe `home`, where joints are not at zero."""
+    model = tmp_path / "arm.xml"
+    model.write_text(
+        """<mujoco><worldbody><body name="upper" pos="0 0 1" euler="0 0 30"><joint name="a" axis="0 1 0"/>
+        <geom size=".1"/><body name="lower" pos=".5 0 0"><joint name="b" axis="1 0 0"/><geom size=".1"/>
+        <body name="tool" pos="0 .3 0" euler="40 0 0"><geom type="box" size=".1 .2 .3"/></body></body></body>
+        </worldbody><keyframe><key name="zero" qpos="0 0"/><key name="home" qpos=".7 -1.1"/></keyframe></mujoco>"""
+    )
+    out = tmp_path / "arm.glb"
+    assert main(["scene", "export", str(model), str(out), "--assets", str(tmp_path / "assets")]) == 0
+    scene = trimesh.load_scene(out)
+    compiled = mujoco.MjModel.from_xml_path(str(model))
+    data = mujoco.MjData(compiled)
+    mujoco.mj_resetDataKeyframe(compiled, data, 1)
+    mujoco.mj_kinematics(compiled, data)
+    y_up = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+    for name in ("upper", "lower", "tool"):
+        T_world_body = np.eye(4)
+        T_world_body[:3, :3] = data.body(name).xmat.reshape(3, 3)
+        T_world_body[:3, 3] = data.body(name).xpos
+        np.testing.assert_allclose(scene.graph[name][0], y_up @ T_world_body, atol=1e-6)
+
+
 def test_a_scene_that_no_client_would_read_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
