@@ -139,8 +139,9 @@ class SceneBuilder:
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
+        look = look_of(options)
         body, T_body_thing = self._place(name, options, named=True)
-        self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look_of(options), flat=self._moves(body))
+        self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
         return name
 
     def add_urdf(
@@ -263,8 +264,8 @@ class SceneBuilder:
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _shape(self, kind: str, name: str, size: tuple[float, ...], options: Options) -> str:
-        body, matrix = self._place(name, options)
         look = look_of(options) or Look()
+        body, matrix = self._place(name, options)
         self._world.items.append(Item(body, cut(name), matrix, look, kind=kind, size=(size[0], size[1], size[2])))
         return name
 

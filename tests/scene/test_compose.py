@@ -215,6 +215,7 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_box", {**BOX, "position": (0, 0)}, "no pose"),
         ("add_box", {**BOX, "quaternion": (0, 0, 0, 0)}, "no pose"),
         ("add_box", {**BOX, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
+        ("add_box", {**BOX, "name": "b", "movable": True, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
         ("add_box", {**BOX, "rgba": (1, 0)}, "4 finite numbers"),
         ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "uint8"),
         ("add_box", {**BOX, "texture": "/lost.png"}, "no such file"),

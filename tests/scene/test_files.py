@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import zipfile
 from pathlib import Path
 
@@ -175,6 +176,23 @@ def test_missing_and_large_files_are_refused(tmp_path: Path) -> None:
             entry.write(bytes(16 << 20))
     with pytest.raises(SceneBuildError, match="unpacks to 528 MiB"):
         load_file(tmp_path / "bomb.3mf")
+
+
+@pytest.mark.parametrize(
+    ("package", "name"), [("trimesh", "a.stl"), ("collada", "a.dae"), ("yourdfpy", "a.urdf"), ("PIL", "a.png")]
+)
+def test_what_is_not_installed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, name: str
+) -> None:
+    (tmp_path / name).write_bytes(b"<robot name='r'><link name='a'/></robot>")
+    monkeypatch.setitem(sys.modules, package, None)
+    scene = SceneBuilder()
+    add = {
+        "PIL": lambda: scene.add_box(half_size=(1, 1, 1), texture=tmp_path / name),
+        "yourdfpy": lambda: scene.add_urdf(tmp_path / name),
+    }.get(package, lambda: scene.add_file(tmp_path / name))
+    with pytest.raises(SceneBuildError, match=r"pip install 'iris-session\[files\]'"):
+        add()
 
 
 def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
