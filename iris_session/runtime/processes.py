@@ -272,8 +272,9 @@ class SessionProcesses:
         self._note()
         if self.front is not None and not self.front.alive and self._front_backoff.dead(now_ns):
             self.front.set_anchors(stepper.core.authority.anchors)
+            fault = self.front.fault or "ended"
             what = replaced(self.front.restart, FrontError)
-            stepper.post(Marker(request_id=0, text=f"the front process ended and {what}"))
+            stepper.post(Marker(request_id=0, text=f"the front process {fault} and {what}"))
         if self.supervisor is not None and self.feed is not None:
             for text in self.supervisor.look(now_ns, self.feed.silence_ns):
                 stepper.post(Marker(request_id=0, text=text))

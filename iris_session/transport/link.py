@@ -28,8 +28,6 @@ _SEND_QUEUE: Final = 256
 _BACKLOG: Final = 4096
 #: Presence follows a state frame, so that clients are woken once for both; alone when no state came for so long.
 PRESENCE_ALONE_NS: Final = 50_000_000
-#: A front says something at least every `link_messages.BEAT_NS`, however busy; one that does not for so long hangs.
-HANGING_NS: Final = 1_500_000_000
 #: Longest time between two looks at the link that counts as silence of the front.
 LOOKED_NS: Final = 100_000_000
 #: State frames come at tick times, so their distance varies by a tick.
@@ -41,7 +39,7 @@ class FrontLink:
 
     `ports`: where the front listens, `None` until it is ready. `failure`: why it could not start. `status`: its
     counters, and those of the fronts before it. `state_drops`: state frames that the front did not take. `overrun`:
-    it reads nothing any more. `hangs`: it says nothing any more.
+    it reads nothing any more.
     """
 
     def __init__(self, config: FrontConfig, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -88,9 +86,9 @@ class FrontLink:
         return endpoint
 
     @property
-    def hangs(self) -> bool:
-        """Nothing came from a front that was ready, for so long that it would have said that it lives."""
-        return self.ports is not None and self._silence_ns > HANGING_NS
+    def silence_ns(self) -> int:
+        """How long we have looked and a front that was ready has said nothing."""
+        return self._silence_ns if self.ports is not None else 0
 
     @property
     def now_ns(self) -> int:

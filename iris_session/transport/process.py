@@ -23,9 +23,16 @@ from iris_session.protocol.common import Pose
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
 from iris_session.transport.media_source import MediaSource
+from iris_session.transport.starvation import Starvation
 
 #: Room is left for our own names, of folder and socket.
 LONGEST_FOLDER: Final = 75
+#: A front says something at least every `link_messages.BEAT_NS`, however busy; one that does not for so long hangs.
+HANGING_NS: Final = 1_500_000_000
+#: One that gets no processor is waited for so long.
+STARVED_NS: Final = 15_000_000_000
+#: From this silence on it is seen whether it gets one.
+_QUIET_NS: Final = 500_000_000
 
 
 class FrontProcess:
@@ -53,6 +60,7 @@ class FrontProcess:
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
         self._source = MediaSource(self.media_endpoint)
+        self._starvation = Starvation()
         self.link = FrontLink(config)
 
     @property
@@ -70,8 +78,25 @@ class FrontProcess:
         """Whether the front runs, reads its link and says something now and then, or is being replaced."""
         if self._replacing is not None and self._replacing.is_alive():
             return True
-        running = self._process is not None and self._process.poll() is None
-        return running and not self.link.overrun and not self.link.hangs
+        return not self.fault
+
+    @property
+    def fault(self) -> str:
+        """What a front did that is to be replaced, empty while all is well."""
+        process = self._process
+        if process is None or process.poll() is not None:
+            return "ended"
+        if self.link.overrun:
+            return "read nothing any more"
+        return "" if not self._hangs(process.pid) else f"said nothing for {self.link.silence_ns * 1e-9:.1f} s"
+
+    def _hangs(self, pid: int) -> bool:
+        silence_ns = self.link.silence_ns
+        if silence_ns < _QUIET_NS:
+            self._starvation.clear()
+            return False
+        starved = self._starvation.look(pid, time.monotonic_ns())
+        return silence_ns > (STARVED_NS if starved else HANGING_NS)
 
     @property
     def restarts(self) -> int:
