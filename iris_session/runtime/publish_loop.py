@@ -109,13 +109,14 @@ class PublishLoop:
             raise OwnershipError("the session is closed: nothing can be published any more")
 
     def close(self) -> None:
-        """Takes the frame that waits, and ends the helper."""
+        """Takes the frame that waits, and ends the helper. After an error no step is taken any more."""
         self._closed.set()
         self._wake.set()
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
-            self._take()
+            if self._error is None:
+                self._take()
 
     # --- steps, with the lock held ------------------------------------------------------------------------------------
 

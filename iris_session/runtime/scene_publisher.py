@@ -84,6 +84,8 @@ class ScenePublisher(Owner):
         """
         if self._processes is not None:
             return
+        if self._loop is not None:
+            raise OwnershipError("the session is closed: make another ScenePublisher")
         where = self.config.assets
         try:
             store = AssetStore(None if isinstance(where, bool) else where)
@@ -116,11 +118,13 @@ class ScenePublisher(Owner):
         False: the recording is incomplete, `recording_fault` says why.
         """
         self._stop.set()
-        if self._loop is not None:
-            self._loop.close()
-        if self._processes is not None:
-            self.recording_fault = self._processes.close()
-            self._processes = None
+        try:
+            if self._loop is not None:
+                self._loop.close()
+        finally:
+            if self._processes is not None:
+                self.recording_fault = self._processes.close()
+                self._processes = None
         return not self.recording_fault
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:

@@ -166,6 +166,8 @@ def test_nothing_is_set_before_the_start_or_published_after_the_end() -> None:
     with pytest.raises(OwnershipError, match="closed"):
         session.publish()
     assert session.close()
+    with pytest.raises(OwnershipError, match="make another"):
+        session.start()
 
 
 def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
