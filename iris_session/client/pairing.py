@@ -22,7 +22,8 @@ from iris_session.protocol.security import Pair, Paired
 from iris_session.protocol.server_messages import ProtocolFault, Refused
 
 ANSWER_S: Final = 5.0
-#: Where many pair at once, or the session's disk is slow, it says so: the same is asked again, for so long.
+#: Where many pair at once it says so, where its disk is slow it says nothing for a while: the same is asked again, for
+#: so long. Who has paired gets the same answer again.
 AGAIN_S: Final = 1.0
 PATIENCE_S: Final = 20.0
 MAX_NAME: Final = 64  # as `protocol.common.Name`
@@ -81,19 +82,23 @@ def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generat
         except RefusedError as refused:
             if refused.code != RefusalCode.RATE or time.monotonic() > until:
                 raise
+        except TimeoutError as silent:
+            if time.monotonic() > until:
+                raise NotConnectedError(str(silent)) from None
         again = time.monotonic() + AGAIN_S
         while time.monotonic() < again:
             yield
 
 
 def _answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None, Paired]:
+    """Raises `TimeoutError` after a while without a word, and as `pair_key`."""
     until = time.monotonic() + ANSWER_S
     while True:
         try:
             message = decode_server(asking.recv_multipart(zmq.NOBLOCK)[0]).message
         except zmq.Again:
             if time.monotonic() > until:
-                raise NotConnectedError(f"the session at {address} did not answer within {ANSWER_S:g} s") from None
+                raise TimeoutError(f"the session at {address} did not answer within {PATIENCE_S:g} s") from None
             yield
             continue
         except ProtocolError as error:

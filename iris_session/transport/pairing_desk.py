@@ -36,6 +36,8 @@ ADDRESS_BURST: Final = 12
 #: How long an attempt may wait for its turn, and how many may: a client waits 5 s for the answer.
 PATIENCE_NS: Final = 2 * SECOND
 MAX_WAITING: Final = 32
+#: Who paired last, and may ask again what was answered.
+MAX_TOLD: Final = 32
 #: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
@@ -67,6 +69,7 @@ class PairingDesk:
         self._complaints = TokenBucket(PER_SECOND, BURST)
         self._waiting: deque[_Waiting] = deque()
         self._trying = False
+        self._told: dict[str, tuple[bytes, Paired]] = {}  # who has paired lately: proof and answer, by fingerprint
         self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
@@ -125,12 +128,21 @@ class PairingDesk:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
         elif fingerprint(raw_key(key)) in self._keyring.revoking:
             self._refuse(route, REVOKED, "ask for another join code")
+        elif (again := self._paired_before(key, pair)) is not None:
+            self._outbox.send_to_route(route, again)
         elif not self.open:
             mark = fingerprint(raw_key(key))
             self._audit.note(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
             self._refuse(route, "no join code can be used now", "run `iris-session pair` where the session runs")
         else:
             self._waiting.append(_Waiting(route, address, key, pair, now_ns))
+
+    def _paired_before(self, key: str, pair: Pair) -> Paired | None:
+        """The answer to an attempt that succeeded, where it is made again: the first may have been lost, or too late.
+        `None` where it is another one, and for a key that is off the list by now."""
+        mark = fingerprint(raw_key(key))
+        proof, answer = self._told.get(mark, (b"", None))
+        return answer if pairing.same(proof, pair.proof) and self._keyring.find(mark) is not None else None
 
     def turn(self, now_ns: int) -> None:
         """Begins the next attempt when the one before is done."""
@@ -186,8 +198,12 @@ class PairingDesk:
             self._audit.note(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=waiting.address, detail=roles
             )
-            proof = pairing.server_proof(attempt.secret, key.raw_public, client)
-            self._outbox.send_to_route(waiting.route, Paired(proof, entry.roles))
+            paired = Paired(pairing.server_proof(attempt.secret, key.raw_public, client), entry.roles)
+            self._told.pop(mark, None)
+            while len(self._told) >= MAX_TOLD:
+                del self._told[next(iter(self._told))]
+            self._told[mark] = waiting.pair.proof, paired
+            self._outbox.send_to_route(waiting.route, paired)
             return
         self._count_wrong(waiting.address, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED

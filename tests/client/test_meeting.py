@@ -208,6 +208,7 @@ def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
 def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """As when a class puts on its headsets: nobody has to type the code again."""
     monkeypatch.setattr(pairing_module, "AGAIN_S", 0.01)
+    monkeypatch.setattr(pairing_module, "ANSWER_S", 1.0)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server, own, code = KeyPair.new(), KeyPair.new(), "7KQ2-M4XD-9PTR"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -220,16 +221,17 @@ def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.Mo
     asked: list[bytes] = []
 
     def answer() -> None:
-        for said in (busy, busy, yes):
+        for said in (busy, None, busy, yes):
             route, request = session.recv_multipart()
             asked.append(request)
-            session.send_multipart([route, encode_server(ServerEnvelope(1, 0, said))])
+            if said is not None:
+                session.send_multipart([route, encode_server(ServerEnvelope(1, 0, said))])
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     deque(pair_key(Address("127.0.0.1", port), server.public, own, code, "ann"), maxlen=0)
     thread.join()
-    assert len(asked) == 3
+    assert len(asked) == 4
     assert len(set(asked)) == 1
     context.destroy(linger=0)
 

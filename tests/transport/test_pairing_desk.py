@@ -212,6 +212,31 @@ def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
     assert desk.keyring.find(own.fingerprint) is not None
 
 
+def test_who_has_paired_and_did_not_hear_it_is_told_again(desk: Desk) -> None:
+    """The answer came too late, or its connection broke: the code is used up, and the key is on the list."""
+    own = KeyPair.new()
+    code, _ = desk.home.codes.make(desk.server)
+    proof = desk.proof(code, own)
+    desk.asks(own, proof)
+    first = desk.answer(own)
+    assert isinstance(first, Paired)
+    _, other = desk.home.codes.make(desk.server)
+    desk.asks(own, proof)
+    assert desk.answers(own) == [first, first], "at once"
+    kept = desk.home.codes.find(other.id)
+    assert kept is not None
+    assert kept.attempts_left == other.attempts_left, "it is no attempt at another code"
+    desk.asks(KeyPair.new(), proof, descriptor=2)
+    desk.asks(own, b"x" * 32)
+    turns(desk.turn, lambda: len(desk.answers(own)) == 3)
+    assert desk.answers(own)[2].code == RefusalCode.CODE
+    desk.home.clients.revoke(own.fingerprint)
+    turns(desk.turn, lambda: desk.keyring.find(own.fingerprint) is None)
+    desk.asks(own, proof)
+    turns(desk.turn, lambda: len(desk.answers(own)) == 4)
+    assert desk.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
+
+
 def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
