@@ -27,14 +27,18 @@ def load_model(path: str | Path) -> mujoco.MjModel:
     path = Path(path).expanduser()
     if not path.is_file():
         raise ModelNotFoundError(f"model file {str(path)!r} does not exist{_siblings(path)}")
+    suffix = path.suffix.lower()
+    if suffix not in (*TEXT_SUFFIXES, ".mjb"):
+        raise ModelNotFoundError(f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}")
+    read = mujoco.MjModel.from_binary_path if suffix == ".mjb" else mujoco.MjModel.from_xml_path
     try:
-        if path.suffix.lower() in TEXT_SUFFIXES:
-            return mujoco.MjModel.from_xml_path(str(path))
-        if path.suffix.lower() == ".mjb":
-            return mujoco.MjModel.from_binary_path(str(path))
+        model = read(str(path))
+        bytes(model.names).decode()
+    except UnicodeDecodeError as error:  # MuJoCo takes any bytes, and then cannot give the name
+        raise ModelInvalidError(f"{path.name}: a name in it is not UTF-8: save the file as UTF-8") from error
     except (ValueError, mujoco.FatalError) as error:
         raise ModelInvalidError(f"{path.name}: {one_line(error)}") from error
-    raise ModelNotFoundError(f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}")
+    return model
 
 
 def _siblings(path: Path) -> str:

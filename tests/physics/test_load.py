@@ -51,3 +51,13 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(ModelInvalidError, match="these 4 bytes are no model of MuJoCo"):
         model_from_bytes(b"nope")
+
+
+def test_names_that_are_not_text_are_said_at_once(tmp_path: Path) -> None:
+    """MuJoCo compiles them, and raises whenever somebody asks for the name."""
+    path = tmp_path / "latin.xml"
+    path.write_bytes(b'<mujoco><worldbody><body name="Z\xf6e"><geom size=".1"/></body></worldbody></mujoco>')
+    with pytest.raises(ModelInvalidError, match="save the file as UTF-8"):
+        load_model(path)
+    path.write_text('<mujoco><worldbody><body name="Zöe"><geom size=".1"/></body></worldbody></mujoco>', "utf-8")
+    assert load_model(path).body("Zöe").id == 1
