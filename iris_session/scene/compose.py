@@ -191,7 +191,7 @@ class SceneBuilder:
             raise SceneBuildError(f"deformable {name!r} needs triangles (m, 3) or edges (m, 2): one of them")
         points = given_vertices(vertices)
         elements = triangles_of(triangles if edges is None else edges, len(points), 3 if edges is None else 2)
-        (half,) = numbers("radius", [radius], 1)
+        (half,) = numbers("radius", [radius], 1, above=0.0)
         look = look_of(looks) or Look()
         coordinates = None if uvs is None else given_vertices(uvs, 2, len(points))
         self._world.flexibles.append(Flexible(name, points, elements, coordinates, half, flat, look))

@@ -228,6 +228,7 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": SQUARE}, "uint8"),
         ("add_deformable", {"name": "cup", "vertices": SQUARE, "triangles": TRIANGLES}, "'cup' already"),
         ("add_deformable", {"name": "d", "vertices": SQUARE}, "one of them"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "radius": 0}, "greater than 0"),
         ("add_deformable", {"name": "d", "vertices": SQUARE, "edges": TRIANGLES}, r"shape \(m, 2\)"),
         ("add_light", {"kind": "laser"}, "directional, spot or point"),
         ("add_light", {"direction": (0, 0, 0)}, "direction"),
