@@ -31,6 +31,8 @@ from iris_session.streams.errors import StreamError
 
 #: A scene whose assets did not come is tried again after so many calls of `tend`: who polls has the clock.
 RETRY_CALLS: Final = 500
+#: Largest asset of a deformable in memory, about twice what the largest mesh has: it is read where the client polls.
+MAX_ASSET_BYTES: Final = 128 << 20
 
 
 class _Mesh:
@@ -39,7 +41,7 @@ class _Mesh:
     feed: MediaFeed
 
     def __init__(self, key: str, spec: Deformable, asset: bytes) -> None:
-        arrays = decode_arrays(asset, ArrayKind.DEFORMABLE)
+        arrays = decode_arrays(asset, ArrayKind.DEFORMABLE, MAX_ASSET_BYTES)
         topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
         self.key, self.stream = key, spec.stream
         self.decoder = DeformableDecoder(topology)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from iris_session.client import AssetCache, Client
-from iris_session.client.deformables import Deformables, keys
+from iris_session.client.deformables import MAX_ASSET_BYTES, Deformables, _Mesh, keys
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
 from iris_session.protocol.scene_names import ArrayKind
-from iris_session.scene import AssetStore
+from iris_session.scene import AssetError, AssetStore
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
@@ -119,3 +119,15 @@ def test_numbers_of_vertices_that_cannot_be_are_a_fault(
         assert not client._feeds, "nothing of it is subscribed to"
     finally:
         live.close()
+
+
+def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
+    """A few kilobytes of nothing, which `poll` would unpack for a second and keep."""
+    store = AssetStore(tmp_path)
+    part = parse_mujoco(flexes(), store).spec.deformables[0]
+    arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
+    padding = Stored("padding", np.zeros(MAX_ASSET_BYTES, np.uint8))
+    bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(Stored(*item) for item in arrays.items()), padding])
+    assert len(bomb) < 100_000
+    with pytest.raises(AssetError, match=f"at most {MAX_ASSET_BYTES}"):
+        _Mesh("a", part, bomb)
