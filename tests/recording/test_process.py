@@ -251,7 +251,8 @@ def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: P
             assert frames is not None
             feed.vertices("flex-0", frames["full"], (session.step_count - 8) * TICK_NS)  # a state is every eighth
         assert feed.close(20.0)
-        assert _status(feed).vertices_refused == 0
+        assert feed.stats.recorder is not None
+        assert feed.stats.recorder.vertices_refused == 0
         assert process.close()
     report = verify(path, SmallCore)
     assert (report.ok, report.steps) == (True, 1000), report.line()
