@@ -146,6 +146,7 @@ class RrdWriter:
         self._write_latencies()
         self.flush()
         self._picture.draw((-1, 0, 0, 0))  # without a state: it is to be seen all the same
+        self.flush()
         self._mark()
         mark = EndMark(*self._newest_row)
         self._static(paths.END, rr.AnyValues(end=pa.array([_encode(mark)], pa.binary())))
