@@ -130,8 +130,9 @@ def own_sessions() -> str:
     try:
         notes = KeyHome().sessions.read()
     except KeysError:
-        return ""
-    return "".join(f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
+        notes = []
+    yours = (f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
+    return "".join(yours) or "; for one on another machine, give its address or --session NAME"
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:

@@ -70,7 +70,7 @@ def conditions(report: StatusReport, own_id: str = "") -> list[Finding]:
     first = session(report)
     return [
         first,
-        alignment(people),
+        alignment(people, ", ".join(one.anchor_id for one in report.anchors)),
         *headsets.headsets(people, report),
         leases(people, report.robots),
         *([] if first.failed and not report.estop else stepping),
@@ -105,17 +105,10 @@ def session(report: StatusReport) -> Finding:
     return ok("session", f"steps: tick {report.tick}, {1e9 / max(1, report.tick_period_ns):.0f} Hz")
 
 
-def alignment(people: tuple[ParticipantReport, ...]) -> Finding:
-    """Who cannot drive, or sees the scene in the wrong place, for want of an alignment."""
+def alignment(people: tuple[ParticipantReport, ...], sheets: str = "") -> Finding:
+    """Who cannot drive, or sees the scene in the wrong place, for want of an alignment. `sheets`: of the session."""
     void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE]
-    texts = []
-    for p in void:
-        lost = (
-            f" (lost {_seconds(p.alignment_void_ns)} ago: its tracking frame jumped)"
-            if p.alignment_void_ns >= 0
-            else ""
-        )
-        texts.append(f"{p.name} has no alignment{lost}")
+    texts = [f"{p.name} has no alignment{_unaligned(p)}" for p in void]
     measured = [p for p in people if p.alignment == AlignmentKind.MEASURED]
     fine = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
     if not texts:
@@ -123,9 +116,23 @@ def alignment(people: tuple[ParticipantReport, ...]) -> Finding:
             "alignment", f"stated error at the robot: {fine}" if fine else "nobody here needs one, or all have it"
         )
     why = "the headset has not seen an anchor well enough since it joined or since its tracking frame jumped"
-    advice = "look at the sheet, nearer or from a second place"
+    advice = "look at the sheet, nearer or from a second place" + (
+        f"; sheets of this session: {sheets}" if sheets else ""
+    )
     say = failed if any(p.role in DRIVERS for p in void) else warning
     return say("alignment", "; ".join(texts), why, advice)
+
+
+def _unaligned(p: ParticipantReport) -> str:
+    """Why it has none, as far as can be told."""
+    seen = p.alignment_report
+    if p.alignment_void_ns >= 0:
+        return f" (lost {_seconds(p.alignment_void_ns)} ago: its tracking frame jumped)"
+    if seen is None or seen.seen:
+        return ""
+    return (
+        f" ({seen.unusable} observations, none of a sheet of this session that could be used)" if seen.unusable else ""
+    )
 
 
 def leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotReport, ...]) -> Finding:

@@ -18,8 +18,7 @@ from iris_session.protocol.names import DenialReason, RefusalCode
 from iris_session.protocol.pairing import normal_code
 from iris_session.protocol.status import StatusReport, quantiles
 
-#: Greeting, keys and hello are seven ways there and back: enough for one of a second.
-JOIN_S: Final = 8.0
+JOIN_S: Final = 4.0
 STATE_S: Final = 3.0
 #: A report of ours is a second old at most by then, and those of all others are there.
 LOOK_S: Final = 1.5
@@ -44,8 +43,9 @@ class Visit:
 
 def server_key(address: Address, said: Introduction | None) -> Finding:
     """Whether the key that the session introduces itself with is the one known for this address."""
+    home = KeyHome()
     try:
-        known = KeyHome().servers.by_address(str(address))
+        known, own = home.servers.by_address(str(address)), {note.server for note in home.sessions.read()}
     except KeysError as error:
         return failed("server_key", str(error), "", "mend or remove that file")
     stored = address.server_key or ("" if known is None else known.key)
@@ -54,6 +54,8 @@ def server_key(address: Address, said: Introduction | None) -> Finding:
     if not said.server_key:
         return ok("server_key", "not encrypted, which is for one machine only")
     mark = fingerprint(raw_key(said.server_key))
+    if not stored and mark in own:
+        return ok("server_key", f"its key {mark} is this user's own")
     if not stored:
         text = f"its key {mark} is not known here yet"
         return warning("server_key", text, "", "pair with a code of `iris-session pair`, which proves whose key it is")

@@ -9,10 +9,21 @@ import pytest
 
 from iris_session.doctor.condition import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
 from iris_session.doctor.findings import Finding
+from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
-from iris_session.protocol.status import ParticipantReport, Quantiles, RecorderReport, RobotReport, StatusReport
+from iris_session.protocol.status import (
+    AlignmentReport,
+    AnchorReport,
+    AnchorSeen,
+    ParticipantReport,
+    Quantiles,
+    RecorderReport,
+    RobotReport,
+    StatusReport,
+)
 
 S = 1_000_000_000
+ORIGIN = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 DOCTOR = ParticipantReport("p9", "doctor", "observer", True, alignment="not_needed")
 ANN = ParticipantReport(
     "p1",
@@ -107,6 +118,14 @@ def test_a_step_that_comes_late_is_no_standstill() -> None:
 
 def test_who_drives_needs_an_alignment() -> None:
     only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "look at the sheet")
+
+
+def test_who_looks_at_another_sheet_is_told_which_there_are() -> None:
+    elsewhere = with_ann(alignment="none", alignment_report=AlignmentReport(unusable=12))
+    report = change(elsewhere, anchors=(AnchorReport("table", ORIGIN), AnchorReport("shelf", ORIGIN)))
+    only(report, "alignment", "failed", "12 observations, none of a sheet of this session", "session: table, shelf")
+    seen = AlignmentReport(unusable=12, seen=(AnchorSeen("table", 3, S),))
+    assert "none of" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
 
 
 def test_an_alignment_that_was_lost_is_told_apart() -> None:

@@ -93,6 +93,7 @@ def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
 def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
     key = KeyPair.new()
     home.sessions.add(SessionNote("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
+    assert server_key(ADDRESS, said(key.public)).state == "ok"
     assert unpaired(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
     assert "pair" in unpaired(ADDRESS, said(KeyPair.new().public)).advice
 

@@ -1,0 +1,56 @@
+"""How `tools/planted_faults.py` judges: a doctor who does not name a fault fails. Planting them needs root and minutes:
+docs/doctor.md has what was seen."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from planted import FAULTS, Fault
+from planted_faults import judge
+
+from iris_session.doctor.examination import ORDER
+from iris_session.doctor.findings import Finding, failed, ok, warning
+
+ROOT = Path(__file__).parents[2]
+REVOKED = next(one for one in FAULTS if one.name == "revoked")
+BLOCKED = next(one for one in FAULTS if one.name == "broadcasts-blocked")
+FULL = next(one for one in FAULTS if one.name == "full-disk")
+
+
+def told(one: Fault) -> Finding:
+    """A finding that names it."""
+    return Finding(one.check, one.state, "; ".join(one.says), advice="do")
+
+
+@pytest.mark.parametrize("one", FAULTS, ids=lambda one: one.name)
+def test_every_fault_has_a_check_and_can_be_named_or_missed(one: Fault) -> None:
+    assert one.check in ORDER
+    assert one.says
+    status = int(one.state == "failed")
+    assert judge(one, [told(one)], status) == ""
+    assert judge(one, [ok(one.check, "; ".join(one.says))], 0)
+    assert f"| {one.planted} |" in (ROOT / "docs" / "doctor.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("one", "findings", "status", "why"),
+    [
+        (REVOKED, [], 1, "missing"),
+        (REVOKED, [failed("key", "this machine's key is not on the list", "", "pair")], 1, "does not say"),
+        (REVOKED, [failed("key", "; ".join(REVOKED.says))], 1, "what to do"),
+        (REVOKED, [told(REVOKED), failed("clients", "doctor: connection lost")], 1, "failed too: clients"),
+        (REVOKED, [told(REVOKED)], 0, "exit status 0"),
+        (REVOKED, [told(REVOKED), ok("age", "x" * 120 * 50)], 1, "screen"),
+        (BLOCKED, [told(BLOCKED)], 1, "exit status 1"),
+        (BLOCKED, [told(BLOCKED), warning("age", "old")], 0, ""),
+        (FULL, [told(FULL), failed("recorder", "ended")], 1, ""),
+    ],
+)
+def test_what_does_not_count_as_named(one: Fault, findings: list[Finding], status: int, why: str) -> None:
+    said = judge(one, findings, status)
+    assert why in said if why else said == ""
