@@ -30,6 +30,8 @@ from iris_session.doctor.findings import FAILED, Finding
 
 SCREEN: Final = (120, 50)
 """Columns and lines of a screen."""
+PLAIN: Final = str.maketrans("|`", "/'")
+"""In a table, and not as commands of the document."""
 FORGOTTEN_S: Final = 11.0
 """Late ticks are told of the last ten seconds."""
 
@@ -84,7 +86,7 @@ def row(number: int, one: Fault, findings: list[Finding], status: int, took: flo
     """A line of the table: in the words of the doctor."""
     named = next(finding for finding in findings if finding.check == one.check)
     said = f"{named.text}. Why: {named.why}" if named.why else named.text
-    what = [part.replace("|", "/") for part in (said, named.advice)]
+    what = [part.translate(PLAIN) for part in (said, named.advice)]
     return (
         f"| {number} | {one.planted} | `{named.check}`, {named.state} | {what[0]} | {what[1]} | {status} | {took:.1f} |"
     )
