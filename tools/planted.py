@@ -266,6 +266,7 @@ def frozen_client(lab: Lab) -> Iterator[Visit]:
     with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
         system("kill", "-STOP", str(ann.pid))
         yield from_client(lab)
+    wait(lambda: not has_no_robot(lab, "ann"), "the end of what is kept for ann")
 
 
 @fault(
