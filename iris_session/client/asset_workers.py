@@ -6,8 +6,6 @@ An asset belongs to one of them, so what is asked for one asset happens in that 
 
 from __future__ import annotations
 
-import contextlib
-import os
 import queue
 import threading
 import time
@@ -15,12 +13,10 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 from iris_session.client.asset_cache import AssetCache, Part
+from iris_session.client.asset_context import give_way
 from iris_session.client.errors import AssetError
 
 THREADS: Final = 2
-#: Nice value of the threads above that of the process: a third of the weight. Not less, as they hold Python's lock for
-#: moments, and whoever polls then waits for them.
-NICER: Final = 5
 #: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything
 #: that may have come costs it as much as a chunk does.
 WAKE_BYTES: Final = 1 << 20
@@ -159,7 +155,7 @@ class AssetWorkers:
     # --- the threads --------------------------------------------------------------------------------------------------
 
     def _run(self, jobs: queue.SimpleQueue[_Job | None]) -> None:
-        _give_way()
+        give_way()
         untold, woken_ns = 0, 0
         while (job := jobs.get()) is not None:
             address, work, size = job
@@ -207,10 +203,3 @@ def _found(address: str, view: memoryview, decodes: Iterable[Decode], *, fetched
             failure.__cause__ = error
             decoded.append((decode, failure))
     return Found(address, len(view), tuple(decoded), fetched)
-
-
-def _give_way() -> None:
-    """Lowers the priority of this thread, where threads have one (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
-        nice = min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)

@@ -15,6 +15,7 @@ from typing import Final, TypeGuard
 
 import zmq
 
+from iris_session.client.asset_context import asset_context
 from iris_session.client.errors import IdentityError
 from iris_session.keys import KeysError, load_public, load_secret
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
@@ -171,7 +172,7 @@ class ClientSockets:
     def open_assets(self, port: int) -> None:
         """Connects to the assets channel, if it is not."""
         if self._assets is None:
-            assets = self._assets = self._new_socket(zmq.DEALER)
+            assets = self._assets = self._new_socket(zmq.DEALER, asset_context())
             assets.setsockopt(zmq.MAXMSGSIZE, MAX_ASSET_CHUNK_BYTES)
             assets.setsockopt(zmq.SNDHWM, ASSETS_SEND_HWM)
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
@@ -309,8 +310,8 @@ class ClientSockets:
         self._control.close(linger=linger_ms)
         self._control = None
 
-    def _new_socket(self, kind: int) -> zmq.Socket[bytes]:
-        sock: zmq.Socket[bytes] = self._context.socket(kind)
+    def _new_socket(self, kind: int, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> zmq.Socket[bytes]:
+        sock: zmq.Socket[bytes] = (context or self._context).socket(kind)
         sock.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         sock.setsockopt(zmq.TCP_KEEPALIVE, 1)  # as the session's sockets: a peer that vanished is noticed in 11 s
         sock.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 5)

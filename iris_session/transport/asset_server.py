@@ -33,7 +33,7 @@ from iris_session.transport.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
 IDLE_MS: Final = 50
 #: Requests taken, and chunks sent, before the rest is looked at.
 ROUND: Final = 64
-CHUNKS: Final = 4
+CHUNKS: Final = 2
 #: While the front's loop is late, one chunk goes out in so long: the slowest headset still gets its scene.
 YIELD_MS: Final = 5
 #: Nice value of the I/O thread, as far above that of the front: a tenth of the weight of the others.
