@@ -257,8 +257,14 @@ def robot_held(lab: Lab) -> Iterator[Visit]:
 
 
 def has_no_robot(lab: Lab, name: str) -> bool:
+    return any(one["name"] == name and not one["holds"] for one in people(lab))
+
+
+def people(lab: Lab) -> list[dict[str, Any]]:
+    """Participants, as the status has them, those too whose connection is lost."""
     status = json.loads(lab.client.iris("status", lab.server.address, "--json").stdout)
-    return any(one["name"] == name and not one["holds"] for one in status["participants"])
+    participants: list[dict[str, Any]] = status["participants"]
+    return participants
 
 
 @fault("a client's program stands still", "clients", "ann:", "silent", "is the app in front")
@@ -266,7 +272,7 @@ def frozen_client(lab: Lab) -> Iterator[Visit]:
     with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
         system("kill", "-STOP", str(ann.pid))
         yield from_client(lab)
-    wait(lambda: not has_no_robot(lab, "ann"), "the end of what is kept for ann")
+    wait(lambda: "ann" not in {one["name"] for one in people(lab)}, "the end of what is kept for ann")
 
 
 @fault(

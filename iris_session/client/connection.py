@@ -23,6 +23,7 @@ from iris_session.client.identity import Identity
 from iris_session.client.limits import (
     BACKOFF_MAX_NS,
     BACKOFF_MIN_NS,
+    HELLO_TIMEOUT_MAX_NS,
     HELLO_TIMEOUT_NS,
     SILENT_HEARTBEATS,
     SNAPSHOT_RETRY_NS,
@@ -85,6 +86,7 @@ class Connection(Receiving):
         self._outgoing = Outgoing(self.counters)
         self._backoff_ns = BACKOFF_MIN_NS
         self._hello_at = 0
+        self._hello_wait_ns = HELLO_TIMEOUT_NS
         self._retry_at = 0
         self._heard_at = 0
         self._heartbeat_at = 0
@@ -98,7 +100,7 @@ class Connection(Receiving):
     def open(self, now_ns: int) -> None:
         """Starts joining, also after a refusal."""
         self.failure = self.put_off = None
-        self._backoff_ns = BACKOFF_MIN_NS
+        self._backoff_ns, self._hello_wait_ns = BACKOFF_MIN_NS, HELLO_TIMEOUT_NS
         self._say_hello(now_ns)
 
     def close(self) -> None:
@@ -114,6 +116,7 @@ class Connection(Receiving):
         if not self.joined:
             return
         self.counters.reconnects += 1
+        self._hello_wait_ns = HELLO_TIMEOUT_NS
         if now_ns - self._joined_at < STEADY_NS:
             self._wait(now_ns)
         else:
@@ -140,7 +143,8 @@ class Connection(Receiving):
         self._ticked_at = now_ns
         if self.phase is Phase.WAITING and now_ns >= self._retry_at:
             self._say_hello(now_ns)
-        elif self.phase is Phase.JOINING and now_ns >= self._hello_at + HELLO_TIMEOUT_NS:
+        elif self.phase is Phase.JOINING and now_ns >= self._hello_at + self._hello_wait_ns:
+            self._hello_wait_ns = min(2 * self._hello_wait_ns, HELLO_TIMEOUT_MAX_NS)
             self._wait(now_ns)
         elif self.joined:
             self._keep_up(now_ns)
@@ -150,7 +154,7 @@ class Connection(Receiving):
         if self.phase is Phase.WAITING:
             return self._retry_at
         if self.phase is Phase.JOINING:
-            return self._hello_at + HELLO_TIMEOUT_NS
+            return self._hello_at + self._hello_wait_ns
         if not self.joined:
             return self.wake_ns or now_ns + STEADY_NS
         due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)

@@ -7,7 +7,10 @@ from typing import Final
 from iris_session.protocol.names import DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ProtocolFault, Refused, Welcome
 
+#: How long an answer is waited for, at first and at most: a handshake takes five ways there and back, so over a slow
+#: link the first tries are too short.
 HELLO_TIMEOUT_NS: Final = 1_000_000_000
+HELLO_TIMEOUT_MAX_NS: Final = 4_000_000_000
 BACKOFF_MIN_NS: Final = 100_000_000
 BACKOFF_MAX_NS: Final = 2_000_000_000
 STEADY_NS: Final = 1_000_000_000

@@ -13,7 +13,7 @@ from iris_session.client.clock import SETTLED
 from iris_session.client.connection import Connection
 from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
 from iris_session.client.identity import Identity
-from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
+from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
 from iris_session.client.outgoing import MAX_OUTGOING
 from iris_session.client.session_state import Missed
 from iris_session.client.status import Phase
@@ -133,7 +133,27 @@ def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire
     gaps = np.diff(hellos)
     assert (np.diff(gaps) >= 0).all()
     assert gaps[0] < HELLO_TIMEOUT_NS + 200 * MS
-    assert gaps[-1] == HELLO_TIMEOUT_NS + BACKOFF_MAX_NS
+    assert gaps[-1] == HELLO_TIMEOUT_MAX_NS + BACKOFF_MAX_NS
+
+
+def test_over_a_slow_link_an_answer_is_waited_for_longer_until_the_connection_is_lost(wire: Wire) -> None:
+    """Five ways there and back of 600 ms: the first two hellos are given up too early, the third is not."""
+    wire.connection.open(0)
+    said, now = 0, 0
+    while not wire.connection.joined:
+        assert now < 60 * SECOND
+        generation = wire.connection.generation
+        now = wire.connection.next_deadline_ns(now)
+        if now > said + 3 * SECOND:
+            now = said + 3 * SECOND
+            wire.welcome(now)
+            break
+        wire.connection.tick(now)
+        if wire.connection.generation != generation:
+            said = now
+    assert wire.connection.generation == 3
+    wire.connection.lost(now + 10 * SECOND)
+    assert wire.connection.next_deadline_ns(now + 10 * SECOND) == now + 10 * SECOND + HELLO_TIMEOUT_NS
 
 
 def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
