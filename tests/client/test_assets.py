@@ -29,6 +29,8 @@ from tests.client.harness import LiveSession
 from tests.transport.asset_rig import noise, put
 
 MIB = 1 << 20
+#: More than may be on its way, so that it can be looked at in the middle.
+LARGE = 24 * MIB + 3
 DEADLINE_S = 60.0
 
 
@@ -38,7 +40,7 @@ class Store:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.data: dict[str, bytes] = {}
-        for size in (1000, 5 * MIB + 3, 0, 700_000, *[2000] * 50):
+        for size in (1000, LARGE, 0, 700_000, *[2000] * 50):
             data = noise(size)
             self.data[put(root, data)] = data
 

@@ -127,7 +127,7 @@ def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
     told: list[object] = []
     session_processes = SessionProcesses(SessionConfig(record=False), core, 0)
     session_processes.front = SimpleNamespace(  # type: ignore[assignment]
-        alive=False, set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
+        alive=False, fault="ended", set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
     )
     session_processes.reporter = SimpleNamespace(due=lambda now_ns: False)  # type: ignore[assignment]
     session_processes.watch(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
