@@ -60,8 +60,8 @@ class SceneDraft:
         pose = Pose(_position(position, name), _unit(quaternion, name))
         with self._lock:
             if name in self._roots:
+                self._place(name, pose, self._joints[name])
                 self._roots[name] = pose
-                self._place(name)
             else:
                 self._poses[self._row(name)] = (*pose.p, *pose.q)
 
@@ -88,8 +88,9 @@ class SceneDraft:
         except (SceneBuildError, TypeError, ValueError, AttributeError) as error:
             raise PublishError(f"set_joints({name!r}): {error}") from error
         with self._lock:
-            self._joints[name].update(given)
-            self._place(name)
+            joints = self._joints[name] | given
+            self._place(name, self._roots[name], joints)
+            self._joints[name] = joints
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
         before = self._vertices.get(name)
@@ -116,10 +117,16 @@ class SceneDraft:
             raise PublishError(f"nothing that moves is called {name!r} in this scene; {_nearest(name, known, 'names')}")
         return row
 
-    def _place(self, name: str) -> None:
-        root = self._roots[name]
-        for body, pose in self._scene.articulations[name].poses(self._joints[name]).items():
-            p, q = compose((root.p, root.q), (pose.p, pose.q))
+    def _place(self, name: str, root: Pose, joints: Mapping[str, float]) -> None:
+        """The bodies of an articulation, all or none: finite joints may still put one where nothing can be."""
+        try:
+            bodies = self._scene.articulations[name].poses(joints)
+            placed = {body: compose((root.p, root.q), (T.p, T.q)) for body, T in bodies.items()}
+        except ValueError:  # farther, or turned more often, than floats can tell
+            placed = {}
+        if not placed or not all(abs(v) <= FARTHEST_M for p, _ in placed.values() for v in p):  # NaN is not
+            raise PublishError(f"joints of {name!r} put it more than 1,000 km away: radians and metres are expected")
+        for body, (p, q) in placed.items():
             self._poses[self._rows[body]] = (*p, *q)
 
 

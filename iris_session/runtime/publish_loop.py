@@ -29,8 +29,8 @@ from iris_session.scene.composed import ComposedScene
 #: Silence after which steps without a frame begin, and their distance.
 IDLE_AFTER_NS: Final = 20_000_000
 IDLE_PERIOD_S: Final = 0.01
-#: Silence after which the state is sent again, and again after as long. Longer than the distance of the frames of any
-#: source that moves: a repeated pose between two frames would be seen as a halt.
+#: Silence after which the state is sent again, and again after as long; two periods of the state at least. Longer
+#: than the distance of the frames of any source that moves: a repeated pose between two would be seen as a halt.
 REPEAT_NS: Final = 250_000_000
 
 
@@ -66,6 +66,7 @@ class PublishLoop:
         self._stepper = stepper
         self._processes = processes
         self._period_ns = period_ns
+        self._repeat_ns = max(REPEAT_NS, 2 * period_ns)
         self.superseded = 0
         self.lock = threading.RLock()
         self._hand = threading.Lock()  # of the frame that waits
@@ -86,8 +87,8 @@ class PublishLoop:
 
     def offer(self, frame: Frame) -> None:
         """Hands in the newest frame. Raises `OwnershipError` after `close`, and what stopped the helper."""
-        self.check()
         with self._hand:
+            self.check()  # here, so that no frame is handed in after `close` has taken the last one
             waited = self._waiting
             if waited is not None:
                 self.superseded += 1
@@ -115,8 +116,7 @@ class PublishLoop:
         if self._helper is not threading.current_thread():
             self._helper.join(timeout=2.0)
         with self.lock:
-            if self._error is None:
-                self._take()
+            self._take()
 
     # --- steps, with the lock held ------------------------------------------------------------------------------------
 
@@ -124,7 +124,7 @@ class PublishLoop:
         """A step with the frame that waits, if one does."""
         with self._hand:
             frame, self._waiting = self._waiting, None
-        if frame is None:
+        if frame is None or self._error is not None:
             return
         now_ns = self._stepper.clock()
         self._due_ns += self._period_ns  # a fixed rate, so that a source with jitter loses nothing
@@ -140,11 +140,15 @@ class PublishLoop:
     def _idle(self) -> None:
         self._step(0)
         now_ns = self._stepper.clock()
-        if not self._sent_ns or now_ns - self._sent_ns >= REPEAT_NS:
+        if not self._sent_ns or (self._waiting is None and now_ns - self._sent_ns >= self._repeat_ns):
             self._send(now_ns - self._delay_ns)  # times of the state go on as the publisher's do
 
     def _step(self, n_ticks: int, plant: bytes = b"") -> None:
-        self._stepper.step(n_ticks, plant, publish=False)
+        try:
+            self._stepper.step(n_ticks, plant, publish=False)
+        except Exception as error:  # whoever took it, the helper ends
+            self._error = error
+            raise
         self._processes.watch(self._stepper)
         self._step_ns = self._stepper.clock()
 
@@ -157,7 +161,7 @@ class PublishLoop:
 
     def _work(self) -> None:
         try:
-            while not self._closed.is_set():
+            while not self._closed.is_set() and self._error is None:
                 self._wake.wait(self._pause_s())
                 self._wake.clear()
                 with self.lock:
@@ -173,7 +177,7 @@ class PublishLoop:
 
     def _turn(self) -> None:
         now_ns = self._stepper.clock()
-        if self._closed.is_set():
+        if self._closed.is_set() or self._error is not None:
             return
         if self._waiting is not None and now_ns >= self._due_ns:
             self._take()

@@ -51,6 +51,7 @@ class ScenePatches:
             # What is journaled is what is used, and it is what clients can read.
             checked = decode_entry(encode_entry(Entry(HOST, HOST, 0, ScenePatched(ops, "")))).message
             assert isinstance(checked, ScenePatched)
+            msgspec.json.decode(msgspec.json.encode(checked), type=ScenePatched)  # where what is not finite is null
             with scenes.lock:
                 shown = scenes.patch(checked.ops)
                 message = ScenePatched(checked.ops, shown.info.scene_hash)

@@ -39,8 +39,8 @@ from iris_session.scene.composed import ComposedScene
 
 #: How often `run` asks `until`.
 RUN_PERIOD_S: Final = 1.0 / 60.0
-#: Longest time that a publisher can give [s]: ticks are milliseconds, and clients count them in 53 bits.
-LONGEST_S: Final = 1e12
+#: Longest time that a publisher can give [s], 285 years: recordings count it in nanoseconds, in 63 bits.
+LONGEST_S: Final = 9e9
 #: How far ahead of the session's clock a capture may lie: clocks are read one after the other.
 AHEAD_NS: Final = 1_000_000
 _NOBODY_DRIVES: Final = (
@@ -66,7 +66,7 @@ class ScenePublisher(Owner):
         self._stop = threading.Event()
         self._draft: SceneDraft | None = None
         self._loop: PublishLoop | None = None
-        self._order = threading.Lock()  # of frames
+        self._order = threading.Lock()  # of frames, and of what is said of the next one
         self._capture_ns = 0
         self._time_s: float | None = None
         self._own_time = False
@@ -194,7 +194,8 @@ class ScenePublisher(Owner):
     def reset(self) -> None:
         """The next `publish` is of a world that was put into another state: a new `scene_epoch`."""
         self._started()
-        self._anew = True
+        with self._order:
+            self._anew = True
 
     @property
     def superseded(self) -> int:
@@ -270,7 +271,7 @@ def _time(time_s: float) -> float:
     except (TypeError, ValueError):
         given_s = -1.0
     if not 0.0 <= given_s <= LONGEST_S:  # NaN is neither
-        raise PublishError(f"time_s is {time_s!r}: seconds from 0 on are expected")
+        raise PublishError(f"time_s is {time_s!r}: seconds from 0 to {LONGEST_S:g} are expected")
     return given_s
 
 

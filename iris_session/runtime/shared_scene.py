@@ -81,7 +81,7 @@ class SharedScenes:
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
             self._without(str(error))
             return Shown(plain)
-        self.notes += [f"clients do not see {what}" for what in parsed.skipped]
+        self._say(*(f"clients do not see {what}" for what in parsed.skipped))
         return shown
 
     def patch(self, ops: Sequence[PatchOp]) -> Shown:
@@ -127,7 +127,7 @@ class SharedScenes:
             self._holds.append(store.hold(addresses))
         except OSError as error:
             why = error.strerror or error
-            self.notes.append(f"files of the scene in {store.root} cannot be held, so others may take them away: {why}")
+            self._say(f"files of the scene in {store.root} cannot be held, so others may take them away: {why}")
 
     def _forget_looks(self, store: AssetStore) -> None:
         """Specifications that patches after them have replaced, for everybody."""
@@ -138,7 +138,11 @@ class SharedScenes:
 
     def _without(self, why: str) -> None:
         self._store = None
-        self.notes.append(f"clients get no meshes and textures: {why}")
+        self._say(f"clients get no meshes and textures: {why}")
+
+    def _say(self, *texts: str) -> None:
+        """Each once: a session may load its scenes, and patch them, for days."""
+        self.notes += [text for text in dict.fromkeys(texts) if text not in self.notes]
 
 
 class _Look(NamedTuple):

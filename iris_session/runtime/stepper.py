@@ -146,6 +146,7 @@ class Stepper:
         self.step_count = 0 if resumed_from is None else resumed_from.step + 1
         self._newest_step = 0
         self.last: StepOutcome | None = None
+        self._crash: Exception | None = None
         self._host: deque[EntryMessage] = deque()
         self._scenes: deque[NextScene | NextPatch] = deque()
         #: Called with another scene before the step that loads it.
@@ -193,7 +194,10 @@ class Stepper:
         """Takes one step now. `plant`: see `SessionCore.step` (open sessions).
 
         `publish` false: the state that this step leads to is not there yet, its maker calls `publish` when it is.
+        After an error in the core no step is taken any more, whoever asks for it: that one is raised again.
         """
+        if self._crash is not None:
+            raise self._crash
         now_ns = self.clock()
         if now_ns <= self._last_now_ns:  # one step per instant: session time strictly grows
             now_ns = self._last_now_ns + 1
@@ -205,7 +209,8 @@ class Stepper:
         self._last_now_ns = now_ns
         try:
             outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.lap)
-        except Exception:
+        except Exception as error:
+            self._crash = error
             if self.recorder is not None:  # what led to it is worth more than all before
                 self.recorder.row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
                 self.recorder.flush()

@@ -100,6 +100,9 @@ NAN = float("nan")
         (lambda d: d.set_joints("arm", {"follower": 1.0}), "follows 'turn'"),
         (lambda d: d.set_joints("arm", {"turn": NAN}), "finite"),
         (lambda d: d.set_joints("arm", [1.0]), "set_joints"),
+        (lambda d: d.set_joints("arm", {"turn": 1e300}), "radians"),
+        (lambda d: d.set_joints("arm", {"slide": 1e7}), "1,000 km"),
+        (lambda d: d.set_joints("arm", {"turn": 1.0, "slide": 1e308}), "1,000 km"),
         (lambda d: d.set_vertices("clot", CLOTH), "nearest: 'cloth'"),
         (lambda d: d.set_vertices("cloth", CLOTH[:3]), r"\(3, 3\): \(4, 3\) is expected"),
         (lambda d: d.set_vertices("cloth", CLOTH * NAN), "not finite"),
@@ -113,3 +116,5 @@ def test_what_is_wrong_is_said_and_changes_nothing(
     with pytest.raises(PublishError, match=says):
         wrong(draft)
     assert everything(draft) == before
+    draft.set_pose("arm", (0.0, 0.0, 0.8), UNIT)  # nor does it come back later
+    assert pose(draft, "arm/fore") == pytest.approx([1.0, 0.0, 0.8, *UNIT])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -15,6 +16,7 @@ from iris_session.protocol.client_messages import Marker
 from iris_session.protocol.entries import HOST, Entry, ExternalReset, Join, decode_entries
 from iris_session.protocol.names import Role
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
+from iris_session.recording.journal import CRASHED
 from iris_session.runtime.core import CoreConfig, CoreState, SessionCore
 from iris_session.runtime.draft import Frame, SceneDraft
 from iris_session.runtime.errors import OwnershipError
@@ -43,7 +45,7 @@ class Watch:
 class Rig:
     """A publisher's loop whose clock the test moves; the helper thread is real."""
 
-    def __init__(self) -> None:
+    def __init__(self, period_ns: int = PERIOD_NS) -> None:
         self.now_ns = 1000 * MS
         scene = composed()
         self.draft = SceneDraft(scene)
@@ -58,7 +60,7 @@ class Rig:
         self.shown: list[tuple[float, float, int]] = []  # x of the red box and of a vertex, scene epoch
         self.vertices = ShownVertices(scene)
         self.stepper.beside_state.append(self._show)
-        self.loop = PublishLoop(carrier, self.vertices, self.stepper, Watch(), PERIOD_NS)  # type: ignore[arg-type]
+        self.loop = PublishLoop(carrier, self.vertices, self.stepper, Watch(), period_ns)  # type: ignore[arg-type]
 
     def _note(self, entries: Sequence[Entry]) -> None:
         self.entries += entries
@@ -151,6 +153,19 @@ def test_states_between_two_frames_of_a_slow_source_are_not_repeated(rig: Rig) -
     assert rig.xs() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
+def test_a_state_of_a_low_rate_is_not_repeated_between_two_frames() -> None:
+    rig = Rig(period_ns=1000 * MS)
+    try:
+        for x in range(1, 31):  # ten a second, of which the state takes one
+            steps = rig.stepper.step_count
+            rig.now_ns += 100 * MS
+            rig.publish(float(x))
+            wait_for(lambda steps=steps: rig.stepper.step_count > steps)  # type: ignore[misc]
+        assert len(set(rig.xs())) == len(rig.xs())
+    finally:
+        rig.loop.close()
+
+
 def test_a_reset_is_told_with_the_frame_that_brings_it_even_when_that_one_is_superseded(rig: Rig) -> None:
     rig.publish(1.0)
     rig.now_ns += MS
@@ -195,6 +210,55 @@ def test_the_last_frame_is_shown_at_the_end_and_none_after_it(rig: Rig) -> None:
     assert rig.xs()[-1] == 2.0
     with pytest.raises(OwnershipError, match="closed"):
         rig.publish(3.0)
+
+
+class Late:
+    """A lock before which the session is closed, once: `publish` was under way in another thread."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._lock, self._closes = threading.Lock(), [threading.Thread(target=rig.loop.close)]
+
+    def __enter__(self) -> None:
+        while self._closes:
+            thread = self._closes.pop()
+            thread.start()
+            thread.join()
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+def test_a_publish_that_was_under_way_at_the_end_takes_no_step_after_it(rig: Rig) -> None:
+    """Front and recorder are gone then."""
+    rig.publish(1.0)
+    rig.now_ns += PERIOD_NS
+    rig.loop._hand = Late(rig)  # type: ignore[assignment]
+    with pytest.raises(OwnershipError, match="closed"):
+        rig.publish(2.0)
+    assert rig.xs()[-1] == 1.0
+
+
+def test_no_step_follows_one_that_failed_in_the_publishers_thread(rig: Rig) -> None:
+    rig.publish(1.0)
+    steps = rig.stepper.core.step
+
+    def broken(*_: object, **__: object) -> None:
+        rig.stepper.core.step = steps  # type: ignore[method-assign]
+        raise KeyError("the core is broken")
+
+    with rig.loop.lock:  # the helper waits
+        rig.now_ns += 100 * MS
+        rig.stepper.core.step = broken  # type: ignore[method-assign,assignment]
+        with pytest.raises(KeyError, match="broken"):
+            rig.publish(2.0)
+    rows = len(rig.recorder.rows)
+    assert rig.recorder.rows[-1].digest == CRASHED
+    rig.loop._helper.join(10.0)
+    with pytest.raises(KeyError, match="broken"):
+        rig.publish(3.0)
+    rig.loop.close()
+    assert len(rig.recorder.rows) == rows
 
 
 def test_what_stops_the_helper_is_raised_where_it_is_seen(rig: Rig) -> None:

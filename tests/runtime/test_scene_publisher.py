@@ -25,6 +25,7 @@ from iris_session.recording import Recording
 from iris_session.runtime.verification import verify_recording
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+NAN = float("nan")
 
 
 def scene() -> SceneBuilder:
@@ -70,6 +71,8 @@ def test_the_owner_speaks_and_patches_as_of_any_session(session: ScenePublisher)
     session.clear_estop()
     assert session.scene is not None
     floor = session.scene.visuals[0]
+    with pytest.raises(ConfigError, match=r"Expected `float`.*rgba"):
+        session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, NAN, 1.0)))
     session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, 1.0, 1.0)))
     session.run(until=lambda: SceneChanged in kinds(session) and not session.status().estop, seconds=30.0)
     assert MarkerAdded in kinds(session)
@@ -93,9 +96,6 @@ def test_what_does_not_fit_a_published_world_says_what_does(wrong: Callable[[Sce
         wrong(ScenePublisher(scene(), CONFIG))
 
 
-NAN = float("nan")
-
-
 def test_times_that_cannot_be_are_refused_and_change_nothing(session: ScenePublisher) -> None:
     session.publish(13.0)
     session.run(until=lambda: session.status().sim_time == 13.0, seconds=30.0)
@@ -105,6 +105,7 @@ def test_times_that_cannot_be_are_refused_and_change_nothing(session: ScenePubli
     for at, capture, says in (
         (NAN, None, "time_s is nan"),
         (-1.0, None, "seconds from 0"),
+        (1e10, None, "seconds from 0"),  # more nanoseconds than a recording counts
         ("noon", None, "time_s is 'noon'"),
         (14.0, -1, "whole nanoseconds"),
         (14.0, 0.5, "whole nanoseconds"),
@@ -130,6 +131,27 @@ def test_a_time_that_goes_back_is_a_new_scene_epoch(session: ScenePublisher) -> 
     session.reset()
     session.publish(4.5)
     session.run(until=lambda: kinds(session).count(SceneChanged) == before + 2, seconds=30.0)
+
+
+def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: ScenePublisher) -> None:
+    before = kinds(session).count(SceneChanged)
+
+    class Now(float):
+        """A time during whose comparison another thread says `reset`."""
+
+        def __gt__(self, other: object) -> bool:
+            thread = threading.Thread(target=session.reset)
+            thread.start()
+            thread.join(0.2)
+            return float.__gt__(self, other)  # type: ignore[arg-type, operator]
+
+    session.publish(16.0)
+    session._time_s = Now(16.0)
+    session.publish(16.5)
+    session.run(until=lambda: session._anew, seconds=30.0)
+    session.publish(17.0)
+    session.run(until=lambda: session.status().sim_time == 17.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 1
 
 
 def test_several_threads_may_publish(session: ScenePublisher) -> None:

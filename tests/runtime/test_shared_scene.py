@@ -67,6 +67,10 @@ def test_a_disk_that_is_full_does_not_undo_a_scene(
     assert scenes.take(shown) is shown.info
     assert scenes.newest is shown
     assert "No space left on device" in scenes.notes[-1]
+    said = len(scenes.notes)
+    for i in range(3):
+        scenes.take(scenes.patch([SetVisual(0, rgba=(i / 20, 0.0, 0.0, 1.0))]))
+    assert len(scenes.notes) == said, "once, however often it is patched"
 
 
 def test_what_no_store_has_is_not_shown(world: World, tmp_path: Path) -> None:

@@ -157,6 +157,9 @@ def test_the_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
     assert check_row(rig.recorder.rows[-2].chain, row) is None
     assert [e.message for e in decode_entries(row.entries)] == [Marker(0, "the last words")]
     rig.stepper.core.controller.begin = step  # type: ignore[method-assign]
+    with pytest.raises(KeyError):
+        rig.steps(1)
+    assert rig.recorder.rows[-1] is row, "no row follows, whatever thread would take the next step"
 
 
 def test_keyframes_at_the_start_and_at_their_distance(rig: Rig) -> None:
