@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from anchors.pose import compose, inverse
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
 from iris_session.protocol.scene import (
-    MAX_SCENE_BYTES,
     Body,
     Deformable,
     Environment,
     Geometry,
+    SceneError,
     SceneSpec,
     Visual,
+    check_scene,
     encode_scene,
 )
 from iris_session.protocol.scene_looks import Material, Mesh, Texture, TextureUse
@@ -43,6 +44,8 @@ from iris_session.streams.deformable_topology import DeformableTopology
 _FAR: Final = 50.0
 _FAR_EXTENTS: Final = 10.0
 _FACES: Final = 6
+#: Farthest vertex of a mesh in its own frame [m]. What is beyond is a mistake of units, and too far for float32.
+MAX_COORDINATE_M: Final = 1e6
 
 
 def assemble(
@@ -87,15 +90,9 @@ def assemble(
     if skybox >= 0:
         surroundings = msgspec.structs.replace(surroundings, skybox=skybox)
     spec = msgspec.structs.replace(spec, environment=surroundings)
-    encoded = encode_scene(spec)
-    if len(encoded) > MAX_SCENE_BYTES:
-        raise SceneBuildError(
-            f"{len(visuals)} visuals on {len(bodies)} bodies make a specification of {len(encoded) >> 20} MiB, at most "
-            f"{MAX_SCENE_BYTES >> 20} are read: join what stands still into fewer meshes"
-        )
     return ComposedScene(
         spec=spec,
-        scene_hash=store.put(encoded),
+        scene_hash=store.put(_readable(spec)),
         moving=tuple(body.name for body in bodies if body.moving),
         poses=tuple(body.T_world_body for body in bodies if body.moving),
         articulations=dict(world.articulations),
@@ -104,6 +101,22 @@ def assemble(
         built=builder.built,
         recalled=builder.recalled,
     )
+
+
+def _readable(spec: SceneSpec) -> bytes:
+    """The bytes of the specification. Raises `SceneBuildError` for one that no client would read, or draw."""
+    try:
+        check_scene(spec)
+        encoded = encode_scene(spec)
+    except SceneError as error:
+        raise SceneBuildError(f"{error}: join what stands still into fewer meshes") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SceneBuildError(f"the scene has something that cannot be sent: {error}") from None
+    try:  # by way of JSON, in which what is not finite is no number
+        msgspec.json.decode(msgspec.json.encode(spec), type=SceneSpec)
+    except msgspec.ValidationError as error:
+        raise SceneBuildError(f"the scene has something that cannot be drawn: {error}") from None
+    return encoded
 
 
 def _bodies(world: World) -> tuple[dict[int, int], tuple[Body, ...]]:
@@ -156,7 +169,16 @@ def _mesh_work(builder: Builder, mesh: MeshArrays, rest: Matrix | None) -> Work[
     marks = np.array([mesh.uv is not None, mesh.color is not None, rest is not None], np.uint8)
     given = (mesh.position, mesh.normal, mesh.index, mesh.uv, mesh.color, rest)
     raw: list[NDArray[Any]] = [marks, *(array for array in given if array is not None)]
-    return builder.mesh(raw, lambda: scaled(mesh, rest))
+    return builder.mesh(raw, lambda: _within_reach(scaled(mesh, rest)))
+
+
+def _within_reach(mesh: MeshArrays) -> MeshArrays:
+    """Raises `SceneBuildError` for coordinates that nobody can draw."""
+    if not np.abs(mesh.position).max(initial=0.0) <= MAX_COORDINATE_M:  # NaN is not
+        raise SceneBuildError(
+            f"a mesh reaches farther than {MAX_COORDINATE_M:,.0f} m from its origin: scale it to metres, or move it"
+        )
+    return mesh
 
 
 def _geometry(item: Item, mesh: int, meshes: Sequence[Mesh]) -> Geometry:

@@ -8,12 +8,23 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.pose import compose, quat_rotate
+from anchors.pose import compose
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Camera, Light
 from iris_session.scene.articulation import Articulation
 from iris_session.scene.meshes import MeshArrays
-from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, matrix_of, rigid_and_rest, solid
+from iris_session.scene.parts import (
+    Item,
+    Loaded,
+    Look,
+    Matrix,
+    Picture,
+    matrix_of,
+    pose_of,
+    rigid_and_rest,
+    solid,
+    vec3,
+)
 from iris_session.scene.urdf import Robot
 
 
@@ -99,9 +110,9 @@ class World:
                 if look is not None and mesh.color is not None:
                     mesh = bare.setdefault(id(mesh), replace(mesh, color=None))
                 self.items.append(Item(places[k], surface.name, matrix, look or surface.look or Look(), mesh))
-            if node.lights or node.cameras:
-                T = rigid_and_rest(matrix)[0]
-                self.lights += [(places[k], _light_at(T, light)) for light in node.lights]
+            self.lights += [(places[k], _light_at(matrix, light)) for light in node.lights]
+            if node.cameras:
+                T = _looking(matrix)
                 self.cameras += [
                     (places[k], msgspec.structs.replace(camera, T_body_camera=composed(T, camera.T_body_camera)))
                     for camera in node.cameras
@@ -119,11 +130,20 @@ def _with_content(loaded: Loaded) -> set[int]:
     return used
 
 
-def _light_at(T_body_light: Pose, light: Light) -> Light:
-    """A light in the frame of its body."""
-    p, _ = compose((T_body_light.p, T_body_light.q), (light.p_body, (1.0, 0.0, 0.0, 0.0)))
-    along = quat_rotate(T_body_light.q, light.direction_body)
-    return msgspec.structs.replace(light, p_body=p, direction_body=along)
+def _light_at(matrix: Matrix, light: Light) -> Light:
+    """A light in the frame of its body, which `matrix` leads to. It shines where that turns it, mirrored or not."""
+    p = matrix @ [*light.p_body, 1.0]
+    along = matrix[:3, :3] @ light.direction_body
+    along /= np.linalg.norm(along)
+    return msgspec.structs.replace(light, p_body=vec3(p), direction_body=vec3(along))
+
+
+def _looking(matrix: Matrix) -> Pose:
+    """T_body_camera of a camera that `matrix` leads from: it looks along its -z with its y up, mirrored or not."""
+    back, up = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]), matrix[:3, 1]
+    up = up - (up @ back) * back
+    up /= np.linalg.norm(up)
+    return pose_of(np.stack([np.cross(up, back), up, back], axis=1), matrix[:3, 3])
 
 
 def composed(a: Pose, b: Pose) -> Pose:

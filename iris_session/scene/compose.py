@@ -13,6 +13,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from iris_session.protocol.common import IDENTITY, Vec3
+from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import Camera, Environment, Light
 from iris_session.protocol.scene_looks import Rgb
 from iris_session.protocol.scene_names import GeometryKind, LightKind, TextureKind
@@ -23,7 +24,7 @@ from iris_session.scene.composed import ComposedScene
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import load_file
 from iris_session.scene.given import Looks, given_mesh, given_vertices, look_of, numbers, triangles_of
-from iris_session.scene.parts import Item, Look, Matrix, Picture, checked_pose, cut, matrix_of
+from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
 from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
 from iris_session.scene.urdf import read_urdf
@@ -135,7 +136,7 @@ class SceneBuilder:
         turn = up or loaded.up
         if turn not in ("y", "z"):
             raise SceneBuildError(f"up is {up!r}: y or z, or None for what the format means")
-        factors = numbers("scale", np.broadcast_to(np.asarray(scale, np.float64), 3).tolist(), 3)
+        factors = numbers("scale", scale if array_of(scale, "scale").ndim else [scale] * 3, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
@@ -187,6 +188,10 @@ class SceneBuilder:
         and `radius` [m]. `vertices` (n, 3) [m]: the first ones, world frame. `uvs` (n, 2). `flat`: a normal per face.
         """
         self._new_name(name)
+        if len(self._world.flexibles) >= MAX_STREAMS:
+            raise SceneBuildError(
+                f"deformable {name!r} is one too many: {MAX_STREAMS} are streamed, join some into one mesh"
+            )
         if (triangles is None) == (edges is None):
             raise SceneBuildError(f"deformable {name!r} needs triangles (m, 3) or edges (m, 2): one of them")
         points = given_vertices(vertices)
@@ -246,6 +251,8 @@ class SceneBuilder:
     ) -> str:
         """A camera that looks along -z of its frame, y up, with a vertical field of view of `fovy` degrees."""
         (angle,) = numbers("fovy", [fovy], 1, above=0.0)
+        if angle >= 180.0:
+            raise SceneBuildError(f"fovy is {fovy}: degrees below 180")
         camera = Camera(cut(name), 0, checked_pose(position, quaternion), angle, resolution=resolution)
         self._world.cameras.append((self._body_named(on), camera))
         return name
@@ -299,7 +306,7 @@ class SceneBuilder:
         raise SceneBuildError(f"on={on!r}: no movable body is called so. Movable: {names}")
 
     def _new_name(self, name: str) -> None:
-        if not name or len(name) > _MAX_NAME:
+        if not name or len(name) > _MAX_NAME or cut(name) != name:
             raise SceneBuildError(
                 f"{name!r}: what moves needs a name of 1 to {_MAX_NAME} characters, by which it is addressed"
             )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene_names import TextureRole
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.meshes import MeshArrays, index_corners
-from iris_session.scene.parts import GREY, MAX_TRIANGLES, Look, Picture
+from iris_session.scene.parts import GREY, MAX_TRIANGLES, Look, Picture, array_of
 from iris_session.scene.pictures import checked_pixels, read_pixels
 from iris_session.scene.references import read_bounded
 from iris_session.scene.simplify import creased_normals, unit
@@ -44,12 +44,11 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
     if not options.keys() & Looks.__annotations__.keys():
         return None
     default = (1.0, 1.0, 1.0, 1.0) if "texture" in options else GREY
-    rgba = [float(v) for v in options.get("rgba", default)]
-    if len(rgba) == 3:
-        rgba.append(1.0)
-    red, green, blue, alpha = numbers("rgba", rgba, 4)
-    if not all(0.0 <= v <= 1.0 for v in rgba):
-        raise SceneBuildError(f"rgba is {tuple(rgba)}: each from 0 to 1")
+    given = options.get("rgba", default)
+    short = hasattr(given, "__len__") and len(given) == 3
+    red, green, blue, alpha = (*numbers("rgba", given, 3 if short else 4), 1.0)[:4]
+    if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
+        raise SceneBuildError(f"rgba is {given!r}: each from 0 to 1")
     across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
     pictures: tuple[tuple[str, Picture], ...] = ()
     if "texture" in options:
@@ -103,7 +102,7 @@ def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDA
 
 def triangles_of(values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
     """Rows of vertex numbers."""
-    array = np.asarray(values)
+    array = array_of(values, "rows of vertex numbers")
     if array.ndim != 2 or array.shape[1] != width or not len(array) or array.dtype.kind not in "iu":
         raise SceneBuildError(
             f"an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at least one row"
@@ -127,7 +126,7 @@ def given_mesh(vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: An
     uv = None if uvs is None else given_vertices(uvs, 2, len(points))[index]
     color = None
     if colors is not None:
-        array = np.asarray(colors)
+        array = array_of(colors, "colors")
         if array.dtype != np.uint8 or array.ndim != 2 or array.shape[1] not in (3, 4) or len(array) != len(points):
             raise SceneBuildError(f"colors {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8")
         if array.shape[1] == 3:

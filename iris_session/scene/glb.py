@@ -60,6 +60,7 @@ class _Glb:
         self._materials: dict[tuple[object, ...], int] = {}
         self._textures: dict[int, int] = {}
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
+        self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
     def finish(self) -> bytes:
         T_world = {body.id: body.T_world_body for body in self._spec.bodies}
@@ -134,7 +135,10 @@ class _Glb:
             if uv is None and mapped is not None:
                 uv = generated_uv(arrays.position, geometry, self._spec.materials[visual.material])
             self._shared[key] = self._attributes(arrays, uv)
-        return {**self._shared[key], "material": self._material(visual.material, visual.rgba)}
+            if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
+                self._see_through.add(key)
+        material = self._material(visual.material, visual.rgba, blended=key in self._see_through)
+        return {**self._shared[key], "material": material}
 
     def _mapping(self, visual: Visual) -> tuple[object, ...] | None:
         """What generated texture coordinates depend on, `None` where there is no 2d texture."""
@@ -206,10 +210,14 @@ class _Glb:
 
     # --- looks --------------------------------------------------------------------------------------------------------
 
-    def _material(self, index: int, rgba: Sequence[float], *, both_sides: bool = False) -> int:
-        key = (index, tuple(rgba), both_sides)
+    def _material(self, index: int, rgba: Sequence[float], *, both_sides: bool = False, blended: bool = False) -> int:
+        """`blended`: something that wears it is not opaque, besides its own colour and textures."""
+        key = (index, tuple(rgba), both_sides, blended)
         if key not in self._materials:
-            self._materials[key] = self._add("materials", self._look(index, rgba, both_sides=both_sides))
+            look = self._look(index, rgba, both_sides=both_sides)
+            if blended:
+                look["alphaMode"] = "BLEND"
+            self._materials[key] = self._add("materials", look)
         return self._materials[key]
 
     def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool) -> dict[str, Any]:
@@ -224,6 +232,9 @@ class _Glb:
             if material.emission > 0:
                 found["emissiveFactor"] = [min(1.0, material.emission * v) for v in colour]
             found["name"] = material.name or f"material_{index}"
+            worn = material.texture()
+            if worn >= 0 and self._spec.textures[worn].channels == 4:
+                found["alphaMode"] = "BLEND"
             for where, key, roles in (
                 (look, "baseColorTexture", ()),
                 (look, "metallicRoughnessTexture", (TextureRole.ORM,)),

@@ -190,6 +190,8 @@ class _Reader:
         color = None
         if "COLOR_0" in attributes:
             color = _bytes(self._of_vertices(attributes["COLOR_0"], (3, 4), len(position)))[index]
+            if dress.opaque:
+                color[..., 3] = 255
         return index_corners(corners, normal, uv, color)
 
     def _of_vertices(self, accessor: object, widths: tuple[int, ...], count: int) -> NDArray[Any]:

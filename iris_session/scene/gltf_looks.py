@@ -21,18 +21,21 @@ from iris_session.scene.parts import Look, Picture, cut
 from iris_session.scene.pictures import read_pixels, without_alpha
 
 _REPEAT: Final = 10497
+#: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
+MAX_FILE_PIXELS: Final = 1 << 29
 Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Dress:
     """A look, whether it is drawn from both sides, and which texture coordinates it takes: `uv_set`, turned by
-    `uv_matrix` (3, 3) unless that is `None`; `uv_set` is -1 without textures."""
+    `uv_matrix` (3, 3) unless that is `None`; `uv_set` is -1 without textures. `opaque`: alpha says nothing."""
 
     look: Look
     both_sides: bool = False
     uv_set: int = -1
     uv_matrix: Doubles | None = None
+    opaque: bool = True
 
 
 class GltfLooks:
@@ -43,6 +46,7 @@ class GltfLooks:
         self._skipped = skipped
         self._dresses: dict[object, Dress] = {}
         self._pictures: dict[tuple[object, ...], Picture] = {}
+        self._pixels = 0
 
     def dress(self, material: object) -> Dress:
         """Of a primitive that names `material`, or none: then as glTF has it, white and rough."""
@@ -79,7 +83,7 @@ class GltfLooks:
             pictures=tuple((role, picture) for _, role, picture in uses),
         )
         uv_set, uv_matrix = self._mapping([use for use, _, _ in uses])
-        return Dress(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix)
+        return Dress(look, bool(entry.get("doubleSided", False)), uv_set, uv_matrix, mode == "OPAQUE")
 
     def _emission(self, entry: dict[str, Any], rgba: Rgba) -> tuple[Rgba, float]:
         """The specification has light of a material's own colour: how much, and the colour where it has none else."""
@@ -131,6 +135,11 @@ class GltfLooks:
         if kept not in self._pictures:
             name = cut(image.get("name") or texture.get("name") or "")
             pixels = read_pixels(self._data.picture_bytes(source), f"image {source} of {self._data.name}")
+            self._pixels += pixels.shape[0] * pixels.shape[1]
+            if self._pixels > MAX_FILE_PIXELS:
+                raise SceneBuildError(
+                    f"the images of {self._data.name} have more than {MAX_FILE_PIXELS:,} pixels together: shrink them"
+                )
             self._pictures[kept] = Picture(pixels if change is None else change(pixels), name, colorspace=space)
         return self._pictures[kept]
 

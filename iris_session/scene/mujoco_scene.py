@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from iris_session.protocol.common import MAX_TEXT, Vec3
+from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import (
     Body,
     Geometry,
@@ -229,4 +230,6 @@ def _skipped(model: mujoco.MjModel) -> tuple[str, ...]:
     found = []
     if model.nskin:
         found.append(f"{model.nskin} skins: only bodies, shapes and flexes are shared; use a flex")
+    if model.nflex > MAX_STREAMS:
+        found.append(f"how {model.nflex - MAX_STREAMS} of {model.nflex} flexes bend: {MAX_STREAMS} are streamed")
     return tuple(found)

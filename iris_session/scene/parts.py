@@ -156,8 +156,13 @@ def solid(matrix: Matrix) -> bool:
 def pose_of(R: NDArray[np.float64], p: Any) -> Pose:
     """A pose of a rotation matrix (3, 3) and a position."""
     w, i, j, k = matrix_quat(np.asarray(R, np.float64)).tolist()
-    x, y, z = (float(v) for v in p)
-    return Pose((x, y, z), (w, i, j, k))
+    return Pose(vec3(p), (w, i, j, k))
+
+
+def vec3(p: Any) -> Vec3:
+    """The first three of an array."""
+    x, y, z = (float(v) for v in p[:3])
+    return x, y, z
 
 
 def matrix_of(pose: Pose) -> Matrix:
@@ -166,6 +171,14 @@ def matrix_of(pose: Pose) -> Matrix:
     matrix[:3, :3] = quat_matrix(np.array(pose.q))
     matrix[:3, 3] = pose.p
     return matrix
+
+
+def array_of(values: Any, what: str) -> NDArray[Any]:
+    """What a caller gave, as an array. Raises `SceneBuildError` for what is none, as rows of different lengths."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise SceneBuildError(f"{what}: no array: {error}") from None
 
 
 def checked_pose(position: Any, quaternion: Any) -> Pose:
@@ -186,5 +199,5 @@ def checked_pose(position: Any, quaternion: Any) -> Pose:
 
 
 def cut(name: object) -> str:
-    """A name as the wire holds it."""
-    return str(name)[:MAX_TEXT] if name is not None else ""
+    """A name as the wire holds it: not longer, and of characters that can be sent (JSON may hold halves of some)."""
+    return str(name)[:MAX_TEXT].encode("utf-8", "replace").decode() if name is not None else ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import Pixels
+from iris_session.scene.parts import array_of
 
 #: Most pixels of one image: larger ones are no texture, or a bomb.
 MAX_PIXELS: Final = 1 << 26
@@ -18,17 +19,17 @@ def read_pixels(data: bytes, what: str) -> Pixels:
     """(height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
     image_module = _pillow()
     try:
-        image = image_module.open(io.BytesIO(data))
-        width, height = image.size
-        if width * height > MAX_PIXELS:
-            raise SceneBuildError(f"{what} has {width} x {height} pixels, at most {MAX_PIXELS:,} are read: shrink it")
-        return pixels_of(image)
+        return pixels_of(image_module.open(io.BytesIO(data)), what)
     except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
         raise SceneBuildError(f"{what} is no image that can be read: {error}") from None
 
 
-def pixels_of(image: Any) -> Pixels:
-    """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque."""
+def pixels_of(image: Any, what: str) -> Pixels:
+    """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque. Raises `SceneBuildError`
+    for too many, before they are decoded."""
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise SceneBuildError(f"{what} has {width} x {height} pixels, at most {MAX_PIXELS:,} are read: shrink it")
     if image.mode.startswith(("I", "F")):
         values = np.asarray(image, np.float64)
         top = 65_535.0 if image.mode.startswith("I") else 1.0
@@ -48,7 +49,7 @@ def without_alpha(pixels: Pixels, *, always: bool = False) -> Pixels:
 
 def checked_pixels(pixels: Any, what: str) -> Pixels:
     """A texture that a caller gave as an array. Raises `SceneBuildError` for what is none."""
-    array = np.asarray(pixels)
+    array = array_of(pixels, what)
     if array.ndim == 2:
         array = array[:, :, None]
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (1, 3, 4) or not array.size:

@@ -2,8 +2,9 @@
 refers to is read only from folders that belong to it.
 
 Those are its own folder with all below; folders beside that one which are called as models call theirs (`SIBLINGS`);
-the package it lies in, from the folder with `package.xml`; and the folders that the caller names. Symbolic links are
-followed before this is judged.
+the package it lies in, from the folder with `package.xml`; packages that it names (`package://`), in or beside a folder
+above it, if they have a `package.xml` too; and the folders that the caller names. Symbolic links are followed before
+this is judged.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class References:
         """As ROS has it: the folder of that name; searched in what was given, then upward from the file."""
         if package in ("", ".", ".."):
             raise SceneBuildError(f"{self.path.name} refers to {reference}: no package is named there")
-        tried = []
+        tried, closed = [], None
         places = (*self.given, *self._above())
         for root in (*places, *(place / package for place in places)):
             if root.name != package and not _is_package(root, package):
@@ -106,11 +107,20 @@ class References:
             tried.append(root)
             found = (root / inside).resolve()
             if found.is_relative_to(root.resolve()) and found.is_file():
-                return found
+                if self._may_draw_in(root, found):
+                    return found
+                closed = closed or root
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
+        if closed is not None:  # any folder has a name: of somebody's pictures, of keys
+            hint = f"{closed} has no {_PACKAGE}, so it is no package"
         raise SceneBuildError(
             f"{self.path.name} refers to {reference}: {hint}; name the package's folder in package_dirs"
         )
+
+    def _may_draw_in(self, root: Path, found: Path) -> bool:
+        """Whether `found`, below the folder `root` that was found by its name, belongs to the file."""
+        named = root in self.given or root.parent in self.given
+        return named or (root / _PACKAGE).is_file() or any(found.is_relative_to(own) for own in self._roots)
 
     def _above(self) -> tuple[Path, ...]:
         """The file's folder and those above it, without the root of the file system."""

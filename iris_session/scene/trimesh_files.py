@@ -6,6 +6,7 @@ Colours are taken as they stand in the file. Where it has no normals they are ma
 from __future__ import annotations
 
 import io
+import math
 import re
 import zipfile
 from pathlib import Path
@@ -64,6 +65,8 @@ def _check(path: Path, kind: str, data: bytes) -> None:
             import collada  # noqa: F401
         except ImportError:
             raise SceneBuildError(f"{path.name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
+        if b"<!DOCTYPE" in data:  # whose entities may be other files
+            raise SceneBuildError(f"{path.name} has a DOCTYPE: remove it")
     if zipfile.is_zipfile(io.BytesIO(data)):
         size = sum(entry.file_size for entry in zipfile.ZipFile(io.BytesIO(data)).infolist())
         if size > MAX_FILE_BYTES:
@@ -86,7 +89,7 @@ class _Reader:
     def __init__(self, trimesh: Any, name: str) -> None:
         self._trimesh = trimesh
         self._name = name
-        self._looks: dict[int, Look] = {}
+        self._looks: dict[int, Look | None] = {}
         self._pictures: dict[int, Picture] = {}
         self.skipped: list[str] = []
 
@@ -144,23 +147,29 @@ class _Reader:
         first, same = unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
         return creased_normals(points[first], same[faces]).astype(np.float32)
 
-    def _look(self, material: Any) -> Look:
+    def _look(self, material: Any) -> Look | None:
         if id(material) not in self._looks:
             pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
             self._looks[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
         return self._looks[id(material)]
 
-    def _of_mtl(self, material: Any) -> Look:
-        """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour."""
+    def _of_mtl(self, material: Any) -> Look | None:
+        """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour. `None` of one that trimesh
+        makes up for texture coordinates without a material, grey with a picture that comes from no file."""
         more = getattr(material, "kwargs", None) or {}
-        rgba = _rgba(material.diffuse)
+        if not more and getattr(material.image, "format", None) is None:
+            return None
+        rgba = (1.0, 1.0, 1.0, 1.0) if material.image is not None else GREY
+        if "kd" in more:
+            rgba = _rgba(material.diffuse)
         alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
         pictures = self._picture(material.image)
         specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
+        shine = 0.5 if specular is None else float(np.mean(specular))
         return Look(
             rgba=(*rgba[:3], min(max(alpha, 0.0), 1.0)),
             name=cut(material.name),
-            specular=0.5 if specular is None else min(max(float(np.mean(specular)), 0.0), 1.0),
+            specular=min(max(shine, 0.0), 1.0) if math.isfinite(shine) else 0.5,
             shininess=min(max(gloss / 128.0, 0.0), 1.0),
             pictures=pictures,
         )
@@ -184,7 +193,7 @@ class _Reader:
         if image is None:
             return ()
         if id(image) not in self._pictures:
-            self._pictures[id(image)] = Picture(pixels_of(image))
+            self._pictures[id(image)] = Picture(pixels_of(image, f"a picture of {self._name}"))
         picture = self._pictures[id(image)]
         return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
 
@@ -198,11 +207,12 @@ def _rgba(color: Any) -> Rgba:
 
 
 def _first(value: Any, default: float) -> float:
-    """A number of an MTL file, which may come as a list of texts."""
+    """A finite number of an MTL file, which may come as a list of texts."""
     try:
-        return float(value[0] if isinstance(value, list | tuple) else value)
+        found = float(value[0] if isinstance(value, list | tuple) else value)
     except (TypeError, ValueError, IndexError):
         return default
+    return found if math.isfinite(found) else default
 
 
 def _resolver(trimesh: Any, references: References) -> Any:

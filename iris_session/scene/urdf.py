@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from iris_session.protocol.common import Pose
+from iris_session.protocol.scene_looks import Rgba
 from iris_session.protocol.scene_names import GeometryKind, TextureRole
 from iris_session.scene.articulation import Articulation, Part
 from iris_session.scene.errors import SceneBuildError
@@ -227,11 +228,16 @@ class _Reader:
             return None
         key = f"{known.name} {known.color} {known.texture}"
         if key not in self._looks:
-            rgba = (1.0, 1.0, 1.0, 1.0) if known.color is None else tuple(float(v) for v in known.color.rgba)
-            if len(rgba) != 4:
-                raise SceneBuildError(f"{self._path.name}: material {known.name!r} needs rgba of four numbers")
+            rgba = self._rgba(known)
             self._looks[key] = Look(rgba=rgba, name=cut(known.name or ""), pictures=self._texture(known.texture))
         return self._looks[key]
+
+    def _rgba(self, material: Any) -> Rgba:
+        values = (1.0,) * 4 if material.color is None else tuple(float(v) for v in material.color.rgba)
+        if len(values) != 4 or not all(map(math.isfinite, values)):
+            raise SceneBuildError(f"{self._path.name}: material {material.name!r} needs rgba of four finite numbers")
+        red, green, blue, alpha = (min(max(v, 0.0), 1.0) for v in values)
+        return red, green, blue, alpha
 
     def _texture(self, texture: Any) -> tuple[tuple[str, Picture], ...]:
         if texture is None or not texture.filename:

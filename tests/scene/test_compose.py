@@ -13,6 +13,7 @@ import pytest
 
 import iris_session
 from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import Environment, decode_scene
 from iris_session.scene import AssetStore, SceneBuildError, decode_arrays, decode_mesh
 from iris_session.scene.compose import SceneBuilder
@@ -217,12 +218,18 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_box", {**BOX, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
         ("add_box", {**BOX, "name": "b", "movable": True, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
         ("add_box", {**BOX, "rgba": (1, 0)}, "4 finite numbers"),
+        ("add_box", {**BOX, "rgba": "crimson"}, "4 numbers"),
+        ("add_box", {**BOX, "rgba": None}, "4 numbers"),
+        ("add_box", {**BOX, "texture": [[0, 1], [0]]}, "no array"),
+        ("add_box", {**BOX, "name": "\ud800", "movable": True}, "needs a name"),
         ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "uint8"),
         ("add_box", {**BOX, "texture": "/lost.png"}, "no such file"),
         ("add_sphere", {"radius": float("inf")}, "finite"),
         ("add_plane", {"half_size": (-1, 0)}, "half_size of a plane"),
         ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1, 4]]}, "numbers go from 0 to 3"),
         ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1]]}, r"shape \(m, 3\)"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1], [0, 1, 2]]}, "no array"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": [[0, 1], [0]]}, "no array"),
         ("add_mesh", {"vertices": SQUARE * np.nan, "triangles": TRIANGLES}, "finite"),
         ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "uvs": SQUARE[:2, :2]}, "one each"),
         ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": SQUARE}, "uint8"),
@@ -233,6 +240,7 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_light", {"kind": "laser"}, "directional, spot or point"),
         ("add_light", {"direction": (0, 0, 0)}, "direction"),
         ("add_camera", {"fovy": 0}, "fovy"),
+        ("add_camera", {"fovy": 180}, "below 180"),
         ("set_skybox", {"pixels": np.zeros((5, 2, 3), np.uint8)}, "six squares"),
         ("add_file", {"path": "/lost.glb"}, "no such file"),
         ("add_urdf", {"path": "/lost.urdf"}, "no such file"),
@@ -248,6 +256,37 @@ def test_refusals_say_what_would_be_right(
     with pytest.raises(SceneBuildError, match=text):
         getattr(scene, method)(**arguments)
     assert scene.build(store).scene_hash == before  # what was refused left nothing behind
+
+
+def test_what_clients_would_not_read_is_refused(store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(scene: SceneBuilder, text: str) -> None:
+        with pytest.raises(SceneBuildError, match=text):
+            scene.build(store)
+
+    scene = SceneBuilder()
+    scene.add_camera(resolution="big")  # type: ignore[arg-type]
+    refused(scene, "cannot be drawn: Expected `array`.*resolution")
+    scene = SceneBuilder()
+    scene.environment = Environment(fog_end=float("inf"))
+    refused(scene, "cannot be drawn: Expected `float`.*fog_end")
+    scene.environment = Environment(skybox=7)
+    refused(scene, "texture 7")
+    scene = SceneBuilder()
+    scene.add_mesh(vertices=SQUARE * 2e6, triangles=TRIANGLES)
+    refused(scene, "scale it to metres")
+    scene = SceneBuilder()
+    scene.add_box(half_size=(1, 1, 1))
+    monkeypatch.setattr("iris_session.protocol.scene.MAX_SCENE_BYTES", 100)
+    refused(scene, "1 visuals, 1 bodies.*join what stands still")
+
+
+def test_no_more_deformables_than_there_are_streams(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    for k in range(MAX_STREAMS):
+        scene.add_deformable(f"cloth {k}", SQUARE, TRIANGLES)
+    with pytest.raises(SceneBuildError, match="16 are streamed"):
+        scene.add_deformable("one more", SQUARE, TRIANGLES)
+    assert len(scene.build(store).deformables) == MAX_STREAMS
 
 
 def test_public_names() -> None:

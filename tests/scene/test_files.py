@@ -97,8 +97,9 @@ def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
         built(tmp_path / "a.stl", tmp_path, up="x")
     with pytest.raises(SceneBuildError, match="scale is 0"):
         built(tmp_path / "a.stl", tmp_path, scale=0)
-    with pytest.raises(SceneBuildError, match="scale"):
-        built(tmp_path / "a.stl", tmp_path, scale=float("nan"))
+    for scale in (float("nan"), "big", (1, 2), [[1], [1, 2]], None):
+        with pytest.raises(SceneBuildError, match="scale"):
+            built(tmp_path / "a.stl", tmp_path, scale=scale)
 
 
 def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
@@ -129,6 +130,29 @@ def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
     assert scene.spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
 
 
+def test_what_a_material_does_not_say_is_not_made_up(tmp_path: Path) -> None:
+    """A texture is not darkened, and a URDF colours a mesh that has coordinates but no material."""
+    path = write_obj(tmp_path)
+    (tmp_path / "parts.mtl").write_text("newmtl painted\nmap_Kd picture.png\n")
+    looks = {node.name: node.surfaces[0].look for node in load_file(path).nodes}
+    painted = next(look for look in looks.values() if look is not None and look.pictures)
+    assert painted.rgba == (1.0, 1.0, 1.0, 1.0)
+    (tmp_path / "bare.obj").write_text(OBJ.replace("mtllib parts.mtl\n", "").replace("f 1 2 3\n", ""))
+    (node,) = load_file(tmp_path / "bare.obj").nodes
+    assert node.surfaces[0].look is None
+    assert node.surfaces[0].mesh.uv is not None
+
+
+def test_numbers_of_a_material_that_are_none_are_left_out(tmp_path: Path) -> None:
+    """Clients and the picture of a recording would draw nothing of the scene."""
+    path = write_obj(tmp_path)
+    (tmp_path / "parts.mtl").write_text(MTL.replace("d 0.4", "d nan\nNs nan\nKs nan nan nan"))
+    scene, _ = built(path, tmp_path)
+    visual = next(visual for visual in scene.spec.visuals if visual.name == "red")
+    assert visual.rgba == pytest.approx((0.8, 0.2, 0.2, 1.0), abs=0.003)
+    assert visual.material == -1 or scene.spec.materials[visual.material].specular == 0.5
+
+
 def test_what_is_missing_is_told(tmp_path: Path) -> None:
     path = write_obj(tmp_path)
     (tmp_path / "picture.png").unlink()
@@ -147,6 +171,7 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "nothing|damaged"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
         ("a.dae", b"<COLLADA>", "damaged"),
+        ("a.dae", b"<!DOCTYPE COLLADA [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><COLLADA/>", "has a DOCTYPE"),
         ("a.3mf", b"PK\3\4", "damaged"),
         ("a.glb", b"glTF", "cut"),
         ("a.gltf", b"[]", "no glTF"),
@@ -209,7 +234,7 @@ def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
     assert references.find("deep/a.stl") == package / "urdf/deep/a.stl"
     assert references.find("../meshes/a%20b.stl") == package / "meshes/a b.stl"
     assert references.find(f"file://{package}/meshes/a b.stl") == package / "meshes/a b.stl"
-    assert references.find("package://package/secret/a.stl") == package / "secret/a.stl"
+    assert references.find("package://package/meshes/a b.stl") == package / "meshes/a b.stl"
     for outside in ("../secret/a.stl", "../../other/a.stl", "meshes/a.stl", "/etc/passwd", "file:///etc/passwd"):
         with pytest.raises(SceneBuildError, match="outside of its own folders"):
             references.find(outside)
@@ -219,6 +244,26 @@ def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
     (package / "package.xml").write_text("<package> <name> official </name> </package>")
     assert References(model).find("../secret/a.stl") == package / "secret/a.stl"
     assert References(model).find("package://official/secret/a.stl") == package / "secret/a.stl"
+    assert References(model).find("package://package/secret/a.stl") == package / "secret/a.stl"
     assert References(model, [tmp_path / "other"]).find("../../other/a.stl") == tmp_path / "other/a.stl"
     with pytest.raises(SceneBuildError, match="no such folder"):
         References(model, [tmp_path / "lost"])
+
+
+def test_a_folder_is_no_package_because_of_its_name(tmp_path: Path) -> None:
+    """A downloaded URDF must not show everybody what lies beside the folder of downloads."""
+    home = tmp_path / "ann"
+    for folder in ("Downloads", "Pictures", ".ssh", "gripper"):
+        (home / folder).mkdir(parents=True)
+    for path in ("Pictures/private.png", ".ssh/key", "gripper/a.stl"):
+        (home / path).write_bytes(b"x")
+    model = home / "Downloads" / "robot.urdf"
+    model.write_text("")
+    names = ("Pictures/private.png", ".ssh/key", "ann/Pictures/private.png", "gripper/a.stl")
+    for name in names:
+        with pytest.raises(SceneBuildError, match=r"no package\.xml, so it is no package; name the package's folder"):
+            References(model).find(f"package://{name}")
+    (home / "gripper" / "package.xml").write_text("<package><name>gripper</name></package>")
+    assert References(model).find("package://gripper/a.stl") == home / "gripper" / "a.stl"
+    for given in (home, home / "Pictures"):
+        assert References(model, [given]).find(f"package://{names[0]}") == home / names[0]

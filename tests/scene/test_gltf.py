@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import SceneSpec
 from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
 from iris_session.scene.compose import SceneBuilder
@@ -131,7 +132,8 @@ def test_there_and_back_again(tmp_path: Path, store: AssetStore) -> None:
 def test_colours_of_vertices_come_back(tmp_path: Path, store: AssetStore) -> None:
     document = Document()
     colors = RNG.integers(0, 65_535, (4, 4), dtype=np.uint16)
-    document.square(COLOR_0=document.accessor(colors, normalized=True))
+    document.json["materials"] = [{"alphaMode": "BLEND"}]
+    document.square(0, COLOR_0=document.accessor(colors, normalized=True))
     first = built(document.write(tmp_path / "a.glb"), store)
     mesh = decode_mesh(store.get(first.meshes[0].levels[0].address))
     assert mesh.color is not None
@@ -144,6 +146,11 @@ def test_colours_of_vertices_come_back(tmp_path: Path, store: AssetStore) -> Non
     write_glb(first, store, tmp_path / "b.glb")
     second = built(tmp_path / "b.glb", store)
     assert first.meshes[0].levels == second.meshes[0].levels
+    document.json["materials"] = [{}]  # opaque: what the alpha of its vertices is does not count
+    opaque = built(document.write(tmp_path / "c.glb"), store)
+    mesh = decode_mesh(store.get(opaque.meshes[0].levels[0].address))
+    assert mesh.color is not None
+    assert (mesh.color[:, 3] == 255).all()
 
 
 def test_one_colour_everywhere_is_the_colour(tmp_path: Path, store: AssetStore) -> None:
@@ -214,6 +221,8 @@ def test_textures_as_the_material_has_them(tmp_path: Path, store: AssetStore) ->
     worn = decode_mesh(store.get(spec.meshes[spec.visuals[3].geometry.mesh].levels[0].address))
     assert worn.uv is not None
     np.testing.assert_allclose(sorted(worn.uv.tolist()), sorted((SQUARE_UV * [2, 3] + [0.25, 0.5]).tolist()))
+    again = built(_again(tmp_path / "a.glb", tmp_path / "b.glb", store), store)
+    assert [t.channels for t in again.textures] == [t.channels for t in spec.textures], "alpha comes back"
 
 
 def test_both_sides_of_what_is_open(tmp_path: Path, store: AssetStore) -> None:
@@ -264,6 +273,38 @@ def test_lights_and_cameras_stand_where_they_are(tmp_path: Path, store: AssetSto
         np.testing.assert_allclose(T[:3, 3], [1, -3, 2], atol=1e-9)
         np.testing.assert_allclose(-T[:3, 2], [0, 0, 1], atol=1e-9)
         assert camera.fovy == pytest.approx(math.degrees(1.0))
+
+
+@pytest.mark.parametrize("movable", [True, False])
+@pytest.mark.parametrize("scale", [(-1, 1, 1), (1, -1, 1), (1, 2, -3), (2, 1, 1)])
+def test_lights_and_cameras_look_where_a_mirrored_node_turns_them(
+    tmp_path: Path, store: AssetStore, scale: tuple[float, ...], movable: bool
+) -> None:
+    document = Document()
+    document.square()
+    turned = [0.5, -0.5, 0.5, 0.5]
+    document.json |= {
+        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "spot"}]}},
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 1.0}}],
+        "nodes": [
+            {"mesh": 0, "scale": list(scale), "children": [1]},
+            {"rotation": turned, "translation": [1, 2, 3], "camera": 0, "children": [2]},
+            {"extensions": {"KHR_lights_punctual": {"light": 0}}},
+        ],
+    }
+    spec = built(document.write(tmp_path / "a.glb"), store, up="z", name="lamp", movable=movable)
+    x, y, z, w = turned
+    R = matrix_of(Pose((0.0, 0.0, 0.0), (w, x, y, z)))[:3, :3]
+    forward, up = np.diag(scale) @ R @ [0, 0, -1], np.diag(scale) @ R @ [0, 1, 0]
+    bodies = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    (light,), (camera,) = spec.lights, spec.cameras
+    T = bodies[camera.body] @ matrix_of(camera.T_body_camera)
+    for found in (bodies[light.body][:3, :3] @ light.direction_body, -T[:3, 2]):
+        np.testing.assert_allclose(found, forward / np.linalg.norm(forward), atol=1e-9)
+    np.testing.assert_allclose(T[:3, 1], up / np.linalg.norm(up), atol=1e-9)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    for p in ((bodies[light.body] @ [*light.p_body, 1])[:3], T[:3, 3]):
+        np.testing.assert_allclose(p, np.array(scale) * [1, 2, 3], atol=1e-9)
 
 
 def _again(path: Path, out: Path, store: AssetStore) -> Path:

@@ -251,6 +251,16 @@ def test_skins_are_named_as_left_out(tmp_path: Path) -> None:
     assert "1 skins" in parse(xml, tmp_path).skipped[0]
 
 
+def test_flexes_that_no_stream_is_left_for_are_named(tmp_path: Path) -> None:
+    ropes = "".join(
+        f'<flexcomp name="{k}" type="grid" dim="1" count="2 1 1" spacing=".1 .1 .1" pos="0 {k} 1" radius=".01">'
+        '<edge equality="true"/></flexcomp>'
+        for k in range(18)
+    )
+    skipped = parse(f"<mujoco><worldbody>{ropes}</worldbody></mujoco>", tmp_path).skipped
+    assert skipped == ("how 2 of 18 flexes bend: 16 are streamed",)
+
+
 def test_an_sdf_comes_as_its_mesh(tmp_path: Path) -> None:
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
     <worldbody><geom type="sdf" mesh="m"/></worldbody></mujoco>"""

@@ -131,6 +131,7 @@ def test_picture_is_mujocos(tmp_path: Path) -> None:
         ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "the axis of joint turn"),
         ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "damaged, or no URDF"),
         ('radius="0.1"', 'radius="-1"', "positive lengths"),
+        ('rgba="0.9 0.5', 'rgba="nan 0.5', "rgba of four finite numbers"),
         ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
         ("</robot>", "", "no XML"),
         ("robot", "sdf", "<robot> is needed"),
