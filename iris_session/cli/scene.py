@@ -15,9 +15,10 @@ from iris_session.cli.common import CommandError, add_json, open_scene, print_js
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
     from iris_session.scene import AssetStore
+    from iris_session.scene.compose import SceneBuilder
 
-#: Endings of files that MuJoCo reads; none: a name.
-_MUJOCO: Final = frozenset({"", ".xml", ".mjb"})
+#: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
+SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 
 
 class _Found(NamedTuple):
@@ -60,15 +61,19 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
         help="MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
         "scene (see `iris-session serve --help`)",
     )
+    add_package_dir(parser)
+    parser.add_argument(
+        "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
+    )
+
+
+def add_package_dir(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--package-dir",
         action="append",
         default=[],
         metavar="DIR",
         help="folder of packages that the file refers to by package://, or may refer into; may be repeated",
-    )
-    parser.add_argument(
-        "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
     )
 
 
@@ -134,7 +139,7 @@ def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
     path = Path(arguments.scene)
     try:
         store = AssetStore(arguments.assets)
-        composed = path.suffix.lower() not in _MUJOCO
+        composed = path.suffix.lower() not in ("", *SIMULATED)  # without an ending it is a name
         return _compose(path, arguments.package_dir, store) if composed else _parse_model(arguments.scene, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
@@ -154,19 +159,30 @@ def _parse_model(scene: str, store: AssetStore) -> _Found:
 
 def _compose(path: Path, package_dirs: list[str], store: AssetStore) -> _Found:
     from iris_session.scene import SceneBuildError
+
+    builder = builder_of(path, path.stem, package_dirs)
+    try:
+        made = builder.build(store)
+    except SceneBuildError as error:
+        raise CommandError(str(error)) from None
+    return _Found(made.spec, made.scene_hash, made.skipped)
+
+
+def builder_of(path: Path, name: str, package_dirs: list[str]) -> SceneBuilder:
+    """A scene called `name` with what is in a file that MuJoCo does not read."""
+    from iris_session.scene import SceneBuildError
     from iris_session.scene.compose import SceneBuilder
 
-    builder = SceneBuilder(path.stem)
+    builder = SceneBuilder(name)
     try:
         if path.suffix.lower() == ".urdf":
             builder.add_urdf(path, package_dirs=package_dirs)
         else:
             builder.add_file(path, package_dirs=package_dirs)
-        made = builder.build(store)
     except SceneBuildError as error:
-        advice = "" if not str(error).count("package_dirs") else " (here: --package-dir DIR)"
+        advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
-    return _Found(made.spec, made.scene_hash, made.skipped)
+    return builder
 
 
 def _size(n_bytes: int) -> str:

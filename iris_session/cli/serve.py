@@ -7,7 +7,7 @@ import dataclasses
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from iris_session.cli.common import (
     CommandError,
@@ -19,15 +19,13 @@ from iris_session.cli.common import (
     print_json,
     scene_names,
 )
+from iris_session.cli.scene import SIMULATED, add_package_dir, builder_of
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
     from iris_session.runtime.config import SessionConfig
     from iris_session.runtime.scene_publisher import ScenePublisher
     from iris_session.runtime.session import Session
-
-#: Files that MuJoCo simulates; any other one is shown.
-SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,6 +68,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="RECORDING",
         help="go on from the end of a recording (a .rrd or its folder): same session, people, leases, scene",
     )
+    add_package_dir(parser)
     parser.add_argument("--seconds", type=positive_seconds, help="stop after this many seconds")
     add_session_options(parser)
     add_json(parser)
@@ -153,16 +152,11 @@ def file_to_show(scene: str | None) -> Path | None:
 def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
     """A session in which everybody sees a file, and nothing moves."""
     from iris_session.runtime.scene_publisher import ScenePublisher
-    from iris_session.scene.compose import SceneBuilder
 
     drives = ("robots", "assign", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
         raise CommandError(f"{', '.join(given)}: nobody drives what is in {path.name}, it is shown as it is")
-    scene = SceneBuilder(path.name)
-    if path.suffix.lower() == ".urdf":
-        scene.add_urdf(path)
-    else:
-        scene.add_file(path)
+    scene = builder_of(path, path.name, arguments.package_dir)
     config = with_anchors(session_config(arguments, session_name(path)), arguments.anchors)
     return ScenePublisher(scene, config)
 
@@ -196,6 +190,8 @@ def run(arguments: argparse.Namespace) -> int:
     shown = None if arguments.resume is not None else file_to_show(arguments.scene)
     if shown is not None:
         return _serve(arguments, showing_session(arguments, shown), f"showing {shown.name}, which nobody drives")
+    if arguments.package_dir:
+        raise CommandError("--package-dir goes with a file to show: MuJoCo's files say themselves where theirs lie")
     session = resumed_session(arguments) if arguments.resume is not None else new_session(arguments)
     hint = ""
     if not session.robots:

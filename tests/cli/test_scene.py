@@ -29,8 +29,10 @@ def test_inspect_of_an_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_export_of_files_and_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.stl")
-    (tmp_path / "model.xml").write_text('<mujoco><worldbody><geom type="box" size=".5 1 1.5"/></worldbody></mujoco>')
-    for source in (tmp_path / "box.stl", tmp_path / "model.xml", furniture(tmp_path / "furniture.glb")):
+    for name in ("model.xml", "other.mjcf"):
+        (tmp_path / name).write_text('<mujoco><worldbody><geom type="box" size=".5 1 1.5"/></worldbody></mujoco>')
+    names = ("box.stl", "model.xml", "other.mjcf")
+    for source in (*(tmp_path / name for name in names), furniture(tmp_path / "furniture.glb")):
         out = tmp_path / f"{source.stem}_out.glb"
         assert run("scene", "export", source, out, "--assets", tmp_path / "assets") == 0
         assert str(out) in capsys.readouterr().out

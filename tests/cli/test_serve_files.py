@@ -56,6 +56,21 @@ def test_what_is_shown_has_no_robots_to_speak_of(
     assert error.count("\n") == 1
 
 
+def test_a_package_elsewhere_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arm = tmp_path / "arm" / "arm.urdf"
+    for path in (arm.parent, tmp_path / "models" / "part"):
+        path.mkdir(parents=True)
+    (tmp_path / "models" / "part" / "a.off").write_text(TRIANGLE)
+    arm.write_text(ARM.replace('<sphere radius="0.1"/>', '<mesh filename="package://part/a.off"/>'))
+    assert main(["serve", str(arm), *QUIET]) == 2
+    assert "(here: --package-dir DIR)" in capfd.readouterr().err
+    named = ("--package-dir", str(tmp_path / "models"))
+    assert main(["serve", str(arm), *named, "--seconds", "0.1", "--json", *QUIET]) == 0
+    capfd.readouterr()
+    assert main(["serve", "handover", *named, *QUIET]) == 2
+    assert "--package-dir goes with a file to show" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "says"), [("part.off", "damaged"), ("part.docx", "are not read"), ("arm.urdf", "arm")]
 )
