@@ -8,6 +8,7 @@ Public API, nothing else is public:
 - `ScenePublisher`: share such a scene, moved by another simulator or a real robot. Error: `PublishError`.
 - `Client`: join a session from any process. Errors: `ClientError` and its subclasses. `find_sessions`: those on this
   network, as `FoundSession`.
+- `fetch_scene`: what a client needs to draw the scene, as `FetchedScene`. `Deformables`: the vertices of what bends in it.
 
 Names are imported on first use, so that a light client does not load MuJoCo.
 """
@@ -19,6 +20,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from iris_session.client import Client, ClientError, FoundSession, find_sessions
+    from iris_session.client.deformables import Deformables
+    from iris_session.client.fetched_scene import FetchedScene, fetch_scene
     from iris_session.runtime.config import SessionConfig
     from iris_session.runtime.errors import (
         ConfigError,
@@ -49,6 +52,9 @@ _HOME: Final = {
     "ClientError": "iris_session.client",
     "FoundSession": "iris_session.client",
     "find_sessions": "iris_session.client",
+    "fetch_scene": "iris_session.client.fetched_scene",
+    "FetchedScene": "iris_session.client.fetched_scene",
+    "Deformables": "iris_session.client.deformables",
 }
 
 __all__ = [
@@ -67,6 +73,9 @@ __all__ = [
     "ClientError",
     "FoundSession",
     "find_sessions",
+    "fetch_scene",
+    "FetchedScene",
+    "Deformables",
 ]
 
 

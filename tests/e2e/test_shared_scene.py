@@ -11,6 +11,7 @@ import pytest
 from iris_session.client import Client
 from iris_session.client.asset_cache import AssetCache
 from iris_session.client.deformables import Deformables
+from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import Recording
@@ -65,6 +66,10 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
     level = spec.meshes[0].levels[0]
     mesh = decode_mesh(ann.asset_cache.read(level.address))
     assert np.linalg.norm(mesh.position, axis=1) == pytest.approx(1.0, abs=0.05)
+
+    scene = fetch_scene(ann, timeout_s=30.0)
+    assert (scene.spec, scene.scene_hash, dict(scene.failed)) == (spec, ann.mirror.scene_hash, {})
+    assert np.array_equal(scene.meshes[0].position, mesh.position)
 
     (cloth,) = spec.deformables
     arrays = decode_arrays(ann.asset_cache.read(cloth.address), ArrayKind.DEFORMABLE)

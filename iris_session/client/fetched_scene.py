@@ -1,0 +1,114 @@
+"""The scene of a session as a Python client draws it: specification, meshes and textures, fetched and decoded.
+
+scene = fetch_scene(client)
+for visual in scene.spec.visuals:
+    if visual.geometry.mesh in scene.meshes:
+        print(visual.name, scene.meshes[visual.geometry.mesh].position.shape)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.client import Client
+from iris_session.client.errors import AssetError, ClientError, NotConnectedError
+from iris_session.protocol.assets import is_address
+from iris_session.protocol.scene import SceneError, SceneSpec, decode_scene
+from iris_session.scene import MeshArrays, decode_image, decode_mesh
+from iris_session.scene.budget import Budget, choose_levels
+from iris_session.scene.images import Pixels
+
+#: No bound: the finest of everything.
+EVERYTHING: Final = Budget()
+#: How long a slow network may take [s].
+DEFAULT_TIMEOUT_S: Final = 60.0
+
+
+@dataclass(frozen=True)
+class FetchedScene:
+    """`spec`: what is where; `meshes`, `textures`: by their place in `spec.meshes` and `spec.textures`. Vertices are in
+    the visual's frame [m], pixels (height, width, channels), top row first.
+
+    `hidden`: ids of visuals that the budget leaves out. `failed`: what cannot be drawn, and why, by address.
+    """
+
+    scene_hash: str
+    spec: SceneSpec
+    meshes: Mapping[int, MeshArrays]
+    textures: Mapping[int, Pixels]
+    hidden: frozenset[int]
+    failed: Mapping[str, AssetError]
+
+
+def fetch_scene(
+    client: Client,
+    budget: Budget = EVERYTHING,
+    timeout_s: float = DEFAULT_TIMEOUT_S,
+    on_progress: Callable[[AssetFetch], None] | None = None,
+) -> FetchedScene:
+    """Fetches the present scene and waits for it; what the cache of this machine has does not travel.
+
+    A scene that is replaced meanwhile is left for the new one. After `scene_changed`, call it again when
+    `client.mirror.scene_hash` is another. Raises `NotConnectedError` when it takes longer than `timeout_s`, or the
+    session shares no specification; `ClientError` for one that this package does not read.
+    """
+    until = time.monotonic() + timeout_s
+    while True:
+        scene_hash = client.mirror.scene_hash
+        try:
+            scene = _fetch(client, scene_hash, budget, until, on_progress)
+        except ClientError:
+            if client.mirror.scene_hash == scene_hash or time.monotonic() >= until:
+                raise
+            continue  # another scene took its place
+        if client.mirror.scene_hash == scene_hash:
+            return scene
+
+
+def _fetch(
+    client: Client, scene_hash: str, budget: Budget, until: float, on_progress: Callable[[AssetFetch], None] | None
+) -> FetchedScene:
+    spec = _specification(client, scene_hash, until)
+    choice = choose_levels(spec, budget)
+    meshes = [mesh.levels[level] for mesh, level in zip(spec.meshes, choice.mesh_levels, strict=True)]
+    textures = [texture.levels[level] for texture, level in zip(spec.textures, choice.texture_levels, strict=True)]
+    decoders: dict[str, Callable[[memoryview], Any]] = {one.address: decode_mesh for one in meshes}
+    decoders |= {one.address: partial(decode_image, encoding=one.encoding) for one in textures}
+
+    def decode(address: str, data: memoryview) -> MeshArrays | Pixels:
+        return decoders[address](data)  # type: ignore[no-any-return]
+
+    sizes = {one.address: one.bytes for one in meshes} | {one.address: one.bytes for one in textures}
+    fetch = _wait(client, client.fetch_assets(sizes, on_progress, decode), until)
+    made = fetch.decoded
+    return FetchedScene(
+        scene_hash,
+        spec,
+        {i: made[one.address] for i, one in enumerate(meshes) if one.address in made},
+        {i: made[one.address] for i, one in enumerate(textures) if one.address in made},
+        choice.hidden,
+        dict(fetch.failed),
+    )
+
+
+def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:
+    if not is_address(scene_hash):  # that of a model, of which nothing but bodies and poses is shared
+        raise NotConnectedError("this session shares no specification of its scene, only bodies and poses")
+    fetch = _wait(client, client.fetch_assets([scene_hash]), until)
+    try:
+        return decode_scene(fetch.read(scene_hash))
+    except SceneError as error:
+        raise ClientError(f"the scene cannot be read: {error}") from error
+
+
+def _wait(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
+    if not client.wait_for(lambda _: fetch.done, max(0.0, until - time.monotonic())):
+        client.cancel_assets(fetch)
+        megabytes = (fetch.bytes_done * 1e-6, fetch.bytes_total * 1e-6)
+        raise NotConnectedError(f"the scene has not come in time: {megabytes[0]:.1f} of {megabytes[1]:.1f} MB are here")
+    return fetch
