@@ -37,6 +37,7 @@ class Owner(Publishing, ScenePatches):
     _stepper: Stepper | None = None
     _pacer: Pacer | None = None
     _scheduling = "normal"
+    _recorded: Path | None = None
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -124,8 +125,8 @@ class Owner(Publishing, ScenePatches):
 
     @property
     def recording(self) -> Path | None:
-        """Path of the recording, None when nothing is recorded."""
-        return None if self._processes is None else self._processes.recording
+        """Path of the recording, after `close()` too; None when nothing is recorded."""
+        return self._recorded if self._processes is None else self._processes.recording
 
     def _live(self) -> SessionProcesses:
         if self._processes is None:

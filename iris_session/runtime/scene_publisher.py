@@ -124,7 +124,7 @@ class ScenePublisher(Owner):
         finally:
             if self._processes is not None:
                 self.recording_fault = self._processes.close()
-                self._processes = None
+                self._recorded, self._processes = self._processes.recording, None
         return not self.recording_fault
 
     def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:

@@ -120,7 +120,7 @@ class Session(Owner, SceneChanges):
             self._user_loop.close()
         if self._processes is not None:
             self.recording_fault = self._processes.close()
-            self._processes = None
+            self._recorded, self._processes = self._processes.recording, None
         if self._past is not None:
             self._past.close()
         return not self.recording_fault

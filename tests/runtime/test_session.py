@@ -198,6 +198,7 @@ def test_a_recorder_that_was_just_replaced_gets_its_time(tmp_path: Path) -> None
         session.run(until=lambda: session.status().restarts["recorder"] == 1)
         session.run(seconds=0.05)
     assert not session.recording_fault
+    assert session.recording == tmp_path / "session.rrd", "known after the end too"
     report = verify_recording(tmp_path / "session.rrd")
     assert report.ok, report.line()
     assert (report.parts, report.finished) == (2, True)
