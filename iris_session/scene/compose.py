@@ -6,8 +6,7 @@ Nothing is encoded before `build`; files are read when they are added, so that t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike, fspath
-from pathlib import Path
+from os import PathLike
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -23,7 +22,7 @@ from iris_session.scene.collected import Flexible, Thing, World
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import load_file
-from iris_session.scene.given import Looks, given_mesh, given_vertices, look_of, numbers, triangles_of
+from iris_session.scene.given import Looks, given_mesh, given_vertices, look_of, numbers, path_of, triangles_of
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
 from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
@@ -130,7 +129,7 @@ class SceneBuilder:
         glTF and DAE that say nothing else. A look, if one is given, takes the place of all in the file. Nodes of what
         stands still are bodies of the scene; what is movable is one. `package_dirs`: folders it may refer into.
         """
-        where = Path(fspath(path))
+        where = path_of(path)
         loaded = load_file(where, package_dirs)
         name = name or where.stem[:_MAX_NAME]
         turn = up or loaded.up
@@ -160,7 +159,7 @@ class SceneBuilder:
         Without a name it is called as the file. `package_dirs`: folders of the packages it refers to; folders above the
         file are searched too. `collisions`: draw its collision shapes in place of visuals.
         """
-        where = Path(fspath(path))
+        where = path_of(path)
         name = name or where.stem[:_MAX_NAME]
         self._new_name(name)
         T_world_root = checked_pose(position, quaternion)
@@ -218,7 +217,7 @@ class SceneBuilder:
         on: str = "",
     ) -> str:
         """A light; `kind`: directional, spot or point. In the frame of the thing `on`, or in the world."""
-        if kind not in LightKind.ALL - {LightKind.IMAGE}:
+        if kind not in (LightKind.DIRECTIONAL, LightKind.SPOT, LightKind.POINT):
             raise SceneBuildError(f"a light of kind {kind!r}: directional, spot or point")
         along = np.array(numbers("direction", direction, 3))
         length = float(np.linalg.norm(along))
@@ -228,11 +227,11 @@ class SceneBuilder:
             name=cut(name),
             kind=kind,
             body=0,
-            p_body=_three(position),
-            direction_body=_three(along / length),
-            ambient=_three(ambient),
-            diffuse=_three(diffuse),
-            specular=_three(specular),
+            p_body=_three("position", position),
+            direction_body=_three("direction", along / length),
+            ambient=_three("ambient", ambient),
+            diffuse=_three("diffuse", diffuse),
+            specular=_three("specular", specular),
             cutoff=numbers("cutoff", [cutoff], 1)[0],
             castshadow=castshadow,
         )
@@ -306,7 +305,7 @@ class SceneBuilder:
         raise SceneBuildError(f"on={on!r}: no movable body is called so. Movable: {names}")
 
     def _new_name(self, name: str) -> None:
-        if not name or len(name) > _MAX_NAME or cut(name) != name:
+        if not isinstance(name, str) or not name or len(name) > _MAX_NAME or cut(name) != name:
             raise SceneBuildError(
                 f"{name!r}: what moves needs a name of 1 to {_MAX_NAME} characters, by which it is addressed"
             )
@@ -314,6 +313,6 @@ class SceneBuilder:
             raise SceneBuildError(f"there is a {name!r} already: what moves needs a name of its own")
 
 
-def _three(values: Any) -> Vec3:
-    x, y, z = numbers("three numbers", values, 3)
+def _three(what: str, values: Any) -> Vec3:
+    x, y, z = numbers(what, values, 3)
     return x, y, z

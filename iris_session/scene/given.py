@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
@@ -46,9 +47,12 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
     default = (1.0, 1.0, 1.0, 1.0) if "texture" in options else GREY
     given = options.get("rgba", default)
     short = hasattr(given, "__len__") and len(given) == 3
-    red, green, blue, alpha = (*numbers("rgba", given, 3 if short else 4), 1.0)[:4]
+    try:
+        red, green, blue, alpha = (*numbers("rgba", given, 3 if short else 4), 1.0)[:4]
+    except SceneBuildError:
+        red = green = blue = alpha = -1.0
     if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
-        raise SceneBuildError(f"rgba is {given!r}: each from 0 to 1")
+        raise SceneBuildError(f"rgba is {given!r}: red, green, blue, alpha from 0 to 1 are needed; (1, 0, 0, 1) is red")
     across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
     pictures: tuple[tuple[str, Picture], ...] = ()
     if "texture" in options:
@@ -68,15 +72,23 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
 
 def _texture(texture: Any) -> NDArray[np.uint8]:
     if isinstance(texture, str | PathLike):
-        path = Path(fspath(texture))
+        path = path_of(texture)
         return read_pixels(read_bounded(path), str(path))
     return checked_pixels(texture, "texture")
+
+
+def path_of(path: Any) -> Path:
+    """Where a file is."""
+    try:
+        return Path(os.fsdecode(path))
+    except TypeError:
+        raise SceneBuildError(f"path is {path!r}: the path of a file is needed, as text or a Path") from None
 
 
 def numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
     """As many finite numbers, greater than `above`."""
     try:
-        found = tuple(float(v) for v in values)
+        found = tuple(float(v) for v in ((None,) if isinstance(values, str | bytes) else values))
     except (TypeError, ValueError):
         raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
     if len(found) != count or not np.isfinite(found).all():

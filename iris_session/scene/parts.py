@@ -183,19 +183,26 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
 
 def checked_pose(position: Any, quaternion: Any) -> Pose:
     """A pose of what a caller gave; the quaternion is normalised. Raises `SceneBuildError` for what is none."""
-    try:
-        p: Vec3 = (float(position[0]), float(position[1]), float(position[2]))
-        q = np.array([float(v) for v in quaternion])
-    except (TypeError, ValueError, IndexError) as error:
-        raise SceneBuildError(f"no pose: {error}; give position (x, y, z) and quaternion (w, x, y, z)") from None
-    length = float(np.linalg.norm(q)) if q.shape == (4,) else 0.0
-    if len(position) != 3 or not np.isfinite([*p, length]).all() or length < 1e-9:
+    x, y, z = _finite("position", position, 3, "(x, y, z) [m]")
+    p: Vec3 = (x, y, z)
+    q = _finite("quaternion", quaternion, 4, "(w, x, y, z)")
+    length = math.hypot(*q)
+    if not 1e-9 <= length < math.inf:
         raise SceneBuildError(
-            f"no pose: position {tuple(position)}, quaternion {tuple(quaternion)}: three and four finite numbers"
+            f"quaternion is {quaternion!r}, of length {length:g}: (w, x, y, z) of length 1; (1, 0, 0, 0) turns nothing"
         )
-    w, x, y, z = (q / length).tolist()
-    unit: Quat = (w, x, y, z)
+    unit: Quat = (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
     return IDENTITY if (p, unit) == (IDENTITY.p, IDENTITY.q) else Pose(p, unit)
+
+
+def _finite(what: str, values: Any, count: int, names: str) -> list[float]:
+    try:
+        found = [float(v) for v in ((None,) if isinstance(values, str | bytes) else values)]
+    except (TypeError, ValueError):
+        found = []
+    if len(found) != count or not np.isfinite(found).all():
+        raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers {names} are needed")
+    return found
 
 
 def cut(name: object) -> str:
