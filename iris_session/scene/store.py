@@ -3,7 +3,8 @@
 Layout: `<root>/<first two hex>/<hash>`; `<root>/index/<two hex>/<key>` remembers what was built from which raw content
 (`build`), `<root>/holds/` what running processes use. Several processes may share a folder: files appear whole (rename)
 and never change. When the files exceed `limit_bytes`, those used longest ago go, but nothing that a process holds and
-nothing used within `GRACE_S`. Files and folders of others below the root are never touched.
+nothing used within `GRACE_S`. What a process that was killed left half done goes when the next one opens the store.
+Files and folders of others below the root are never touched.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ DEFAULT_LIMIT: Final = 4 << 30
 GRACE_S: Final = 600.0
 _ADDRESS: Final = re.compile(r"[0-9a-f]{64}")
 _PART: Final = re.compile(r"tmp\w+\.part")
+#: Of a hold: its note before it has its name, and a lock, which is of no use without the note.
+_HALF_HELD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
 _INDEX: Final = "index"
 _HOLDS: Final = "holds"
 
@@ -81,7 +84,7 @@ class AssetStore:
         self.limit_bytes = limit_bytes
         self.evicted = 0
         self.root.mkdir(parents=True, exist_ok=True)
-        self._total = sum(status.st_size for _, status in self._files())
+        self._total = self._tidied()
         self._look_at = limit_bytes
 
     # --- assets -------------------------------------------------------------------------------------------------------
@@ -198,6 +201,28 @@ class AssetStore:
                         if (ours or _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
                             with contextlib.suppress(FileNotFoundError):  # taken by another process meanwhile
                                 yield entry, entry.stat(follow_symlinks=False)
+
+    def _tidied(self) -> int:
+        """Takes away what processes that are gone left half done; what is young may be somebody's at work. Bytes of
+        all files."""
+        with contextlib.suppress(OSError):  # a folder that we may only read
+            self._held()
+        old = time.time() - GRACE_S
+        found, total = [], 0
+        for entry, status in self._files():
+            total += status.st_size
+            if _PART.fullmatch(entry.name):
+                found.append(entry)
+        holds = self.root / _HOLDS
+        for entry in _entries(holds):
+            half = _HALF_HELD.fullmatch(entry.name)
+            if half and not (holds / f"{half[1]}.hold").exists():
+                found.append(entry)
+        for entry in found:
+            with contextlib.suppress(OSError):
+                if entry.stat(follow_symlinks=False).st_mtime < old:
+                    os.unlink(entry.path)
+        return total  # with the parts: the next time that room is made it is counted anew
 
     def _make_room(self, n_bytes: int) -> None:
         if self._total + n_bytes <= self._look_at:

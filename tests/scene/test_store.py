@@ -274,3 +274,32 @@ def test_where_it_lies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.raises(OSError, match="set XDG_CACHE_HOME"):
         default_root()
+
+
+def test_what_killed_processes_left_is_gone_with_the_next_start(tmp_path: Path) -> None:
+    """A power cut between two files of a hold, or within one of an asset; what is young may be another's at work."""
+    store = AssetStore(tmp_path)
+    address = store.put(b"hello")
+    hold = store.hold([address])
+    holds, folder = tmp_path / "holds", store.path(address).parent
+    left = [
+        holds / "tmpa1_.new",
+        holds / "tmpb2.new.hold.lock",
+        folder / "tmpc3.part",
+        tmp_path / "index/ab/tmpd4.part",
+    ]
+    dead = [holds / "tmpe5.new.hold", holds / "tmpe5.new.hold.lock"]
+    young = [holds / "tmpf6.new", holds / "tmpf6.new.hold.lock", folder / "tmpg7.part"]
+    others = [holds / "notes.new", holds / "tmp.txt", folder / "mine.part"]
+    living = list(holds.iterdir())
+    for path in (*left, *dead, *young, *others):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"half")
+    then = store.path(address).stat().st_mtime - 2 * GRACE_S
+    for path in (*left, *dead, *others, *living, store.path(address)):
+        os.utime(path, (then, then))
+    AssetStore(tmp_path)
+    assert not [path for path in (*left, *dead) if path.exists()]
+    assert all(path.exists() for path in (*young, *others, *living))
+    assert store.get(address) == b"hello"
+    hold.release()
