@@ -29,11 +29,12 @@ DEFAULT_MAX_BYTES: Final = 4 << 30
 #: What was used so lately is not taken away. Where that alone is twice what the cache may hold, nothing more is stored.
 IN_USE_S: Final = 600.0
 FULL: Final = 2
-#: A part that nobody has written to for so long is of no use.
+#: A part that nobody has written to for so long is of no use. A private one is of none once its process has ended.
 STALE_PART_S: Final = 7 * 86_400.0
 #: The folder is looked through after so many bytes were stored.
 TRIM_EVERY: Final = 64 << 20
 PART: Final = ".part"
+ADDRESS_DIGITS: Final = 64
 
 
 def default_folder() -> Path:
@@ -128,7 +129,8 @@ class AssetCache:
                 found.append((status.st_mtime, status.st_size, path))
         total = sum(size for _, size, _ in found)
         for used, size, path in sorted(found):
-            stale = path.name.endswith(PART) and now - used > STALE_PART_S
+            private = path.name.endswith(PART) and len(path.name) > ADDRESS_DIGITS + len(PART)
+            stale = path.name.endswith(PART) and now - used > (IN_USE_S if private else STALE_PART_S)
             if not stale and (total <= self.max_bytes or now - used < IN_USE_S):
                 continue
             with contextlib.suppress(OSError):

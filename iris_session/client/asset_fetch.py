@@ -52,11 +52,15 @@ class AssetFetch:
 
     def read(self, address: str) -> bytes:
         """The bytes of an asset that is here. Raises its `AssetError` when it is not."""
+        return bytes(self.view(address))
+
+    def view(self, address: str) -> memoryview:
+        """As `read`, mapped instead of copied: whoever refuses it, for its size or its beginning, has not read it."""
         if address in self.failed:
             raise self.failed[address]
         if address in self.pending:
             raise AssetError(address, "gone", f"asset {address} has not come yet")
-        return self._cache.read(address)
+        return self._cache.view(address)
 
     def check(self) -> None:
         """Raises the first `AssetError`, if there is one."""

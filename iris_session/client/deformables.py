@@ -40,7 +40,7 @@ class _Mesh:
 
     feed: MediaFeed
 
-    def __init__(self, key: str, spec: Deformable, asset: bytes) -> None:
+    def __init__(self, key: str, spec: Deformable, asset: memoryview) -> None:
         arrays = decode_arrays(asset, ArrayKind.DEFORMABLE, MAX_ASSET_BYTES)
         topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
         self.key, self.stream = key, spec.stream
@@ -111,12 +111,12 @@ class Deformables:
         try:
             fetch.check()
             if not self._parts:
-                self._parts = decode_scene(fetch.read(self.scene_hash)).deformables
+                self._parts = decode_scene(fetch.view(self.scene_hash)).deformables
                 if self._parts:
                     self._fetch = self._client.fetch_assets([part.address for part in self._parts])
             else:
                 for key, part in zip(keys(self._parts), self._parts, strict=True):
-                    mesh = _Mesh(key, part, fetch.read(part.address))
+                    mesh = _Mesh(key, part, fetch.view(part.address))
                     mesh.feed = self._client.media(part.stream)
                     self._meshes.append(mesh)
         except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:

@@ -101,7 +101,7 @@ def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:
         raise NotConnectedError("this session shares no specification of its scene, only bodies and poses")
     fetch = _wait(client, client.fetch_assets([scene_hash]), until)
     try:
-        return decode_scene(fetch.read(scene_hash))
+        return decode_scene(fetch.view(scene_hash))
     except SceneError as error:
         raise ClientError(f"the scene cannot be read: {error}") from error
 

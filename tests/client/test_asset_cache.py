@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.client import AssetCache, AssetError
+from iris_session.client.asset_cache import IN_USE_S
 
 DATA = os.urandom(100_000)
 ADDRESS = hashlib.sha256(DATA).hexdigest()
@@ -129,6 +130,7 @@ def stored(cache: AssetCache, data: bytes) -> str:
 FULL_DISK = """
 import resource, sys
 from iris_session.client import AssetCache, AssetError
+from iris_session.client.asset_cache import IN_USE_S
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 part = AssetCache(sys.argv[1]).begin(sys.argv[2])
 try:
@@ -165,6 +167,19 @@ def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) ->
         part.append(DATA[40_000:])
         assert part.finish()
     assert cache.find(ADDRESS) == DATA
+
+
+def test_private_parts_of_processes_that_were_killed_do_not_pile_up(tmp_path: Path) -> None:
+    """Nobody can go on with them, so they need not wait a week as common ones do."""
+    cache = AssetCache(tmp_path)
+    folder = cache.path(ADDRESS).parent
+    folder.mkdir()
+    common, dead, young = (folder / f"{ADDRESS}{end}.part" for end in ("", ".123-0123abcd", ".124-4567abcd"))
+    for path, seconds in ((common, 2 * IN_USE_S), (dead, 2 * IN_USE_S), (young, 0.0)):
+        path.write_bytes(b"begun")
+        os.utime(path, (time.time() - seconds,) * 2)
+    assert cache.trim() == 10
+    assert [path.exists() for path in (common, dead, young)] == [True, False, True]
 
 
 def test_more_than_twice_its_bound_is_never_stored(tmp_path: Path) -> None:

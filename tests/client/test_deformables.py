@@ -130,4 +130,4 @@ def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
     bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(Stored(*item) for item in arrays.items()), padding])
     assert len(bomb) < 100_000
     with pytest.raises(AssetError, match=f"at most {MAX_ASSET_BYTES}"):
-        _Mesh("a", part, bomb)
+        _Mesh("a", part, memoryview(bomb))

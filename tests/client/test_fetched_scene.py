@@ -9,8 +9,9 @@ import mujoco
 import pytest
 
 from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError
+from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
-from iris_session.protocol.scene import encode_scene
+from iris_session.protocol.scene import MAX_SCENE_BYTES, encode_scene
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -68,15 +69,23 @@ def test_everything_or_what_a_budget_allows(store: AssetStore, join: Callable[..
     assert len(coarse.hidden) == 1
 
 
-def test_what_cannot_be_had_is_said(store: AssetStore, join: Callable[..., Client]) -> None:
+def test_what_cannot_be_had_is_said(
+    store: AssetStore, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def copied(*_: object) -> bytes:
+        raise AssertionError("a session could fill the memory with it before it is refused")
+
+    monkeypatch.setattr(AssetCache, "read", copied)
+    monkeypatch.setattr(AssetFetch, "read", copied)
     with pytest.raises(NotConnectedError, match="shares no specification"):
         fetch_scene(join("model"))
     parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
     with pytest.raises(AssetError):
         fetch_scene(join("0" * 64, *parsed.addresses))
-    address = store.put(b"no scene")
-    with pytest.raises(ClientError, match="the scene cannot be read"):
-        fetch_scene(join(address, address))
+    for data, says in ((b"no scene", "the scene cannot be read"), (bytes(MAX_SCENE_BYTES + 1), "at most")):
+        address = store.put(data)
+        with pytest.raises(ClientError, match=says):
+            fetch_scene(join(address, address))
     lonely = store.put(encode_scene(parsed.spec))
     part = fetch_scene(join(lonely, lonely))
     assert part.meshes == part.textures == {}
