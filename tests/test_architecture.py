@@ -29,6 +29,7 @@ FORBIDDEN = {
     "streams": SOCKETS | CLOCKS | THREADS | RANDOM | {"mujoco", "rerun"},
     "scene": SOCKETS | RANDOM | {"rerun"},
     "keys": (SOCKETS - {"zmq"}) | THREADS | RANDOM | HEAVY,
+    "system": SOCKETS | CLOCKS | RANDOM | HEAVY,
     "transport": {"mujoco", "rerun"},
     "recording": set(),
     "client": {"mujoco", "rerun"},

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 from iris_session.client.asset_cache import AssetCache, Part
-from iris_session.client.asset_context import give_way
 from iris_session.client.errors import AssetError
+from iris_session.system.priority import give_way
 
 THREADS: Final = 2
 #: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything

@@ -7,8 +7,6 @@ It makes pauses instead, whenever the front's loop is late.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
 import threading
 import time
@@ -23,6 +21,7 @@ from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
+from iris_session.system.priority import made_below
 from iris_session.transport.asset_files import AssetFiles
 from iris_session.transport.asset_hub import ADVICE, AssetHub, Reader
 from iris_session.transport.config import MILLISECOND, FrontConfig
@@ -36,8 +35,6 @@ ROUND: Final = 64
 CHUNKS: Final = 2
 #: While the front's loop is late, one chunk goes out in so long: the slowest headset still gets its scene.
 YIELD_MS: Final = 5
-#: Nice value of the I/O thread, as far above that of the front: a tenth of the weight of the others.
-NICER: Final = 10
 #: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
 FAULT_S: Final = 0.25
 #: As plain integers: operations on the enumerations take longer than what they are for.
@@ -67,7 +64,7 @@ class Tallied(NamedTuple):
 
 
 class AssetSockets:
-    """The channel's sockets, in a context whose I/O thread gives way to all others. Raises `FrontError`."""
+    """The channel's sockets, in a context of their own. Raises `FrontError`."""
 
     def __init__(self, config: FrontConfig, key: KeyPair | None) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)
@@ -87,26 +84,8 @@ class AssetSockets:
 
 
 def open_below(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
-    """`AssetSockets`, made in a thread of low priority: libzmq's threads are started with the first socket and inherit
-    it. No thread can take back what it gave up, so that one ends. Raises `FrontError`."""
-    made: list[AssetSockets] = []
-    failed: list[BaseException] = []
-
-    def make() -> None:
-        with contextlib.suppress(OSError, AttributeError):  # where threads have no priority, assets compete with all
-            nice = min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
-        try:
-            made.append(AssetSockets(config, key))
-        except BaseException as error:  # raised where somebody waits
-            failed.append(error)
-
-    thread = threading.Thread(target=make, name="iris-assets-open")
-    thread.start()
-    thread.join()
-    if failed:
-        raise failed[0]
-    return made[0]
+    """`AssetSockets` whose I/O thread gives way to all others. Raises `FrontError`."""
+    return made_below(lambda: AssetSockets(config, key))
 
 
 class AssetServer:

@@ -11,7 +11,8 @@ import pytest
 CODE = """
 import os, time
 from pathlib import Path
-from iris_session.client.asset_context import NICER, asset_context
+from iris_session.client.asset_context import asset_context
+from iris_session.system.priority import NICER
 
 def lower():
     stats = [(task / "stat").read_text().rpartition(")") for task in Path("/proc/self/task").iterdir()]

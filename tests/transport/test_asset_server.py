@@ -20,9 +20,10 @@ from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import encode_asset_request
 from iris_session.protocol.names import AssetRefusal
 from iris_session.protocol.status import GetStatus, StatusReport
+from iris_session.system.priority import NICER
 from iris_session.transport import FrontConfig, FrontLimits
 from iris_session.transport.asset_files import AssetFiles
-from iris_session.transport.asset_server import NICER, AssetServer, AssetSockets, Table, open_below
+from iris_session.transport.asset_server import AssetServer, AssetSockets, Table, open_below
 from iris_session.transport.media_doors import MediaDoors
 from iris_session.transport.sockets import bound_port
 from tests.e2e.conftest import unavailable
