@@ -49,16 +49,19 @@ JOBS ?= 2
 T ?= tests
 
 UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov --cov-report=
-
 # A file stays on one worker, because its tests share sessions; the longest begin first (tests/e2e/conftest.py).
-# These tests run real processes in real time: a machine that is taken away for a second can fail one. When the run was
-# whole and tests failed (status 1), they are named and judged once more, alone; what fails twice fails.
-define E2E
-$(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder $(T); status=$$?; \
-if [ $$status -eq 1 ]; then \
+E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+# Tests with real processes, sockets or threads (`live`, tests/conftest.py) run in real time: a machine that is taken away
+# for a second can fail one. When the run was whole and only such tests failed (status 1), they are named and judged once
+# more, alone; what fails twice fails. $(1): the run; $(2): its marker; $(3): options of the second.
+LAST = --last-failed --last-failed-no-failures none
+define JUDGED
+$(1) $(T); status=$$?; \
+if [ $$status -eq 1 ] && ! $(BIN)/python -m pytest -q -m "$(2) and not live" $(LAST) --collect-only $(T) > /dev/null; then \
   echo "FAILED AT FIRST, judged once more, alone:"; \
-  $(BIN)/python -m pytest -v -m e2e --last-failed --last-failed-no-failures none $(T); status=$$?; \
-fi
+  $(BIN)/python -m pytest -v -m "$(2)" $(LAST) $(3) $(T); status=$$?; \
+fi; exit $$status
 endef
 
 test: check
@@ -67,10 +70,10 @@ test: check
 	$(MAKE) --no-print-directory coverage
 
 test-unit: install-dev
-	$(UNIT) $(T)
+	@$(call JUDGED,$(UNIT),not e2e,--cov --cov-append --cov-report=)
 
 test-e2e: install-dev
-	@$(E2E); exit $$status
+	@$(call JUDGED,$(E2E),e2e,)
 
 test-random: install-dev
 	HYPOTHESIS=random $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) $(T)

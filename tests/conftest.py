@@ -10,6 +10,7 @@ import os
 import sys
 import uuid
 from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -26,6 +27,20 @@ settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
 MARK = "IRIS_TEST_RUN"
 #: What ends by itself may take this long, on a machine that others keep busy.
 ENDING_S = 30.0
+
+
+#: Rooms whose tests have processes, sockets or threads, and so a machine that may be taken away for a second.
+LIVE = {
+    "bench", "cli", "client", "doctor", "e2e", "emulator", "recording", "runtime", "system", "tools", "transport",
+}  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what may be judged a second time (Makefile)."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.relative_to(here).parts[0] in LIVE or item.get_closest_marker("e2e"):
+            item.add_marker("live")
 
 
 def _ours() -> list[psutil.Process]:
