@@ -13,9 +13,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # machines are those of the tests
+
+from tests.namespaces import Namespace, connect
 
 COMMAND: Final = (sys.executable, "-m", "iris_session.cli.main")
 DEADLINE_S: Final = 60.0
@@ -43,21 +47,8 @@ def wait(true: Callable[[], bool], what: str) -> None:
         time.sleep(0.1)
 
 
-@dataclass
-class Machine:
-    """One machine. `folder`: what it has on its disk, keys included."""
-
-    name: str
-    interface: str
-    address: str
-    folder: Path
-    running: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-    def words(self, *command: str) -> list[str]:
-        return ["ip", "netns", "exec", self.name, *command]
-
-    def environment(self, keys: str) -> dict[str, str]:
-        return {**os.environ, "IRIS_HOME": str(self.folder / keys)}
+class Machine(Namespace):
+    """One machine, and what can befall it."""
 
     def iris(self, *arguments: str, keys: str = "keys") -> subprocess.CompletedProcess[str]:
         """One command, to its end. `keys`: another home than the usual one is another user."""
@@ -159,7 +150,7 @@ class Lab:
 
     def __enter__(self) -> Lab:
         try:
-            self._open()
+            connect(partial(system, "ip"), self.server, self.client)
         except BaseException:
             self.close()
             raise
@@ -167,19 +158,6 @@ class Lab:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _open(self) -> None:
-        one, other = self.server, self.client
-        for machine in (one, other):
-            machine.folder.mkdir(parents=True)
-            system("ip", "netns", "add", machine.name)
-            system("ip", "-n", machine.name, "link", "set", "lo", "up")
-        ends = ("link", "add", one.interface, "netns", one.name, "type", "veth")
-        system("ip", *ends, "peer", "name", other.interface, "netns", other.name)
-        for machine in (one, other):
-            network = ("addr", "add", f"{machine.address}/24", "brd", "+", "dev", machine.interface)
-            system("ip", "-n", machine.name, *network)
-            system("ip", "-n", machine.name, "link", "set", machine.interface, "up")
 
     def small_disk(self, mib: int) -> Path:
         """A disk of the server with room for so much."""

@@ -8,13 +8,14 @@ import re
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import psutil
 
 from tests.e2e.conftest import COMMAND, DEADLINE_S, none_left, relatives, unavailable, wait
+from tests.namespaces import Namespace, connect
 
 #: Frames of state after which somebody has seen enough.
 SEEN: Final = 20
@@ -25,23 +26,11 @@ def ip(*words: str) -> None:
     assert done.returncode == 0, f"ip {' '.join(words)}: {done.stderr}"
 
 
-@dataclass
-class Machine:
-    """One of them: `address` on `interface`, and a home of keys of its own. Without a `name`: this machine itself."""
-
-    name: str
-    interface: str
-    address: str
-    folder: Path
-    running: list[subprocess.Popen[bytes]] = field(default_factory=list)
+class Machine(Namespace):
+    """One of them, with commands of ours."""
 
     def command(self, *arguments: str) -> list[str]:
-        inside = ["ip", "netns", "exec", self.name] if self.name else []
-        return [*inside, *COMMAND, *arguments]
-
-    @property
-    def environment(self) -> dict[str, str]:
-        return {**os.environ, "IRIS_HOME": str(self.folder / "keys")}
+        return self.words(*COMMAND, *arguments)
 
     def iris(self, *arguments: str, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
         """Runs one command to its end."""
@@ -51,7 +40,7 @@ class Machine:
             text=True,
             check=False,
             cwd=self.folder,
-            env=self.environment,
+            env=self.environment(),
             timeout=timeout_s,
         )
 
@@ -59,7 +48,7 @@ class Machine:
         """An observer joins and looks until they have seen something, or failed; what became of them."""
         command = self.command("emulate", *where, "--behaviour", "observer", "--seconds", f"{DEADLINE_S}", "--json")
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self.environment
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self.environment()
         )
         assert process.stdout is not None
         report: dict[str, Any] = {}
@@ -82,7 +71,7 @@ class Machine:
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=self.folder,
-                env=self.environment,
+                env=self.environment(),
             )
         self.running.append(process)
         served = Served(process, out)
@@ -144,22 +133,10 @@ class Network:
         self.headset = Machine(f"iris-h{mark}", f"irh{mark}", "10.77.1.2", folder / "headset")
         self.machines = (self.server, self.headset)
         try:
-            self._open()
+            connect(ip, *self.machines)
         except BaseException:
             self.close()
             raise
-
-    def _open(self) -> None:
-        for machine in self.machines:
-            machine.folder.mkdir()
-            ip("netns", "add", machine.name)
-            ip("-n", machine.name, "link", "set", "lo", "up")
-        one, other = self.machines
-        ends = ("link", "add", one.interface, "netns", one.name, "type", "veth")
-        ip(*ends, "peer", "name", other.interface, "netns", other.name)
-        for machine in self.machines:
-            ip("-n", machine.name, "addr", "add", f"{machine.address}/24", "brd", "+", "dev", machine.interface)
-            ip("-n", machine.name, "link", "set", machine.interface, "up")
 
     def block_broadcasts(self) -> None:
         """To the headset, as some access points do: a broadcast of the network is no address of its own any more."""
