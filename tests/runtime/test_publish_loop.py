@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -22,24 +21,11 @@ from iris_session.runtime.draft import Frame, SceneDraft
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.publish_loop import REPEAT_NS, PublishLoop, ShownVertices
 from iris_session.runtime.stepper import Stepper
+from tests.runtime.loops import Watch, wait_for
 from tests.runtime.published import CLOTH, UNIT, composed
 from tests.runtime.test_stepper import MS, Front, Recorder
 
 PERIOD_NS = 16 * MS
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    until = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.001)
-
-
-class Watch:
-    """In place of the processes, which these tests do not need."""
-
-    def watch(self, stepper: Stepper) -> None:
-        pass
 
 
 class Rig:

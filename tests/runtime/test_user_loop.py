@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -17,23 +16,10 @@ from iris_session.protocol.entries import Entry, ExternalReset, StalledGap
 from iris_session.protocol.server_messages import SceneChanged
 from iris_session.runtime.stepper import Stepper
 from iris_session.runtime.user_loop import UserLoop
+from tests.runtime.loops import Watch, wait_for
 from tests.runtime.play import TICK_NS, make_core
 from tests.runtime.test_session import QUIET
 from tests.runtime.test_stepper import MS, Front, Recorder
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    until = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.001)
-
-
-class Watch:
-    """In place of the processes, which these tests do not need."""
-
-    def watch(self, stepper: Stepper) -> None:
-        pass
 
 
 class Rig:
