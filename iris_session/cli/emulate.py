@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 
-from iris_session.cli.common import CommandError, add_way_to_session, positive_seconds
+from iris_session.cli.common import CommandError, add_way_to_session, expect_session, positive_seconds
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -73,7 +74,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.seconds is not None:
         options += ["--seconds", str(arguments.seconds)]
     options += [flag for flag, given in (("--json", arguments.json), ("--orders", arguments.orders)) if given]
-    return main(options, "iris-session")
+    status = main(options, "iris-session")
+    if status == 1:
+        try:
+            expect_session(arguments)  # it may have begun while they waited: asked only now, to say more
+        except CommandError as error:
+            print(f"iris-session: {error}", file=sys.stderr)
+    return status
 
 
 def _headset_options(arguments: argparse.Namespace) -> str:

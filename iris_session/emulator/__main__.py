@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -143,10 +144,15 @@ def _say_json(report: HeadsetReport, *, final: bool = False) -> None:
 def _say_line(report: HeadsetReport, *, final: bool = False) -> None:
     phase = next(reversed(report.phases), report.phase)
     text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
-    text += f" age p99 {report.age_ms_p99:.1f} ms, alignment {report.alignment_error_mm:.1f} mm"
+    text += f" age p99 {_known(report.age_ms_p99, 'ms')}, alignment {_known(report.alignment_error_mm, 'mm')}"
     if report.failed:
         text += f"  FAILED: {report.failed}"
     print(("end  " if final else "     ") + text, flush=True)
+
+
+def _known(value: float, unit: str) -> str:
+    """Before there is state or an alignment: not a number."""
+    return "-" if math.isnan(value) else f"{value:.1f} {unit}"
 
 
 if __name__ == "__main__":

@@ -144,6 +144,10 @@ def test_emulated_people_whom_no_session_lets_in_have_failed(capsys: pytest.Capt
         assert all(f"no session let us in at 127.0.0.1:{port} within 0.2 s" in line for line in errors)
         assert main(["emulate", f"127.0.0.1:{port}", "--behaviour", "observer", "--seconds", "0.1"]) == 1
         assert "no session let us in" in capsys.readouterr().err
+    assert main(["emulate", f"127.0.0.1:{port}", "--join-timeout", "0.2"]) == 1
+    said = capsys.readouterr()
+    assert "no session answers at 127.0.0.1" in said.err.splitlines()[-1]
+    assert "age p99 -, alignment -" in said.out
 
 
 SERVE = ("--no-record", "--control-port", "0", "--state-port", "0", "--json")
