@@ -12,7 +12,7 @@ from iris_session.client.connection import Connection
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
-from iris_session.protocol.status import ClientReport, GetStatus, StatusReport, quantiles
+from iris_session.protocol.status import ClientReport, GetStatus, Quantiles, StatusReport, quantiles
 
 PERIOD_NS: Final = 1_000_000_000
 #: Frames of one period that are remembered: more than are ever sent in a second.
@@ -26,6 +26,8 @@ class ArrivalMeter:
 
     def __init__(self) -> None:
         self._ages_ns: list[int] = []
+        self._ages: Quantiles | None = None
+        self._shown_ns = -1
         self._delivered = 0
         self._missed = 0
         self._seq = 0
@@ -33,19 +35,23 @@ class ArrivalMeter:
         self._since_ns = -1
 
     def delivered(self, state: SceneState) -> None:
-        """A frame was handed to the application."""
+        """A frame was handed to the application.
+
+        One that is sent again, because its source is silent, is as old as that silence, and says nothing of its way.
+        """
         seq = state.header.state_seq
         if 0 < self._seq < seq:
             self._missed += seq - self._seq - 1
         self._seq = seq
         self._delivered += 1
-        if len(self._ages_ns) < MAX_AGES:
+        if len(self._ages_ns) < MAX_AGES and state.header.session_time != self._shown_ns:
             self._ages_ns.append(state.age_ns)
+        self._shown_ns = state.header.session_time
 
     def take(self, connection: Connection, now_ns: int) -> ClientReport | None:
         """The report of the last second, when it is due and there is a session to tell it."""
         if not connection.joined:
-            self._since_ns, self._seq = -1, 0
+            self._since_ns, self._seq, self._ages = -1, 0, None
             return None
         received = connection.stream.counters.bytes_received
         if self._since_ns < 0:
@@ -54,10 +60,11 @@ class ArrivalMeter:
         elapsed_ns = now_ns - self._since_ns
         if elapsed_ns < PERIOD_NS:
             return None
-        ages = quantiles(self._ages_ns)
+        if self._ages_ns or not self._delivered:
+            self._ages = quantiles(self._ages_ns)
         report = ClientReport(
-            0.0 if ages is None else ages.p50,
-            0.0 if ages is None else ages.p99,
+            0.0 if self._ages is None else self._ages.p50,
+            0.0 if self._ages is None else self._ages.p99,
             self._delivered,
             self._missed,
             connection.clock.rtt_ns * 1e-6,

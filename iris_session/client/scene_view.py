@@ -67,7 +67,8 @@ class SceneView:
         return self.connection.clock.session_ns(time.monotonic_ns())
 
     def data_age_ns(self) -> int | None:
-        """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason. `None`: no scene yet.
+        """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason, and while a program that
+        publishes its world is silent. `None`: no scene yet.
 
         A paused session goes on sending: `state.header.sim_time` tells that physics stands.
         """

@@ -53,8 +53,9 @@ class DeformableStreams:
         self._streams = [_Stream(mesh) for mesh in meshes]
         self._epoch = -1
 
-    def send(self, scene_epoch: int, end_ns: int) -> None:
-        """The vertices as they are after the newest tick, which ended at `end_ns`; call it at the rate of the state."""
+    def send(self, scene_epoch: int, end_ns: int, shown_ns: int) -> None:
+        """The vertices as they are after the newest tick, which ended at `shown_ns`; call it at the rate of the state.
+        `end_ns`: when it did, or now, where the state is sent again."""
         if scene_epoch != self._epoch:
             self._epoch = scene_epoch
             for stream in self._streams:
@@ -66,7 +67,7 @@ class DeformableStreams:
             if frames is None:
                 continue
             stream.sent_ns = end_ns
-            if not self._publish(stream.mesh.stream, frames, end_ns, scene_epoch, MediaEncoding.DEFORMABLE):
+            if not self._publish(stream.mesh.stream, frames, shown_ns, scene_epoch, MediaEncoding.DEFORMABLE):
                 stream.encoder.reset()  # nobody got it: the next one is sent whatever it is
 
 

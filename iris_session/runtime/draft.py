@@ -1,12 +1,14 @@
 """What a publisher has set so far: poses, joints and vertices, checked when they are set, taken together as one frame.
 
-Whatever is wrong is said to whoever sets it, as `PublishError`, and changes nothing. From any thread.
+Whatever is wrong is said to whoever sets it, as `PublishError`, and changes nothing. Joints beyond their limits are not
+wrong, as real robots report some: they are shown so, and `warnings` tells of what is far beyond. From any thread.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import reprlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,12 +21,18 @@ from anchors.pose import compose
 from iris_session.protocol.common import Pose
 from iris_session.runtime.errors import PublishError
 from iris_session.scene import SceneBuildError
+from iris_session.scene.articulation import Joint
 from iris_session.scene.composed import ComposedScene
 
 #: Farthest coordinate [m]. What is beyond is a mistake of units, and exact to less than the stream's bound.
 FARTHEST_M: Final = 1e6
 #: How far a quaternion may be from unit length to be taken for a rounded one, which is normalised.
 UNIT: Final = 1e-3
+#: How far beyond its limits a joint is worth a word, as a share of what lies between them: encoders and limits of a
+#: description differ by less, degrees in place of radians by more.
+BEYOND: Final = 0.05
+#: Joints of which `warnings` tells; a robot in degrees has many.
+MAX_SAID: Final = 4
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,7 @@ class SceneDraft:
         self._poses = np.array([(*pose.p, *pose.q) for pose in scene.poses]).reshape(-1, 7)
         self._roots = {name: one.T_world_root for name, one in scene.articulations.items()}
         self._joints: dict[str, dict[str, float]] = {name: {} for name in scene.articulations}
+        self._beyond: dict[tuple[str, str], str] = {}  # joints that are, and what is said of them
         self._vertices = {name: one.vertices for name, one in scene.deformables.items()}
 
     def frame(self, capture_ns: int, time_s: float, anew: bool) -> Frame:
@@ -56,7 +65,15 @@ class SceneDraft:
         with self._lock:
             return Frame(capture_ns, time_s, self._poses.copy(), dict(self._vertices), anew)
 
+    def warnings(self) -> tuple[str, ...]:
+        """What is shown as it was set, though it looks like a mistake."""
+        with self._lock:
+            found = tuple(self._beyond.values())
+        more = len(found) - MAX_SAID
+        return found if more <= 0 else (*found[:MAX_SAID], f"{more} more joints are set far beyond their limits")
+
     def set_pose(self, name: str, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        _check_name(name)
         pose = Pose(_position(position, name), _unit(quaternion, name))
         with self._lock:
             if name in self._roots:
@@ -66,40 +83,54 @@ class SceneDraft:
                 self._poses[self._row(name)] = (*pose.p, *pose.q)
 
     def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
+        names = _names(names)
         p = _finite(positions, (len(names), 3), "positions")
         q = _finite(quaternions, (len(names), 4), "quaternions")
-        lengths = np.sqrt(np.einsum("ij,ij->i", q, q))
+        with np.errstate(over="ignore"):  # infinite is no length of 1 either
+            lengths = np.sqrt(np.einsum("ij,ij->i", q, q))
         if len(names) and (np.abs(p).max() > FARTHEST_M or np.abs(lengths - 1.0).max() > UNIT):
             for row, name in enumerate(names):  # one of them is wrong, and this says which
                 _position(p[row].tolist(), name)
                 _unit(q[row].tolist(), name)
         rows = [self._rows[name] if name in self._rows else self._row(name) for name in names]
+        if len(set(rows)) != len(rows):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise PublishError(f"set_poses: {twice!r} is named more than once: give one pose of each")
         with self._lock:
             self._poses[rows, :3] = p
             self._poses[rows, 3:] = q / lengths[:, None]
 
     def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
+        _check_name(name)
         articulation = self._scene.articulations.get(name)
         if articulation is None:
             raise PublishError(f"{name!r} has no joints in this scene; {_nearest(name, self._roots, 'articulations')}")
+        if not isinstance(positions, Mapping):
+            example = {joint.name: joint.rest for joint in articulation.joints}
+            raise PublishError(f"set_joints({name!r}): positions by name of the joint are expected, as {example}")
         try:
+            articulation.check(positions)
             given = {joint: float(position) for joint, position in positions.items()}
-            articulation.check(given)
-        except (SceneBuildError, TypeError, ValueError, AttributeError) as error:
+        except (SceneBuildError, TypeError, OverflowError) as error:
             raise PublishError(f"set_joints({name!r}): {error}") from error
         with self._lock:
             joints = self._joints[name] | given
             self._place(name, self._roots[name], joints)
             self._joints[name] = joints
+            for joint in articulation.joints:
+                if joint.name in given:
+                    self._judge(name, joint, given[joint.name])
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
+        _check_name(name)
         before = self._vertices.get(name)
         if before is None:
             near = _nearest(name, self._vertices, "deformables")
             raise PublishError(f"{name!r} is no deformable of this scene; {near}")
-        taken = _finite(vertices, before.shape, f"vertices of {name!r}").astype(np.float32)
-        if np.abs(taken).max(initial=0.0) > FARTHEST_M:
+        given = _finite(vertices, before.shape, f"vertices of {name!r}")
+        if np.abs(given).max(initial=0.0) > FARTHEST_M:
             raise PublishError(f"vertices of {name!r} are more than 1,000 km away: metres are expected")
+        taken = given.astype(np.float32)
         taken.flags.writeable = False
         with self._lock:
             self._vertices[name] = taken
@@ -125,9 +156,35 @@ class SceneDraft:
         except ValueError:  # farther, or turned more often, than floats can tell
             placed = {}
         if not placed or not all(abs(v) <= FARTHEST_M for p, _ in placed.values() for v in p):  # NaN is not
-            raise PublishError(f"joints of {name!r} put it more than 1,000 km away: radians and metres are expected")
+            raise PublishError(f"{name!r} would lie more than 1,000 km away: metres and radians are expected")
         for body, (p, q) in placed.items():
             self._poses[self._rows[body]] = (*p, *q)
+
+    def _judge(self, name: str, joint: Joint, position: float) -> None:
+        """Whether a joint is so far beyond its limits that somebody should know."""
+        slack = BEYOND * (joint.high - joint.low)  # infinite without limits
+        if joint.low - slack <= position <= joint.high + slack:
+            self._beyond.pop((name, joint.name), None)
+        else:
+            unit = "m" if joint.kind == "prismatic" else "rad"
+            limits = f"{joint.low:.4g} to {joint.high:.4g} {unit}"
+            self._beyond[name, joint.name] = (
+                f"joint {joint.name!r} of {name!r} is set to {position:.4g} {unit}, far beyond its limits, {limits}"
+            )
+
+
+def _names(given: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(given, str | bytes) or not isinstance(given, Iterable):
+        raise PublishError(f"names is {_brief(given)}: a list of the names of what moves is expected")
+    names = tuple(given)
+    for name in names:
+        _check_name(name)
+    return names
+
+
+def _check_name(name: object) -> None:
+    if not isinstance(name, str):
+        raise PublishError(f"{_brief(name)} is no name: that of something that moves, as text, is expected")
 
 
 def _position(given: Sequence[float], name: str) -> tuple[float, float, float]:
@@ -141,30 +198,36 @@ def _unit(given: Sequence[float], name: str) -> tuple[float, float, float, float
     w, x, y, z = _numbers(given, 4, f"quaternion of {name!r}")
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(length - 1.0) <= UNIT:
-        raise PublishError(f"quaternion of {name!r} has length {length:g}: a unit one (w, x, y, z) is expected")
+        right = "(w, x, y, z) of length 1 is expected; (1, 0, 0, 0) turns nothing"
+        raise PublishError(f"quaternion of {name!r} has length {length:g}: {right}")
     return w / length, x / length, y / length, z / length
 
 
 def _numbers(given: Sequence[float], n: int, what: str) -> list[float]:
     try:
         numbers = [float(number) for number in given]
-    except (TypeError, ValueError) as error:
-        raise PublishError(f"{what} is {given!r}: {n} numbers are expected") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PublishError(f"{what} is {_brief(given)}: {n} numbers are expected") from error
     if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise PublishError(f"{what} is {given!r}: {n} finite numbers are expected")
+        raise PublishError(f"{what} is {_brief(given)}: {n} finite numbers are expected")
     return numbers
 
 
 def _finite(given: ArrayLike, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
     try:
         array = np.asarray(given, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise PublishError(f"{what}: an array of shape {shape} is expected ({error})") from error
     if array.shape != shape:
         raise PublishError(f"{what} have shape {array.shape}: {shape} is expected")
     if not np.isfinite(array).all():
         raise PublishError(f"{what} hold numbers that are not finite")
     return array
+
+
+def _brief(given: object) -> str:
+    """On one line, however large it is."""
+    return " ".join(reprlib.repr(given).split())
 
 
 def _nearest(name: object, known: Iterable[str], what: str) -> str:

@@ -3,7 +3,8 @@
 Of frames that come faster the newest wins, and the others are counted. A frame that comes before its time is taken by
 the helper thread when it is due; any other by the thread that published it. While the publisher is silent the helper
 takes steps without a tick, so leases, heartbeats and requests go on, and repeats the state now and then for those who
-have joined meanwhile.
+have joined meanwhile, with the time that it had, so that it looks as old as it is. Recorded, its time goes on, as
+people's heads and hands do.
 
 A row of the journal has a plant's state only where a frame came: in between it stays what it was.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from types import TracebackType
 from typing import Final
 
 import numpy as np
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from iris_session.physics.carrier import Carrier
 from iris_session.protocol.entries import ExternalReset
+from iris_session.runtime.cadence import Cadence
 from iris_session.runtime.deformables import Bending
 from iris_session.runtime.draft import Frame
 from iris_session.runtime.errors import OwnershipError
@@ -73,13 +76,17 @@ class PublishLoop:
         self._waiting: Frame | None = None
         self._due_ns = 0
         self._step_ns = stepper.clock()
-        #: Session time of the newest state, when it was sent, and how old the newest frame was when it was taken.
+        #: Session time of the newest state as it is shown and as it is recorded, and when it was sent.
+        self._shown_ns = 0
         self._state_ns = 0
         self._sent_ns = 0
-        self._delay_ns = 0
+        #: How old the newest frame was when it was taken, -1 before the first.
+        self._delay_ns = -1
+        self._cadence = Cadence()
         self._closed = threading.Event()
         self._wake = threading.Event()
         self._error: BaseException | None = None
+        self._where: TracebackType | None = None
         with self.lock:
             self._idle()  # who joins before the first frame sees the scene as it was composed
         self._helper = threading.Thread(target=self._work, name="iris-session-publish", daemon=True)
@@ -89,6 +96,7 @@ class PublishLoop:
         """Hands in the newest frame. Raises `OwnershipError` after `close`, and what stopped the helper."""
         with self._hand:
             self.check()  # here, so that no frame is handed in after `close` has taken the last one
+            self._cadence.came(self._stepper.clock())
             waited = self._waiting
             if waited is not None:
                 self.superseded += 1
@@ -103,9 +111,17 @@ class PublishLoop:
         elif waited is None:
             self._wake.set()
 
+    def warnings(self) -> tuple[str, ...]:
+        """That the publisher has fallen silent, if it has."""
+        silent_ns = self._cadence.silent_ns(self._stepper.clock())
+        if not silent_ns:
+            return ()
+        return (f"nothing was published for {silent_ns * 1e-9:.1f} s: the program that publishes stands still",)
+
     def check(self) -> None:
+        """Raises what stopped the helper, `OwnershipError` after `close`."""
         if self._error is not None:
-            raise self._error
+            raise self._error.with_traceback(self._where)  # which would grow with every time that it is raised
         if self._closed.is_set():
             raise OwnershipError("the session is closed: nothing can be published any more")
 
@@ -141,21 +157,26 @@ class PublishLoop:
         self._step(0)
         now_ns = self._stepper.clock()
         if not self._sent_ns or (self._waiting is None and now_ns - self._sent_ns >= self._repeat_ns):
-            self._send(now_ns - self._delay_ns)  # times of the state go on as the publisher's do
+            # Before the first frame nobody has said that the scene is otherwise than it was composed: it is so now.
+            self._send(now_ns - max(0, self._delay_ns), again=self._delay_ns >= 0)
 
     def _step(self, n_ticks: int, plant: bytes = b"") -> None:
         try:
             self._stepper.step(n_ticks, plant, publish=False)
         except Exception as error:  # whoever took it, the helper ends
-            self._error = error
+            self._fail(error)
             raise
         self._processes.watch(self._stepper)
         self._step_ns = self._stepper.clock()
 
-    def _send(self, capture_ns: int) -> None:
+    def _send(self, capture_ns: int, *, again: bool = False) -> None:
         self._state_ns = max(capture_ns, self._state_ns + 1)
+        self._shown_ns = self._shown_ns if again else self._state_ns
         self._sent_ns = self._stepper.clock()
-        self._stepper.publish_now(self._state_ns)
+        self._stepper.publish_now(self._state_ns, self._shown_ns)
+
+    def _fail(self, error: BaseException) -> None:
+        self._error, self._where = error, error.__traceback__
 
     # --- the helper ---------------------------------------------------------------------------------------------------
 
@@ -167,7 +188,7 @@ class PublishLoop:
                 with self.lock:
                     self._turn()
         except BaseException as error:  # shown at the next `publish`, where it can be seen
-            self._error = error
+            self._fail(error)
 
     def _pause_s(self) -> float:
         """Until the frame that waits is due, but never long."""

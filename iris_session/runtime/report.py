@@ -10,7 +10,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from iris_session.physics import Pacer
@@ -35,6 +35,8 @@ class Reporter:
         self.pacer: Pacer | None = None
         self.times: TickTimes | None = None
         self.scheduling = ""
+        #: What else somebody should know now, though nothing has failed: asked for every report.
+        self.notices: list[Callable[[], Sequence[str]]] = []
         self._next_ns = 0
         self._cpu_ns = time.process_time_ns()
         self._cpu_at_ns = time.monotonic_ns()
@@ -82,10 +84,13 @@ class Reporter:
             recorder=recorder,
             drops=processes.own_drops(),
             restarts=processes.restarts(),
-            warnings=tuple(warnings(stepper, recorder, self.scheduling)),
+            warnings=tuple(warnings(stepper, recorder, self.scheduling, self._noticed())),
             anchors=anchors(core.authority.anchors, processes.sheet_sizes),
             cross_checks=core.authority.cross_check_reports(),
         )
+
+    def _noticed(self) -> list[str]:
+        return [text for ask in self.notices for text in ask()]
 
     def _cpu_share(self) -> float:
         """Processor time of this process since the last report, 1 for a whole processor."""
@@ -151,9 +156,9 @@ def recorder_report(processes: SessionProcesses) -> RecorderReport:
     )
 
 
-def warnings(stepper: Stepper, recorder: RecorderReport, scheduling: str) -> list[str]:
+def warnings(stepper: Stepper, recorder: RecorderReport, scheduling: str, notices: Sequence[str] = ()) -> list[str]:
     """What somebody should know though nothing has failed yet."""
-    found = []
+    found = list(notices)
     if stepper.last is not None and stepper.last.diverged:
         found.append(f"physics stands still until a reset: {stepper.last.diverged}"[:MAX_TEXT])
     if scheduling == "normal":

@@ -159,8 +159,8 @@ class Stepper:
         self.ledger = SessionLedger()
         #: Worst lateness of a tick since the last published state, for the recording's plots. Set by the pacing loop.
         self.lateness_ns = 0
-        #: Called after a state was published with its scene epoch and the end of its tick: for streams beside it.
-        self.beside_state: list[Callable[[int, int], None]] = []
+        #: Called after a state was published with its scene epoch and the times of `publish_now`: streams beside it.
+        self.beside_state: list[Callable[[int, int, int], None]] = []
         #: Called with what was published, and with the entries of every step: for measurements and tests.
         self.on_state: Callable[[StateHeader, NDArray[np.float64]], None] | None = None
         self.on_entries: Callable[[Sequence[Entry]], None] | None = None
@@ -278,19 +278,23 @@ class Stepper:
         self._next_state_ns = max(self._next_state_ns + self._state_period_ns, end_ns)
         self.publish_now(end_ns)
 
-    def publish_now(self, end_ns: int) -> None:
-        """Sends the rigid state, for somebody who keeps the rate himself. A step must have been taken."""
+    def publish_now(self, end_ns: int, shown_ns: int = -1) -> None:
+        """Sends the rigid state, for somebody who keeps the rate himself. A step must have been taken.
+
+        `end_ns`: as of `publish`. `shown_ns`: of a state that is sent again, the `end_ns` with which it was sent first.
+        """
         assert self.last is not None
         decision, world = self.last.decision, self.core.world
         world.poses(self._poses)
         applied = tuple(s.applied for s in self.last.status if s.applied is not None)
         tick, sim_time = world.view().tick, world.view().sim_time
+        shown_ns = end_ns if shown_ns < 0 else shown_ns
         header = StateHeader(
-            decision.scene_epoch, decision.scene_revision, tick, sim_time, end_ns, 0, 0, 0, applied
+            decision.scene_epoch, decision.scene_revision, tick, sim_time, shown_ns, 0, 0, 0, applied
         )  # fmt: skip
         self.front.send_state(header, self._poses)
         for send in self.beside_state:
-            send(decision.scene_epoch, end_ns)
+            send(decision.scene_epoch, end_ns, shown_ns)
         if self.on_state is not None:
             self.on_state(header, self._poses)
         if self.recorder is not None:

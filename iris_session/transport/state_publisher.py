@@ -36,8 +36,10 @@ class StatePublisher:
         self._now_ns = now_ns
         self._next_seq = first_seq
         self.frames = 0
-        #: End of the tick until it was handed to the socket, of the newest frames (about five seconds).
+        #: End of the tick until it was handed to the socket, of the newest frames (about five seconds), without those
+        #: that are sent again while their source is silent.
         self.delays_ns: deque[int] = deque(maxlen=300)
+        self._shown_ns = -1
         self.set_scene(scene)
 
     def use_socket(self, state: zmq.Socket[bytes] | None) -> None:
@@ -71,7 +73,9 @@ class StatePublisher:
         self._published = True
         self._next_seq = frame.state_seq + 1
         published_ns = self._now_ns()
-        self.delays_ns.append(published_ns - head.session_time)
+        if head.session_time != self._shown_ns:
+            self.delays_ns.append(published_ns - head.session_time)
+        self._shown_ns = head.session_time
         stamped = StateHeader(
             head.scene_epoch,
             head.scene_revision,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ def connection() -> Connection:
 
 
 def frame(seq: int, age_ns: int) -> SceneState:
-    return SceneState(StateHeader(1, 0, 0, 0.0, 0, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
+    return SceneState(StateHeader(1, 0, 0, 0.0, seq * MS, 0, seq, 0), np.zeros((0, 7)), age_ns, age_ns)
 
 
 def test_one_report_a_second(connection: Connection) -> None:
@@ -44,6 +45,27 @@ def test_one_report_a_second(connection: Connection) -> None:
     assert report == ClientReport(2.0, 4.0, 4, 2, 0.0, 2000.0)
     assert meter.take(connection, 2 * PERIOD_NS) is None
     assert meter.take(connection, 3 * PERIOD_NS) == ClientReport(0.0, 0.0, 0, 0, 0.0, 0.0)
+
+
+def test_states_that_are_sent_again_say_nothing_of_their_way(connection: Connection) -> None:
+    """Their source is silent, and they are as old as that: no reason to give this client less, or to blame its link."""
+    meter = ArrivalMeter()
+    meter.take(connection, 0)
+    again = frame(2, 0).header
+    meter.delivered(frame(1, 2 * MS))
+    meter.delivered(frame(2, 2 * MS))
+    for second in range(1, 5):
+        meter.delivered(
+            SceneState(msgspec.structs.replace(again, state_seq=2 + second), np.zeros((0, 7)), 0, second * 10**9)
+        )
+        report = meter.take(connection, second * PERIOD_NS)
+        assert report is not None
+        assert (report.age_ms_p50, report.age_ms_p99, report.missed) == (2.0, 2.0, 0)
+        assert report.delivered
+    meter.delivered(frame(9, 7 * MS))
+    report = meter.take(connection, 6 * PERIOD_NS)
+    assert report is not None
+    assert report.age_ms_p50 == 7.0
 
 
 def test_another_session_numbers_its_frames_anew(connection: Connection) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from iris_session.runtime.draft import SceneDraft
+from iris_session.protocol.common import IDENTITY
+from iris_session.runtime.draft import MAX_SAID, SceneDraft
 from iris_session.runtime.errors import PublishError
+from iris_session.scene.articulation import Articulation, Joint, Part
 from tests.runtime.published import CLOTH, MOVING, UNIT, composed
 
 TURNED = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn around z
@@ -52,6 +55,32 @@ def test_joints_and_the_root_place_the_bodies_of_an_articulation(draft: SceneDra
     assert pose(draft, "arm/fore")[:3] == pytest.approx([8.75, 0.0, 0.0])
 
 
+def test_joints_beyond_their_limits_are_shown_and_said_when_they_are_far_beyond(draft: SceneDraft) -> None:
+    """Encoders of real robots report a little more than their description allows; degrees are much more."""
+    draft.set_joints("arm", {"turn": math.pi + 0.05, "slide": -0.01})
+    assert draft.warnings() == ()
+    assert pose(draft, "arm/upper")[3:] == pytest.approx([math.cos((math.pi + 0.05) / 2), 0, 0, 0.9997], abs=1e-4)
+    draft.set_joints("arm", {"turn": 90.0, "slide": 0.6})
+    assert draft.warnings() == (
+        "joint 'turn' of 'arm' is set to 90 rad, far beyond its limits, -3.142 to 3.142 rad",
+        "joint 'slide' of 'arm' is set to 0.6 m, far beyond its limits, 0 to 0.5 m",
+    )
+    draft.set_joints("arm", {"slide": 0.5})
+    assert len(draft.warnings()) == 1, "of those that are there now"
+
+
+def test_of_many_joints_beyond_their_limits_a_few_are_named() -> None:
+    joints = tuple(Joint(f"j{i}", "revolute", -1.0, 1.0, 0.0) for i in range(MAX_SAID + 3))
+    parts = (Part("arm/base"), *(Part(f"arm/{i}", i, joint=i) for i in range(len(joints))))
+    names = tuple(part.body for part in parts)
+    robot = Articulation("arm", IDENTITY, parts, joints, {})
+    scene = replace(composed(), moving=names, poses=(IDENTITY,) * len(names), articulations={"arm": robot})
+    draft = SceneDraft(scene)
+    draft.set_joints("arm", {joint.name: 57.3 for joint in joints})
+    assert len(draft.warnings()) == MAX_SAID + 1
+    assert draft.warnings()[-1] == "3 more joints are set far beyond their limits"
+
+
 def test_one_body_of_an_articulation_can_be_placed_by_itself(draft: SceneDraft) -> None:
     """Robots often tell where their links are, not their joints."""
     draft.set_pose("arm/upper", (0.0, 0.0, 5.0), UNIT)
@@ -86,12 +115,22 @@ NAN = float("nan")
         (lambda d: d.set_pose("red", (0, 0), UNIT), "3 finite numbers"),
         (lambda d: d.set_pose("red", None, UNIT), "3 numbers"),
         (lambda d: d.set_pose("red", (0, 0, 2e6), UNIT), "in metres"),
-        (lambda d: d.set_pose("red", (0, 0, 0), (0, 0, 0, 0)), "length 0"),
-        (lambda d: d.set_pose("red", (0, 0, 0), (1.002, 0, 0, 0)), "unit one"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (0, 0, 0, 0)), r"length 0: .*\(1, 0, 0, 0\) turns nothing"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (1.002, 0, 0, 0)), "of length 1 is expected"),
+        (lambda d: d.set_pose("red", (0, 0, 10**400), UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", np.zeros((90, 3)), UNIT), "^[^\n]{1,120}$"),
+        (lambda d: d.set_pose(["red"], (0, 0, 0), UNIT), r"\['red'\] is no name"),
         (lambda d: d.set_pose("red", (0, 0, 0), (1, 0, 0)), "4 finite numbers"),
         (lambda d: d.set_poses(["red", "blu"], [(1, 1, 1)] * 2, [UNIT] * 2), "nearest: 'blue'"),
         (lambda d: d.set_poses(["red", "arm"], [(1, 1, 1)] * 2, [UNIT] * 2), "set_pose"),
         (lambda d: d.set_poses(["red", "blue"], [(1, 1, 1)] * 2, [UNIT, (1.1, 0, 0, 0)]), "of 'blue' has length 1.1"),
+        (lambda d: d.set_poses(["red", "blue", "red"], [(1, 1, 1)] * 3, [UNIT] * 3), "'red' is named more than once"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(0, 0, 0, 0)]), "of 'red' has length 0"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(1e200, 0, 0, 0)]), "has length inf"),
+        (lambda d: d.set_poses("red", [(1, 1, 1)] * 3, [UNIT] * 3), "names is 'red': a list of the names"),
+        (lambda d: d.set_poses(None, [(1, 1, 1)], [UNIT]), "a list of the names"),
+        (lambda d: d.set_poses([0], [(1, 1, 1)], [UNIT]), "0 is no name"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 10**400)], [UNIT]), "an array of shape"),
         (lambda d: d.set_poses(["red"], [(1, NAN, 1)], [UNIT]), "not finite"),
         (lambda d: d.set_poses(["red"], [(1, 1)], [UNIT]), r"\(1, 2\): \(1, 3\) is expected"),
         (lambda d: d.set_poses(["red"], "red", [UNIT]), "an array of shape"),
@@ -99,7 +138,10 @@ NAN = float("nan")
         (lambda d: d.set_joints("arm", {"turn": 1.0, "twist": 1.0}), "Joints: turn, slide"),
         (lambda d: d.set_joints("arm", {"follower": 1.0}), "follows 'turn'"),
         (lambda d: d.set_joints("arm", {"turn": NAN}), "finite"),
-        (lambda d: d.set_joints("arm", [1.0]), "set_joints"),
+        (lambda d: d.set_joints("arm", [1.0]), "by name of the joint are expected, as {'turn': 0.0, 'slide': 0.0}"),
+        (lambda d: d.set_joints("arm", {"turn": "1.0"}), "a finite number is needed"),
+        (lambda d: d.set_joints("arm", {"turn": 10**400}), "set_joints"),
+        (lambda d: d.set_joints(["arm"], {}), "is no name"),
         (lambda d: d.set_joints("arm", {"turn": 1e300}), "radians"),
         (lambda d: d.set_joints("arm", {"slide": 1e7}), "1,000 km"),
         (lambda d: d.set_joints("arm", {"turn": 1.0, "slide": 1e308}), "1,000 km"),
@@ -107,6 +149,8 @@ NAN = float("nan")
         (lambda d: d.set_vertices("cloth", CLOTH[:3]), r"\(3, 3\): \(4, 3\) is expected"),
         (lambda d: d.set_vertices("cloth", CLOTH * NAN), "not finite"),
         (lambda d: d.set_vertices("cloth", CLOTH * 1e9), "metres"),
+        (lambda d: d.set_vertices("cloth", CLOTH.astype(np.float64) * 1e300), "metres"),
+        (lambda d: d.set_vertices(["cloth"], CLOTH), "is no name"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_and_changes_nothing(

@@ -51,7 +51,8 @@ class Rig:
     def _note(self, entries: Sequence[Entry]) -> None:
         self.entries += entries
 
-    def _show(self, epoch: int, end_ns: int) -> None:
+    def _show(self, epoch: int, end_ns: int, shown_ns: int) -> None:
+        assert self.front.states[-1].session_time == shown_ns, "what bends has the time of the state"
         (mesh,) = self.vertices.bending
         red = self.stepper.core.world.data.xpos[1]
         self.shown.append((float(red[0]), float(mesh.vertices()[0, 0]), epoch))
@@ -75,6 +76,10 @@ def rig() -> Iterator[Rig]:
 def test_who_joins_before_the_first_frame_sees_the_scene_as_composed(rig: Rig) -> None:
     assert rig.shown == [(0.0, 0.0, 1)]
     assert rig.front.n_bodies == 5
+    rig.now_ns += 3600 * 1000 * MS
+    wait_for(lambda: len(rig.shown) == 2)
+    assert rig.front.states[-1].session_time == rig.now_ns, "nobody has said that it is otherwise: it is so now"
+    assert rig.loop.warnings() == ()
 
 
 def test_poses_and_vertices_of_a_frame_go_out_together_with_its_time(rig: Rig) -> None:
@@ -120,13 +125,35 @@ def test_while_nothing_is_published_the_session_goes_on(rig: Rig) -> None:
     wait_for(lambda: any(isinstance(e.body, MarkerAdded) for d in rig.front.decisions for e in d.events))
     wait_for(lambda: len(rig.shown) == 3)
     assert rig.shown[-1] == (1.0, 1.0, 1), "for those who joined meanwhile"
-    assert rig.front.states[-1].session_time == before + REPEAT_NS, "as old as the source is"
+    assert rig.front.states[-1].session_time == before, "as old as the source is"
+    assert rig.recorder.state_times[-1] == before + REPEAT_NS, (
+        "people go on: their heads and hands are recorded with it"
+    )
     idle = [row for row in rig.recorder.rows if not row.n_ticks]
     assert idle
     assert not any(row.plant for row in idle), "the plant's state is in the rows where it changed"
     rig.publish(2.0, delay_ns=60 * MS)
     times = [state.session_time for state in rig.front.states]
-    assert times == sorted(set(times)), "a source that got slower does not make time go back"
+    assert times == sorted(times), "a source that got slower does not make time go back"
+    assert rig.recorder.state_times == sorted(set(rig.recorder.state_times))
+
+
+def test_a_publisher_that_falls_silent_is_said_until_it_speaks(rig: Rig) -> None:
+    for x in range(1, 5):
+        rig.now_ns += PERIOD_NS
+        rig.publish(float(x), delay_ns=40 * MS)
+    shown_ns = rig.now_ns - 40 * MS
+    for silence_ms in (900, 1000, 1100):
+        sent = len(rig.front.states)
+        rig.now_ns += silence_ms * MS
+        wait_for(lambda sent=sent: len(rig.front.states) > sent)  # type: ignore[misc]
+        assert rig.front.states[-1].session_time == shown_ns, "its age is that of the silence"
+        assert len(rig.loop.warnings()) == (silence_ms > 900)
+    assert rig.loop.warnings() == ("nothing was published for 3.0 s: the program that publishes stands still",)
+    rig.now_ns += PERIOD_NS
+    rig.publish(6.0, delay_ns=40 * MS)
+    assert rig.front.states[-1].session_time == rig.now_ns - 40 * MS
+    assert rig.loop.warnings() == ()
 
 
 def test_states_between_two_frames_of_a_slow_source_are_not_repeated(rig: Rig) -> None:
@@ -241,8 +268,12 @@ def test_no_step_follows_one_that_failed_in_the_publishers_thread(rig: Rig) -> N
     rows = len(rig.recorder.rows)
     assert rig.recorder.rows[-1].digest == CRASHED
     rig.loop._helper.join(10.0)
-    with pytest.raises(KeyError, match="broken"):
-        rig.publish(3.0)
+    depths = []
+    for _ in range(3):
+        with pytest.raises(KeyError, match="broken") as caught:
+            rig.publish(3.0)
+        depths.append(len(caught.traceback))
+    assert len(set(depths)) == 1, "who tries again and again does not fill the memory"
     rig.loop.close()
     assert len(rig.recorder.rows) == rows
 

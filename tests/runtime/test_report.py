@@ -9,15 +9,15 @@ import pytest
 
 from iris_session.physics import Pacer
 from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
-from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
 from iris_session.protocol.entries import Bye, Entry, Join
 from iris_session.protocol.names import Role
-from iris_session.protocol.status import AnchorReport, ParticipantReport
+from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
 from iris_session.recording.feed import FeedStats
 from iris_session.recording.messages import RecorderStatus
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.report import PATIENCE_NS, PERIOD_NS, Reporter, anchors, recorder_report, robots
+from iris_session.runtime.report import PATIENCE_NS, PERIOD_NS, Reporter, anchors, recorder_report, robots, warnings
 from iris_session.runtime.stepper import Stepper
 from tests.runtime.play import TICK_NS, entries, host, make_core
 from tests.runtime.test_stepper import Front
@@ -104,6 +104,11 @@ def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
     assert reporter.due(PERIOD_NS + PATIENCE_NS)
     reporter.pacer = Pacer(TICK_NS, 3 * PERIOD_NS)
     assert reporter.due(3 * PERIOD_NS)
+
+
+def test_what_is_noticed_beside_ticks_is_among_the_warnings(session: Session) -> None:
+    assert warnings(session.stepper, RecorderReport(), "") == []
+    assert warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
 
 
 def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) -> None:

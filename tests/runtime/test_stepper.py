@@ -55,6 +55,7 @@ class Recorder:
         self.rows: list[JournalRow] = []
         self.keyframes: list[Keyframe] = []
         self.states = 0
+        self.state_times: list[int] = []
         self.metrics: list[tuple[str, float]] = []
         self.scenes: list[tuple[int, str]] = []  # rows before it, hash
         self.drawn: list[tuple[str, str]] = []
@@ -95,6 +96,7 @@ class Recorder:
         applied: Sequence[Applied] = (),
     ) -> None:
         self.states += 1
+        self.state_times.append(session_time)
 
     def decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass

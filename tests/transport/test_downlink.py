@@ -129,3 +129,12 @@ def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) ->
     far.downlink.drain()
     assert far.drops.by_reason == {"decision_invalid": 1}
     assert [h.tick for h in far.headers()] == [1]
+
+
+def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: Far) -> None:
+    """Its source is silent, and it is as old as that."""
+    for session_time in (7, 7, 7, 9):
+        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
+        assert far.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
+    assert list(far.publisher.delays_ns) == [70, 68]
+    assert [header.session_time for header in far.headers()] == [7, 7, 7, 9]
