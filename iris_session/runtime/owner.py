@@ -38,6 +38,7 @@ class Owner(Publishing, ScenePatches):
     _pacer: Pacer | None = None
     _scheduling = "normal"
     _recorded: Path | None = None
+    _ended = False  # by `close`, for good
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -128,8 +129,13 @@ class Owner(Publishing, ScenePatches):
         """Path of the recording, after `close()` too; None when nothing is recorded."""
         return self._recorded if self._processes is None else self._processes.recording
 
+    def _check_open(self) -> None:
+        if self._ended:
+            raise OwnershipError(f"the session is closed: make another {type(self).__name__}")
+
     def _live(self) -> SessionProcesses:
         if self._processes is None:
+            self._check_open()
             what = type(self).__name__
             raise OwnershipError(f"the session is not started: use `with {what}(...) as session`, or session.start()")
         return self._processes

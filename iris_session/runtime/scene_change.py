@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -20,13 +21,14 @@ from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.config_checks import check_timestep
+from iris_session.runtime.config_checks import check_arguments, check_timestep
 from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.deformables import flexes
 from iris_session.runtime.errors import ConfigError, OwnershipError
+from iris_session.runtime.patch_ops import checked_ops
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.shared_scene import SharedScenes
-from iris_session.runtime.stepper import NextPatch, NextScene, Stepper
+from iris_session.runtime.stepper import MAX_SCENES, NextPatch, NextScene, Stepper
 from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
 
@@ -35,29 +37,24 @@ class ScenePatches:
     """Part of every session: its scene as it is drawn."""
 
     _stepper: Stepper | None
+    _early_patches: list[NextPatch]  # asked for before anybody drove the session; with the lock of the scenes
 
     def patch_scene(self, *ops: PatchOp) -> None:
         """Changes how the scene is drawn, for everybody: colours, visibility, poses of visuals, decoration. Physics
-        does not know of it. `session.scene` is the specification that `ops` refer to.
+        does not know of it. `session.scene` is the specification that `ops` refer to, at most 64 at once.
 
-        Raises `ConfigError` for what does not fit (nothing is changed then), `OwnershipError` before the session is
-        driven. From any thread.
+        Everything of one call is seen together, with the next step. Raises `ConfigError` for what does not fit (nothing
+        is changed then), `OwnershipError` before `start()`. From any thread.
         """
-        stepper = self._stepper
-        if stepper is None:
-            raise OwnershipError("patch_scene needs a session that runs: call it while run() is under way")
         scenes = self._live().scenes
         try:
-            # What is journaled is what is used, and it is what clients can read.
-            checked = decode_entry(encode_entry(Entry(HOST, HOST, 0, ScenePatched(ops, "")))).message
-            assert isinstance(checked, ScenePatched)
-            msgspec.json.decode(msgspec.json.encode(checked), type=ScenePatched)  # where what is not finite is null
+            checked = checked_ops(ops)
             with scenes.lock:
-                shown = scenes.patch(checked.ops)
-                message = ScenePatched(checked.ops, shown.info.scene_hash)
-                stepper.change_scene(NextPatch(message, shown))
+                shown = scenes.patch(checked)
+                patch = NextPatch(ScenePatched(checked, shown.info.scene_hash), shown)
+                self._queue(patch)
                 scenes.take(shown)
-        except (SceneError, OSError, RuntimeError, msgspec.ValidationError) as error:
+        except (SceneError, OSError, RuntimeError) as error:
             raise ConfigError(f"patch_scene: {error}") from error
 
     @property
@@ -65,6 +62,14 @@ class ScenePatches:
         """What clients draw, with all patches that were asked for; None when the session shares no specification."""
         newest = self._live().scenes.newest
         return None if newest is None else newest.spec
+
+    def _queue(self, patch: NextPatch) -> None:
+        if self._stepper is not None:
+            self._stepper.change_scene(patch)
+        elif len(self._early_patches) < MAX_SCENES:
+            self._early_patches.append(patch)
+        else:
+            raise SceneError(f"{MAX_SCENES} changes wait for the first step: call run() first")
 
     @abstractmethod
     def _live(self) -> SessionProcesses: ...
@@ -97,21 +102,27 @@ class SceneChanges(ScenePatches):
         that no loop can keep. It may be another one than the session's: ticks are of that length from then on, and
         clients are told.
 
-        Raises `OwnershipError` at once in a user's loop, whose model is not ours, and before `run()`.
+        Raises `OwnershipError` at once in a user's loop, whose model is not ours, and before `run()`; `TypeError` for
+        what is no model.
         """
         if self._user_loop is not None:
             raise OwnershipError("load_scene: your own loop owns the model; end this session and begin another with it")
+        if not isinstance(model, str | Path):
+            check_arguments(model, data, self.config)
         stepper = self._stepper
         if stepper is None:
             raise OwnershipError("load_scene needs a session that runs: call it while run() is under way")
         done: Future[None] = Future()
         scenes = self._live().scenes
         known = None if robots is None else tuple(robots), None if objects is None else tuple(objects)
-        state = b"" if data is None or isinstance(model, str | Path) else plant_state(model, data)
+        begun = copy.copy(data)  # the caller may go on with theirs
 
         def work() -> None:
             try:
-                scene = prepare(stepper.core, scenes, load_model_of(model), state, *known)
+                loaded = load_model_of(model)
+                check_arguments(loaded, begun, self.config)
+                state = b"" if begun is None else plant_state(loaded, begun)
+                scene = prepare(stepper.core, scenes, loaded, state, *known)
                 with scenes.lock:
                     stepper.change_scene(scene)
                     scenes.take(scene.shown)

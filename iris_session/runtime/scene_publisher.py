@@ -71,6 +71,7 @@ class ScenePublisher(Owner):
         self._time_s: float | None = None
         self._own_time = False
         self._anew = False
+        self._early_patches = []  # none: the stepper is there as soon as anybody can ask
         #: Why the recording is incomplete, known after `close()`; empty when it is not.
         self.recording_fault = ""
 
@@ -84,8 +85,7 @@ class ScenePublisher(Owner):
         """
         if self._processes is not None:
             return
-        if self._loop is not None:
-            raise OwnershipError("the session is closed: make another ScenePublisher")
+        self._check_open()
         where = self.config.assets
         try:
             store = AssetStore(None if isinstance(where, bool) else where)
@@ -106,11 +106,12 @@ class ScenePublisher(Owner):
         self._processes = processes
         try:
             self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
+            self._draft = SceneDraft(composed)
             self._loop = PublishLoop(carrier, vertices, self._stepper, processes, processes.state_period_ns)
+            processes.reporter.notices += [self._loop.warnings, self._draft.warnings]
         except BaseException:
             self.close()
             raise
-        self._draft = SceneDraft(composed)
 
     def close(self) -> bool:
         """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice.
@@ -118,6 +119,7 @@ class ScenePublisher(Owner):
         False: the recording is incomplete, `recording_fault` says why.
         """
         self._stop.set()
+        self._ended = True
         try:
             if self._loop is not None:
                 self._loop.close()
@@ -244,6 +246,7 @@ class ScenePublisher(Owner):
         return nullcontext() if self._loop is None else self._loop.lock
 
     def _started(self) -> tuple[SceneDraft, PublishLoop]:
+        self._check_open()
         if self._draft is None or self._loop is None:
             raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
         return self._draft, self._loop

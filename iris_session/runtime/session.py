@@ -81,6 +81,7 @@ class Session(Owner, SceneChanges):
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
         self._early: list[EntryMessage] = []  # posted before anybody drove the session
+        self._early_patches = []
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
         self._attached = False
@@ -99,6 +100,7 @@ class Session(Owner, SceneChanges):
         afterwards `StartError`: a port in use, a folder that cannot be written, a key that is missing.
         """
         if self._processes is None:
+            self._check_open()
             core = self._make_core(user_owned=False)
             processes = SessionProcesses(self.config, core, self.origin_ns, self._past)
             processes.start()
@@ -111,6 +113,7 @@ class Session(Owner, SceneChanges):
         at rest where they are commanded (torque actuators: with the torques that hold them now).
         """
         self._stop.set()
+        self._ended = True
         if self._attached:
             if mujoco.get_mjcb_control() is self._callback:  # it may be somebody else's by now
                 mujoco.set_mjcb_control(None)
@@ -301,7 +304,12 @@ class Session(Owner, SceneChanges):
                 raise OwnershipError("one session is driven in one way: by run(), or by begin_tick() and end_tick()")
         else:
             live, core = self._live(), self._make_core(user_owned=user_owned)
-            self._stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
+            stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
+            with live.scenes.lock:  # no patch comes between
+                for patch in self._early_patches:
+                    stepper.change_scene(patch)
+                self._early_patches.clear()
+                self._stepper = stepper
             if not user_owned:
                 self.data = core.world.data
                 self._stepper.on_scene.append(self._take_scene)

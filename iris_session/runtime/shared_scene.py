@@ -17,7 +17,7 @@ import numpy as np
 
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, encode_scene
-from iris_session.protocol.scene_patch import MAX_OPS, MAX_PATCHES, PatchOp, merged, patched
+from iris_session.protocol.scene_patch import MAX_PATCHES, PatchOp, merged, patched
 from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -90,9 +90,10 @@ class SharedScenes:
         if self._store is None or newest is None or newest.spec is None:
             raise SceneError("this session shares no specification of its scene: set `assets` of SessionConfig")
         merging = merged(newest.patches, ops)
-        if len(ops) > MAX_OPS or len(merging) > MAX_PATCHES:
+        if len(merging) > MAX_PATCHES:
             raise SceneError(
-                f"at most {MAX_OPS} operations a patch, {MAX_PATCHES} since the scene was loaded: load it anew"
+                f"{len(merging)} operations since the scene was loaded, at most {MAX_PATCHES}, of which those on one "
+                "visual count once: load the scene anew"
             )
         return _stored(self._store, patched(newest.spec, ops), newest.info, merging)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from iris_session import (
+    Client,
     ConfigError,
     OwnershipError,
     PublishError,
@@ -22,6 +23,7 @@ from iris_session import (
 from iris_session.protocol.scene_patch import SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
+from iris_session.runtime.cadence import SILENT_NS
 from iris_session.runtime.verification import verify_recording
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
@@ -71,7 +73,7 @@ def test_the_owner_speaks_and_patches_as_of_any_session(session: ScenePublisher)
     session.clear_estop()
     assert session.scene is not None
     floor = session.scene.visuals[0]
-    with pytest.raises(ConfigError, match=r"Expected `float`.*rgba"):
+    with pytest.raises(ConfigError, match=r"patch_scene: operation 1, SetVisual: numbers of rgba\[2\] must be finite"):
         session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, NAN, 1.0)))
     session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, 1.0, 1.0)))
     session.run(until=lambda: SceneChanged in kinds(session) and not session.status().estop, seconds=30.0)
@@ -154,6 +156,28 @@ def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: Scene
     assert kinds(session).count(SceneChanged) == before + 1
 
 
+def test_a_publisher_that_is_silent_is_as_old_as_its_silence_and_says_so(session: ScenePublisher) -> None:
+    """A simulator that hangs, or a robot's driver: what everybody looks at is not of now."""
+    with Client(session.address, role="observer", name="ann", alignment="not_needed") as ann:
+        for i in range(5):
+            session.publish(18.0 + 0.1 * i)
+        ann.wait_for(lambda c: c.state is not None and c.state.header.sim_time == 18.4, 30.0)
+        assert ann.state is not None
+        shown = ann.state.header
+        ann.wait_for(lambda c: (c.data_age_ns() or 0) > SILENT_NS, 30.0)
+        assert ann.state.header.session_time == shown.session_time
+        assert ann.state.header.state_seq > shown.state_seq, "it is sent again, for those who join"
+        ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
+        report = ann.status(30.0)
+        assert report.step_to_publish is not None
+        assert report.step_to_publish.p99 < 1000.0, "the front is not to blame"
+        row = next(row for row in report.participants if row.name == "ann")
+        assert row.state_age is None or row.state_age.p99 < 1000.0, "nor her link"
+        session.publish(19.0)
+        ann.wait_for(lambda c: not c.status(30.0).warnings, 30.0)
+        ann.wait_for(lambda c: c.state is not None and c.state.header.sim_time == 19.0, 30.0)
+
+
 def test_several_threads_may_publish(session: ScenePublisher) -> None:
     faults: list[BaseException] = []
 
@@ -185,8 +209,9 @@ def test_nothing_is_set_before_the_start_or_published_after_the_end() -> None:
         session.stop()
         session.run()  # ends at once
     assert session.stopping
-    with pytest.raises(OwnershipError, match="closed"):
-        session.publish()
+    for call in (session.publish, session.patch_scene, lambda: session.set_pose("box", (0, 0, 0)), session.start):
+        with pytest.raises(OwnershipError, match="closed"):
+            call()
     assert session.close()
     with pytest.raises(OwnershipError, match="make another"):
         session.start()

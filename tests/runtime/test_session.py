@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import threading
@@ -18,7 +19,11 @@ from iris_session.control import ControlConfig, ControlError
 from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol.client_messages import Control
+from iris_session.protocol.scene import encode_scene
+from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
+from iris_session.runtime import scene_change
+from iris_session.runtime.core import plant_state
 from iris_session.runtime.verification import verify_recording
 
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
@@ -133,9 +138,53 @@ def test_targets_for_an_environment_with_its_own_controller() -> None:
 def test_closing_twice_and_using_it_afterwards(session: Session) -> None:
     session.close()
     session.close()
-    with pytest.raises(OwnershipError, match="not started"):
-        session.run()
+    for call in (session.run, session.start, session.patch_scene, lambda: session.address):
+        with pytest.raises(OwnershipError, match="the session is closed: make another Session"):
+            call()
     assert session.recording is None
+
+
+def test_a_look_can_be_changed_before_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=path)
+    with pytest.raises(OwnershipError, match="not started"):
+        Session(scene_path("handover"), config=config).patch_scene(RemoveVisual(0))
+    with Session(scene_path("handover"), config=config) as session:
+        monkeypatch.setattr(scene_change, "MAX_SCENES", 2)
+        assert session.scene is not None
+        seen = session.scene.visuals[0]
+        for green in (0.5, 1.0):
+            session.patch_scene(SetVisual(seen.id, rgba=(0.0, green, 0.0, 1.0)))
+        with pytest.raises(ConfigError, match="2 changes wait for the first step: call run"):
+            session.patch_scene(RemoveVisual(seen.id))
+        assert session.scene.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
+        told = session.scene
+        session.run(until=lambda: sum(isinstance(body, SceneChanged) for body in _bodies(session)) == 2, seconds=30.0)
+        session.patch_scene(RemoveVisual(seen.id))
+        session.run(seconds=0.1)
+        changes = [body for body in _bodies(session) if isinstance(body, SceneChanged)]
+        assert [change.scene_revision for change in changes] == [1, 2, 3]
+        assert changes[1].scene_hash == hashlib.sha256(encode_scene(told)).hexdigest()
+    assert verify_recording(path).ok
+
+
+def test_another_scene_begins_with_the_data_that_came_with_its_file(session: Session) -> None:
+    path = scene_path("handover")
+    model = load_model(path)
+    data = mujoco.MjData(model)
+    data.qpos[0] = 0.3
+    begun = plant_state(model, data)
+    session.run(seconds=0.05)
+    change = session.load_scene(path, data)
+    data.qpos[0] = 0.9  # whose it is goes on with it
+    session.run(until=change.done)
+    change.result()
+    before = session.stepper.core.as_it_is().initial_state
+    session.run(until=lambda: session.stepper.core.as_it_is().initial_state != before, seconds=30.0)
+    assert session.stepper.core.as_it_is().initial_state == begun
+    other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
+    with pytest.raises(ConfigError, match="data is of another model"):
+        other.result(60.0)
 
 
 def test_what_cannot_be_driven_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
