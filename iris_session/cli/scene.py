@@ -1,30 +1,28 @@
-"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers.
-
-MuJoCo reads MJCF and MJB, and scenes with a name; every other file is composed without it (`SceneBuilder`).
-"""
+"""`iris-session scene inspect`, `scene export`: what clients are given of a scene, and a file for viewers."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from iris_session.cli.common import CommandError, add_json, open_scene, print_json
+from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, unit_advice
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
     from iris_session.scene import AssetStore
-    from iris_session.scene.compose import SceneBuilder
-
-#: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
-SIMULATED: Final = (".xml", ".mjcf", ".mjb")
+    from iris_session.scene.report import SceneReport
 
 
 class _Found(NamedTuple):
+    """`path`: of a file that MuJoCo does not read."""
+
     spec: SceneSpec
     scene_hash: str
     skipped: tuple[str, ...]
+    path: Path | None = None
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,13 +30,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "scene",
         help="what clients are given of a scene, what is heavy in it; export to GLB",
         epilog="examples:\n  iris-session scene inspect scene.xml\n  iris-session scene inspect arm.urdf\n"
+        "  iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)\n"
         "  iris-session scene export handover handover.glb",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = actions.add_parser(
         "inspect",
-        help="tree, sizes, what is heavy and why, what a headset will struggle with",
+        help="tree, extent, sizes, what is heavy and why, what a headset will struggle with",
         description="Shows what clients are given of a scene, what is heavy in it, what a Quest 3 will struggle with.",
     )
     _add_scene(inspect)
@@ -51,6 +50,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     _add_scene(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
+    add_json(export)
     export.set_defaults(run=run_export)
 
 
@@ -61,19 +61,9 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
         help="MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
         "scene (see `iris-session serve --help`)",
     )
-    add_package_dir(parser)
+    add_file_options(parser)
     parser.add_argument(
         "--assets", default=None, metavar="DIR", help="where assets are kept (default: ~/.cache/iris-session/assets)"
-    )
-
-
-def add_package_dir(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--package-dir",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder of packages that the file refers to by package://, or may refer into; may be repeated",
     )
 
 
@@ -81,20 +71,36 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     """Prints the report; status 0 whatever it says."""
     import msgspec
 
-    from iris_session.scene.report import report, tree
+    from iris_session.scene.extent import extent_of
+    from iris_session.scene.report import report
 
-    parsed, _ = _parse(arguments)
-    found = report(parsed.spec, parsed.scene_hash, parsed.skipped)
+    parsed, store = _parse(arguments)
+    extent = extent_of(parsed.spec, store)
+    advice = unit_advice(parsed.spec, extent, parsed.path)
+    found = report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     if arguments.json:
-        print_json(msgspec.to_builtins(found))
-        return 0
-    for line in tree(parsed.spec):
+        print_json({**msgspec.to_builtins(found), "unit_hint": advice})
+    else:
+        _print_report(parsed.spec, found, advice)
+    return 0
+
+
+def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
+    from iris_session.scene.extent import size_text
+    from iris_session.scene.report import tree
+
+    for line in tree(spec):
         print(line)
     totals = found.totals
     print(
         f"\n{found.bodies} bodies ({found.moving} move), {totals.objects} objects, {totals.triangles:,} triangles, "
-        f"{len(parsed.spec.lights)} lights, {len(parsed.spec.deformables)} deformables"
+        f"{len(spec.lights)} lights, {len(spec.deformables)} deformables"
     )
+    if found.extent is not None:
+        low, high = (", ".join(f"{v:.3g}" for v in corner) for corner in (found.extent.low, found.extent.high))
+        print(f"extent: {size_text(found.extent)} along x, y, z, from ({low}) to ({high}), planes not counted")
+    if advice:
+        print(f"size: {advice}")
     print(
         f"{_size(totals.asset_bytes)} of assets: {_size(totals.mesh_bytes)} meshes and {_size(totals.texture_bytes)} "
         f"textures, the rest coarser levels; {_size(totals.texture_memory)} of textures on a graphics card"
@@ -104,31 +110,51 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_size(heavy.bytes)}, {heavy.levels} levels")
     for text in found.skipped:
         print(f"left out: {text}")
+    for text in found.simplified:
+        print(f"in recordings and GLB: {text}")
     for text in found.struggles:
         print(f"headset: {text}")
     if not found.struggles:
         print("headset: nothing here that a Quest 3 would struggle with")
-    return 0
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    """Writes the file and says how large it is."""
+    """Writes the file and says how large it is, and what is not in it."""
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
+    from iris_session.scene.report import not_in_glb
 
-    if arguments.out.suffix.lower() != ".glb":
-        raise CommandError(f"{arguments.out} does not end in .glb: GLB is the only format of `scene export`")
+    out = arguments.out.expanduser()
+    if out.suffix.lower() != ".glb":
+        raise CommandError(f"{out} does not end in .glb: GLB is the only format of `scene export`")
+    if _same_file(Path(arguments.scene).expanduser(), out):
+        raise CommandError(f"{out} is the file that is read: name another one to write")
     parsed, store = _parse(arguments)
     try:
-        size = write_glb(parsed.spec, store, arguments.out)
+        size = write_glb(parsed.spec, store, out)
     except SceneBuildError as error:
         raise CommandError(str(error)) from None
     except OSError as error:
-        raise CommandError(f"{arguments.out} cannot be written: {error.strerror or error}") from None
+        raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None
+    simplified = not_in_glb(parsed.spec)
+    if arguments.json:
+        lists = {"skipped": parsed.skipped, "simplified": simplified}
+        print_json({"file": str(out), "bytes": size, "scene_hash": parsed.scene_hash, **lists})
+        return 0
     for text in parsed.skipped:
         print(f"left out: {text}", file=sys.stderr)
-    print(f"{arguments.out}: {_size(size)}")
+    for text in simplified:
+        print(f"in the GLB: {text}", file=sys.stderr)
+    print(f"{out}: {_size(size)}")
     return 0
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    """Whether both are one file, also by a link, or in another spelling."""
+    try:
+        return a.samefile(b)
+    except OSError:
+        return False
 
 
 def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
@@ -136,11 +162,11 @@ def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
     from iris_session.protocol.scene import SceneError
     from iris_session.scene import AssetStore
 
-    path = Path(arguments.scene)
+    path = file_of(arguments.scene)
+    check_file_options(arguments, path)
     try:
         store = AssetStore(arguments.assets)
-        composed = path.suffix.lower() not in ("", *SIMULATED)  # without an ending it is a name
-        return _compose(path, arguments.package_dir, store) if composed else _parse_model(arguments.scene, store), store
+        return _parse_model(arguments.scene, store) if path is None else _compose(path, arguments, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
     except SceneError as error:  # more than clients read
@@ -157,32 +183,15 @@ def _parse_model(scene: str, store: AssetStore) -> _Found:
     return _Found(parsed.spec, parsed.scene_hash, parsed.skipped)
 
 
-def _compose(path: Path, package_dirs: list[str], store: AssetStore) -> _Found:
+def _compose(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _Found:
     from iris_session.scene import SceneBuildError
 
-    builder = builder_of(path, path.stem, package_dirs)
+    builder = builder_of(path, path.stem, arguments)
     try:
         made = builder.build(store)
     except SceneBuildError as error:
         raise CommandError(str(error)) from None
-    return _Found(made.spec, made.scene_hash, made.skipped)
-
-
-def builder_of(path: Path, name: str, package_dirs: list[str]) -> SceneBuilder:
-    """A scene called `name` with what is in a file that MuJoCo does not read."""
-    from iris_session.scene import SceneBuildError
-    from iris_session.scene.compose import SceneBuilder
-
-    builder = SceneBuilder(name)
-    try:
-        if path.suffix.lower() == ".urdf":
-            builder.add_urdf(path, package_dirs=package_dirs)
-        else:
-            builder.add_file(path, package_dirs=package_dirs)
-    except SceneBuildError as error:
-        advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
-        raise CommandError(f"{error}{advice}") from None
-    return builder
+    return _Found(made.spec, made.scene_hash, made.skipped, path)
 
 
 def _size(n_bytes: int) -> str:

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -19,7 +20,7 @@ from iris_session.cli.common import (
     print_json,
     scene_names,
 )
-from iris_session.cli.scene import SIMULATED, add_package_dir, builder_of
+from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, unit_advice
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session serve handover --interface wlan0 --name lab-1\n"
         "  iris-session serve handover --port-base 7730    (a second session on this machine)\n"
         "  iris-session serve part.glb    (shown, nothing moves)\n"
+        "  iris-session serve part.stl --scale 0.001    (a part in millimetres)\n"
         "  iris-session serve --resume sessions/20261121T093000.000000Z-handover    (go on where it ended)",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -68,7 +70,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="RECORDING",
         help="go on from the end of a recording (a .rrd or its folder): same session, people, leases, scene",
     )
-    add_package_dir(parser)
+    add_file_options(parser)
     parser.add_argument("--seconds", type=positive_seconds, help="stop after this many seconds")
     add_session_options(parser)
     add_json(parser)
@@ -143,12 +145,6 @@ def new_session(arguments: argparse.Namespace) -> Session:
     return Session(scene.model, config=config, robots=robots)
 
 
-def file_to_show(scene: str | None) -> Path | None:
-    """The file that is to be shown as it is; None where MuJoCo simulates what was asked for."""
-    path = Path(scene or "").expanduser()
-    return path if path.is_file() and path.suffix and path.suffix.lower() not in SIMULATED else None
-
-
 def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
     """A session in which everybody sees a file, and nothing moves."""
     from iris_session.runtime.scene_publisher import ScenePublisher
@@ -156,7 +152,7 @@ def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher
     drives = ("robots", "assign", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
         raise CommandError(f"{', '.join(given)}: nobody drives what is in {path.name}, it is shown as it is")
-    scene = builder_of(path, path.name, arguments.package_dir)
+    scene = builder_of(path, path.name, arguments)
     config = with_anchors(session_config(arguments, session_name(path)), arguments.anchors)
     return ScenePublisher(scene, config)
 
@@ -187,24 +183,42 @@ def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
-    shown = None if arguments.resume is not None else file_to_show(arguments.scene)
+    shown = None if arguments.resume is not None or arguments.scene is None else file_of(arguments.scene)
+    check_file_options(arguments, shown)
     if shown is not None:
-        return _serve(arguments, showing_session(arguments, shown), f"showing {shown.name}, which nobody drives")
-    if arguments.package_dir:
-        raise CommandError("--package-dir goes with a file to show: MuJoCo's files say themselves where theirs lie")
+        return _serve(arguments, showing_session(arguments, shown), lambda session: _showing(session, shown))
     session = resumed_session(arguments) if arguments.resume is not None else new_session(arguments)
     hint = ""
     if not session.robots:
         tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
         hint = f"{no_robots(session.model)}; {tip}"
-    return _serve(arguments, session, hint, ", ".join(robot.name for robot in session.robots))
+    return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))
 
 
-def _serve(arguments: argparse.Namespace, session: Session | ScenePublisher, hint: str, robots: str = "") -> int:
+def _showing(session: Session | ScenePublisher, path: Path) -> str:
+    """What is shown, and what is likely wrong with its size."""
+    from iris_session.scene.extent import box_extent, size_text
+
+    spec = session.scene
+    extent = None if spec is None else box_extent(spec)
+    if spec is None or extent is None:
+        return f"showing {path.name}, which nobody drives"
+    advice = unit_advice(spec, extent, path)
+    what = f"showing {path.name}, which nobody drives; its extent is {size_text(extent)}"
+    return f"{what}\nsize: {advice}" if advice else what
+
+
+def _serve(
+    arguments: argparse.Namespace,
+    session: Session | ScenePublisher,
+    hint_of: Callable[[Session | ScenePublisher], str],
+    robots: str = "",
+) -> int:
+    """`hint_of`: what is said of the session once it runs; empty for nothing."""
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         print(f"session '{session.name}' on {session.address}, robots: {robots or 'none'}", file=out, flush=True)
-        for note in (*session.notes, *([hint] if hint else [])):
+        for note in filter(None, (*session.notes, hint_of(session))):
             print(note, file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)

@@ -76,6 +76,8 @@ def _sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
     return {ANCHOR_ID: (p_world, IDENTITY_QUAT)}
 
 
+#: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
+FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae, .3mf"
 #: How the scenes of `SCENE_NAMES` are made.
 SCENES: Final[dict[str, Callable[[], Scene]]] = {
     "handover": lambda: packaged("handover"),
@@ -97,7 +99,7 @@ def scene_by_name(name: str) -> Scene:
     match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
     if match is None or match[1] not in NUMBERED:
         names = ", ".join(SCENE_NAMES)
-        raise ConfigError(f"no scene is called '{name}'. Scenes: {names}; or give a file (.xml, .mjb)")
+        raise ConfigError(f"no scene is called '{name}'. Scenes: {names}; or give a file ({FILES})")
     try:
         return NUMBERED[match[1]](int(match[2]))
     except ValueError as error:  # out of range

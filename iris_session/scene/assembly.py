@@ -5,7 +5,7 @@ once, assets in the store. The order of all lists follows from the order in whic
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -33,8 +33,9 @@ from iris_session.scene.collected import Flexible, World
 from iris_session.scene.composed import ComposedScene, DeformableSource
 from iris_session.scene.deformable_assets import encode_deformable
 from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.extent import box_extent
 from iris_session.scene.meshes import MeshArrays
-from iris_session.scene.parts import Item, Look, Matrix, Picture, matrix_of, rigid_and_rest
+from iris_session.scene.parts import MAX_TRIANGLES, Item, Look, Matrix, Picture, rigid_and_rest
 from iris_session.scene.store import AssetStore
 from iris_session.scene.surfaces import scaled
 from iris_session.scene.totals import with_totals
@@ -152,6 +153,7 @@ def _meshes(
         mesh = item.mesh if mapped else replace(item.mesh, uv=None)  # coordinates of nothing would keep levels out
         pieces.setdefault(key, (item.name, mesh, rest))
         keys.append(key)
+    _check_copies(pieces.values())
     notes = builder.run([_mesh_work(builder, mesh, rest) for _, mesh, rest in pieces.values()])
     found: dict[str, int] = {}
     meshes: list[Mesh] = []
@@ -163,6 +165,22 @@ def _meshes(
             meshes.append(Mesh(name, note.low, note.high, mesh.uv is not None, note.levels))
         places[key] = found[address]
     return tuple(meshes), [places[key] for key in keys]
+
+
+def _check_copies(pieces: Iterable[tuple[str, MeshArrays, Matrix | None]]) -> None:
+    """A scale is in the vertices, so every further one of a mesh is a mesh: a small file can ask for any number.
+    Raises `SceneBuildError`."""
+    seen: set[int] = set()
+    copied = 0
+    for name, mesh, _ in pieces:
+        places = id(mesh.position)  # a mesh and the same one without texture coordinates share it
+        copied += mesh.triangles if places in seen else 0
+        seen.add(places)
+        if copied > MAX_TRIANGLES:
+            raise SceneBuildError(
+                f"{name!r} and others are drawn in so many scales that they have over {MAX_TRIANGLES:,} triangles: "
+                "give what is alike one scale"
+            )
 
 
 def _mesh_work(builder: Builder, mesh: MeshArrays, rest: Matrix | None) -> Work[MeshNote]:
@@ -280,26 +298,9 @@ def _encoder(one: Flexible, uv: NDArray[np.float32] | None, topology: Deformable
 
 def _surroundings(spec: SceneSpec, sources: Sequence[DeformableSource]) -> Environment:
     """Centre and extent of what is there at first, without planes; everything of it is near enough to be drawn."""
-    poses = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
-    corners = [np.array(source.vertices, np.float64) for source in sources]
-    for visual in spec.visuals:
-        geometry = visual.geometry
-        if geometry.kind == GeometryKind.PLANE:
-            continue
-        size = np.array(geometry.size)
-        low, high = -size, size
-        if geometry.mesh >= 0:
-            low, high = np.array(spec.meshes[geometry.mesh].low), np.array(spec.meshes[geometry.mesh].high)
-        elif geometry.kind == GeometryKind.CAPSULE:
-            caps = np.array([0.0, 0.0, size[0]])
-            low, high = -size - caps, size + caps
-        box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-        T = poses[visual.body] @ matrix_of(visual.T_body_visual)
-        corners.append(box @ T[:3, :3].T + T[:3, 3])
-    if not corners:
+    box = box_extent(spec, (source.vertices for source in sources))
+    if box is None:
         return Environment()
-    points = np.concatenate(corners)
-    low, high = points.min(axis=0), points.max(axis=0)
-    x, y, z = ((low + high) / 2).tolist()
-    extent = max(0.1, math.dist(low.tolist(), high.tolist()) / 2)
+    x, y, z = (0.5 * (low + high) for low, high in zip(box.low, box.high, strict=True))
+    extent = max(0.1, math.hypot(*box.size) / 2)
     return Environment(zfar=max(_FAR, _FAR_EXTENTS * extent), extent=extent, center=(x, y, z))

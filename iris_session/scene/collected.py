@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -66,9 +69,22 @@ class World:
     names: set[str] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
 
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """What is added within is added whole, or, where something is raised, not at all."""
+        lists: tuple[list[Any], ...] = (self.things, self.items, self.lights, self.cameras, self.skipped)
+        lengths, names = [len(one) for one in lists], self.names.copy()
+        try:
+            yield
+        except BaseException:
+            for one, length in zip(lists, lengths, strict=True):
+                del one[length:]
+            self.names = names
+            raise
+
     def skip(self, texts: tuple[str, ...]) -> None:
         """What clients will not see, each line once."""
-        self.skipped += [text for text in texts if text not in self.skipped]
+        self.skipped += dict.fromkeys(text for text in texts if text not in self.skipped)
 
     def add_robot(self, robot: Robot) -> None:
         """An articulation with its bodies, at rest."""

@@ -134,14 +134,16 @@ class SceneBuilder:
         name = name or where.stem[:_MAX_NAME]
         turn = up or loaded.up
         if turn not in ("y", "z"):
-            raise SceneBuildError(f"up is {up!r}: y or z, or None for what the format means")
+            said = f"{where.name} says that {turn} is up" if up is None else f"up is {up!r}"
+            raise SceneBuildError(f"{said}: give up='y' or up='z', or None for what the format means")
         factors = numbers("scale", scale if array_of(scale, "scale").ndim else [scale] * 3, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
         look = look_of(options)
-        body, T_body_thing = self._place(name, options, named=True)
-        self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
+        with self._world.whole():
+            body, T_body_thing = self._place(name, options, named=True)
+            self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
         return name
 
     def add_urdf(
@@ -153,17 +155,20 @@ class SceneBuilder:
         quaternion: Sequence[float] = IDENTITY.q,
         package_dirs: Sequence[str | PathLike[str]] = (),
         collisions: bool = False,
+        scale: float = 1.0,
     ) -> str:
         """An articulation: links that joints move are bodies called `name/link`, its root among them.
 
         Without a name it is called as the file. `package_dirs`: folders of the packages it refers to; folders above the
-        file are searched too. `collisions`: draw its collision shapes in place of visuals.
+        file are searched too. `collisions`: draw its collision shapes in place of visuals. `scale`: how large it is
+        drawn; positions of its joints stay those of the robot, also where they slide.
         """
         where = path_of(path)
         name = name or where.stem[:_MAX_NAME]
         self._new_name(name)
         T_world_root = checked_pose(position, quaternion)
-        robot = read_urdf(where, name, T_world_root, package_dirs, collisions=collisions)
+        (factor,) = numbers("scale", [scale], 1, above=0.0)
+        robot = read_urdf(where, name, T_world_root, package_dirs, collisions=collisions, scale=factor)
         for body in robot.articulation.bodies:
             self._new_name(body)
         self._world.add_robot(robot)

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.parts import Loaded
 from iris_session.scene.references import References
 
-_GLTF: Final = frozenset({"glb", "gltf"})
+#: Endings that `load_file` reads; the others of trimesh are points, archives of anything, or hardly ever met.
+_GLTF: Final = ("glb", "gltf")
+MESHES: Final = ("3mf", "dae", "obj", "off", "ply", "stl")
+ROBOTS: Final = ("urdf",)
+#: What MuJoCo reads.
+MODELS: Final = ("mjb", "mjcf", "xml")
+ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
+#: Most files that an error text lists.
+_LISTED: Final = 8
 
 
 def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> Loaded:
     """The geometry of a file. Raises `SceneBuildError` for one that is missing, damaged, or of another form."""
-    kind = path.suffix.lower().lstrip(".")
+    kind = ending(path)
+    present(path)
+    if kind not in (*_GLTF, *MESHES):
+        raise SceneBuildError(f"{path.name}: {_other_reader(path, kind)}")
     references = References(path, package_dirs)
-    try:
-        found = _read(path, kind, references)
-    except SceneBuildError:
-        raise
-    except MemoryError:
-        raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
-    except Exception as error:  # damaged files make libraries raise anything, AssertionError too
-        raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {error}") from error
+    found: Loaded = guarded(path, kind, lambda: _read(path, kind, references))
     if not any(node.surfaces or node.lights or node.cameras for node in found.nodes):
         raise SceneBuildError(
             f"{path} has nothing that can be drawn" + "".join(f"; {text}" for text in found.skipped[:3])
@@ -33,14 +37,73 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> L
     return found
 
 
+def present(path: Path) -> None:
+    """Raises `SceneBuildError` unless there is a file with something in it."""
+    try:
+        if path.is_dir():
+            raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
+        if not path.is_file():
+            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder')}")
+        if not path.stat().st_size:
+            raise SceneBuildError(f"{path} is empty: 0 bytes")
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise SceneBuildError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
+    """What `read` returns. Damaged files make libraries raise anything, `AssertionError` too: `SceneBuildError`."""
+    try:
+        return read()
+    except SceneBuildError:
+        raise
+    except MemoryError:
+        raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
+    except IndexError as error:
+        raise SceneBuildError(f"{path} names something that it does not have ({error}): export it again") from error
+    except Exception as error:
+        text = " ".join(str(error).split())[:200]  # one line
+        raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {text}") from error
+
+
+def ending(path: Path) -> str:
+    """In lower case, without the dot."""
+    return path.suffix.lower().lstrip(".")
+
+
+def readable_in(folder: Path, where: str) -> str:
+    """For error texts: the files of a folder that can be read."""
+    try:
+        names = sorted(entry.name for entry in folder.iterdir() if ending(entry) in ENDINGS and entry.is_file())
+    except OSError:
+        return "" if folder.is_dir() else f"; there is no folder {folder} either"
+    if not names:
+        return f"; none {where} is of a kind that is read ({', '.join(ENDINGS)})"
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"; {where}: {', '.join(names[:_LISTED])}{more}"
+
+
+def _other_reader(path: Path, kind: str) -> str:
+    if kind in ROBOTS:
+        return "a URDF is a robot: use add_urdf"
+    if kind == "xacro":
+        return xacro_advice(path)
+    if kind in MODELS:
+        return f"files that end in .{kind} are MuJoCo's: Session({path.name!r}) shares one"
+    these = f"{', '.join((*_GLTF, *MESHES))}; urdf by add_urdf; {', '.join(MODELS)} by Session"
+    return f"files that end in .{kind} are not read. These are: {these}" if kind else f"no ending. Read are {these}"
+
+
+def xacro_advice(path: Path) -> str:
+    """How a URDF is made of xacro."""
+    stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+    return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
+
+
 def _read(path: Path, kind: str, references: References) -> Loaded:
     if kind in _GLTF:
         from iris_session.scene.gltf import read_gltf
 
         return read_gltf(path, references)
-    from iris_session.scene.trimesh_files import formats, read_with_trimesh
+    from iris_session.scene.trimesh_files import read_with_trimesh
 
-    if kind not in formats():
-        known = ", ".join(sorted({*formats(), *_GLTF}))
-        raise SceneBuildError(f"{path.name}: files that end in .{kind} are not read. These are: {known}")
     return read_with_trimesh(path, references)

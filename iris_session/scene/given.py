@@ -59,6 +59,9 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
         pixels = _texture(options["texture"])
         pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, Picture(pixels)),)
     values: dict[str, Any] = {name: numbers(name, [options[name]], 1)[0] for name in _NUMBERS if name in options}
+    for name, value in values.items():
+        if value < 0.0 or (value > 1.0 and name != "emission"):
+            raise SceneBuildError(f"{name} is {value:g}: {'0 or more' if name == 'emission' else 'from 0 to 1'}")
     if "roughness" in values and "shininess" not in values:  # for clients that do not draw by roughness
         values["shininess"] = min(max(1.0 - values["roughness"], 0.0), 1.0)
     plain = Look(
@@ -88,7 +91,8 @@ def path_of(path: Any) -> Path:
 def numbers(what: str, values: Any, count: int, *, above: float | None = None) -> tuple[float, ...]:
     """As many finite numbers, greater than `above`."""
     try:
-        found = tuple(float(v) for v in ((None,) if isinstance(values, str | bytes) else values))
+        texts = isinstance(values, str | bytes)  # whose digits would be taken for numbers
+        found = tuple(float(_no_text(v)) for v in ((None,) if texts else values))
     except (TypeError, ValueError):
         raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
     if len(found) != count or not np.isfinite(found).all():
@@ -96,6 +100,10 @@ def numbers(what: str, values: Any, count: int, *, above: float | None = None) -
     if above is not None and min(found) <= above:
         raise SceneBuildError(f"{what} is {values!r}: numbers greater than {above:g} are needed")
     return found
+
+
+def _no_text(value: Any) -> Any:
+    return None if isinstance(value, str | bytes) else value
 
 
 def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:

@@ -1,13 +1,15 @@
 """A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors open anywhere.
 
 Y is up there, so a root node turns the scene. Every mesh and texture is in the file once, however many bodies wear
-it. 2d textures are kept, with normals, roughness and the like; cubes and skies have no form in glTF and leave their
-colour. Groups that are hidden stay out. Cameras come along, and lights that are lit.
+it. 2d textures are kept, with normals, roughness and the like; cubes have no form in glTF and leave their mean colour,
+skies nothing. Groups that are hidden stay out. Cameras come along, and lights that are lit. `report.not_in_glb` says
+what of a scene is not in the file.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +24,7 @@ from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.collected import composed
+from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.glb_views import add_viewpoints
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
@@ -32,14 +35,28 @@ from iris_session.scene.store import AssetStore
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _REPEAT, _LINEAR, _MIPMAPS = 10497, 9729, 9987
+_LINES: Final = 1
+#: Lengths in a GLB have 32 bits; some are left for the heads of its parts.
+_MAX_BYTES: Final = (1 << 32) - 64
 #: Turns z up into y up: -90 degrees around x, `[x, y, z, w]` as glTF has quaternions.
 _Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 
 
 def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
-    """Writes the file; returns its size. Raises `AssetMissingError` when the store lacks an asset of the scene."""
+    """Writes the file, whole or not at all; returns its size. Raises `AssetMissingError` when the store lacks an asset
+    of the scene, `SceneBuildError` for a scene that is too large, and `OSError`."""
     data = _Glb(spec, store).finish()
-    path.write_bytes(data)
+    target = Path(os.path.realpath(path))  # a link stays one
+    if target.exists() and not target.is_file():  # a pipe or a device, or a folder, which says so
+        target.write_bytes(data)
+        return len(data)
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(data)
+        os.replace(part, target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
     return len(data)
 
 
@@ -59,6 +76,7 @@ class _Glb:
         self._meshes: dict[tuple[object, ...], int | None] = {}
         self._materials: dict[tuple[object, ...], int] = {}
         self._textures: dict[int, int] = {}
+        self._tints: dict[int, list[float]] = {}
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
         self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
@@ -78,7 +96,7 @@ class _Glb:
                     self._json["nodes"][node]["mesh"] = mesh
                     self._children(nodes[visual.body]).append(node)
         for index, deformable in enumerate(self._spec.deformables):
-            if deformable.dim > 1 and deformable.group in self._spec.groups_shown:
+            if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
                 node = self._node(deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
                 self._json["nodes"][node]["mesh"] = self._deformable(index)
                 self._children(0).append(node)
@@ -91,11 +109,18 @@ class _Glb:
         document = {key: value for key, value in self._json.items() if value != []}
         if not self._blob:
             del document["buffers"]
-        text = json.dumps(document, separators=(",", ":")).encode()
+        try:
+            text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+        except ValueError:
+            raise SceneBuildError("the scene has a number that is not finite, which glTF cannot hold") from None
         text += b" " * (-len(text) % 4)
         body = bytes(self._blob) + b"\0" * (-len(self._blob) % 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
         if body:
+            if len(chunks) + len(body) > _MAX_BYTES:
+                raise SceneBuildError(
+                    f"a GLB of {len(body) / 1e9:.1f} GB, they hold {_MAX_BYTES / 1e9:.1f} at most: export its parts"
+                )
             chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
@@ -141,8 +166,9 @@ class _Glb:
         return {**self._shared[key], "material": material}
 
     def _mapping(self, visual: Visual) -> tuple[object, ...] | None:
-        """What generated texture coordinates depend on, `None` where there is no 2d texture."""
-        if visual.material < 0:
+        """What generated texture coordinates depend on, `None` where there is no 2d texture, or a mesh has its own."""
+        mesh = visual.geometry.mesh
+        if visual.material < 0 or (mesh >= 0 and self._spec.meshes[mesh].textured):
             return None
         material = self._spec.materials[visual.material]
         worn = material.texture()
@@ -160,13 +186,17 @@ class _Glb:
         return primitive(geometry)
 
     def _deformable(self, index: int) -> int:
-        """The rest shape, from both sides."""
+        """The rest shape: surfaces, of cloths from both sides; ropes as lines."""
         deformable = self._spec.deformables[index]
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
+        material = self._material(deformable.material, deformable.rgba, both_sides=deformable.dim == 2)
+        if deformable.dim == 1:
+            attributes = {"POSITION": self._accessor(arrays["position"], "VEC3", bounds=True)}
+            rope = {"attributes": attributes, "indices": self._indices(arrays["elements"]), "mode": _LINES}
+            return self._add("meshes", {"primitives": [{**rope, "material": material}]})
         corners = arrays["position"][arrays["elements"]]
         normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), arrays.get("uv"))
-        material = self._material(deformable.material, deformable.rgba, both_sides=deformable.dim == 2)
         return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": material}]})
 
     def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
@@ -178,16 +208,19 @@ class _Glb:
             attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2")
         if mesh.color is not None:
             attributes["COLOR_0"] = self._accessor(_linear_colors(mesh.color), "VEC4")
-        index = self._add(
+        return {"attributes": attributes, "indices": self._indices(mesh.index)}
+
+    def _indices(self, index: NDArray[Any]) -> int:
+        data = np.ascontiguousarray(index, "<u4")
+        return self._add(
             "accessors",
             {
-                "bufferView": self._view(mesh.index.tobytes(), _INDICES),
+                "bufferView": self._view(data.tobytes(), _INDICES),
                 "componentType": _UINT,
-                "count": mesh.index.size,
+                "count": data.size,
                 "type": "SCALAR",
             },
         )
-        return {"attributes": attributes, "indices": index}
 
     def _accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
         accessor: dict[str, Any] = {
@@ -221,7 +254,8 @@ class _Glb:
         return self._materials[key]
 
     def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool) -> dict[str, Any]:
-        colour = [_linear(v) for v in rgba[:3]]
+        tint = [1.0] * 3 if index < 0 else self._tint(self._spec.materials[index].texture())
+        colour = [_linear(v * part) for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
         found: dict[str, Any] = {"pbrMetallicRoughness": look, "doubleSided": both_sides}
         if index >= 0:
@@ -249,6 +283,17 @@ class _Glb:
         if rgba[3] < 1:
             found["alphaMode"] = "BLEND"
         return found
+
+    def _tint(self, texture: int) -> list[float]:
+        """The mean colour of a cube, for which its coarsest level will do; white where there is none."""
+        if texture < 0 or self._spec.textures[texture].kind == TextureKind.IMAGE:
+            return [1.0] * 3
+        level = self._spec.textures[texture].levels[-1]
+        if texture not in self._tints and level.encoding != AssetEncoding.OPAQUE:
+            pixels = decode_image(self._store.get(level.address), level.encoding)
+            colours = np.broadcast_to(pixels[:, :, : 3 if pixels.shape[2] >= 3 else 1], (*pixels.shape[:2], 3))
+            self._tints[texture] = (colours.reshape(-1, 3).mean(axis=0) / 255.0).tolist()
+        return self._tints.get(texture, [1.0] * 3)
 
     def _texture(self, index: int) -> int | None:
         if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:

@@ -109,7 +109,11 @@ class _Reader:
         if isinstance(worn, dict):
             node.lights.append(self._light(worn.get("light"), node))
         if "camera" in entry:
-            node.cameras.append(self._camera(entry["camera"], node))
+            camera = self._camera(entry["camera"], node)
+            if camera.fovy > 0 and (camera.orthographic or camera.fovy < 180):
+                node.cameras.append(camera)
+            else:
+                self._skip(f"camera {node.name!r}: its angle of view is {camera.fovy:g} degrees")
         return node
 
     def _matrix(self, entry: dict[str, Any]) -> Matrix:
@@ -246,7 +250,9 @@ class _Reader:
             cutoff=math.degrees(self._looks.number(cone.get("outerConeAngle", math.pi / 4))),
             range=max(0.0, self._looks.number(entry.get("range", 0.0))),
             # of directional lights glTF gives lux, which has no place in the specification
-            intensity=0.0 if kind == LightKind.DIRECTIONAL else self._looks.number(entry.get("intensity", 1.0)),
+            intensity=0.0
+            if kind == LightKind.DIRECTIONAL
+            else max(0.0, self._looks.number(entry.get("intensity", 1.0))),
         )
 
     def _camera(self, index: object, node: Node) -> Camera:

@@ -23,8 +23,11 @@ from iris_session.scene.references import References, read_bounded
 
 _TYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_BOM: Final = b"\xef\xbb\xbf"
 #: Whole numbers that stand for 0..1 or -1..1, and what 1 is.
 _ONE: Final = {"i1": 127.0, "u1": 255.0, "i2": 32_767.0, "u2": 65_535.0}
+#: Most numbers of an accessor that has no bytes of its own: a file of a few hundred bytes can ask for any number.
+_MAX_ZEROS: Final = 1 << 24
 #: What is drawn as the file means it; others are listed as left out, or refused when the file requires them.
 KNOWN_EXTENSIONS: Final = frozenset(
     {
@@ -44,11 +47,15 @@ class GltfData:
         self.name = path.name
         self._references = references
         data = read_bounded(path)
+        if path.suffix.lower() == ".glb" and not data.startswith((b"glTF", b"{", _BOM)):
+            raise SceneBuildError(
+                f"{self.name} is no GLB: it begins with {data[:4]!r} where b'glTF' is needed; export it as glTF binary"
+            )
         text, self._chunk = _glb(data, path.name) if data[:4] == b"glTF" else (data, None)
         try:
             self.json: dict[str, Any] = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise SceneBuildError(f"{self.name} is no glTF: {error}") from None
+            raise SceneBuildError(f"{self.name} is no glTF, or cut: its document is no JSON: {error}") from None
         if not isinstance(self.json, dict) or not str(self._version()).startswith("2."):
             raise SceneBuildError(f"{self.name} is no glTF 2.0: export it again as that")
         unknown = sorted(set(map(str, self.json.get("extensionsRequired", ()))) - KNOWN_EXTENSIONS)
@@ -78,7 +85,7 @@ class GltfData:
             raise SceneBuildError(f"{self.name}: accessor {accessor} is none of the form that is needed there")
         if "bufferView" in entry:
             values = self._view_array(entry["bufferView"], entry.get("byteOffset", 0), dtype, count, width)
-        elif count * width * dtype.itemsize > MAX_FILE_BYTES:
+        elif count * width > _MAX_ZEROS:
             raise SceneBuildError(f"{self.name}: accessor {accessor} has {count} entries without bytes")
         else:
             values = np.zeros((count, width), dtype)

@@ -18,11 +18,9 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.gltf_data import GltfData
 from iris_session.scene.images import Pixels
 from iris_session.scene.parts import Look, Picture, cut
-from iris_session.scene.pictures import read_pixels, without_alpha
+from iris_session.scene.pictures import PixelBudget, read_pixels, without_alpha
 
 _REPEAT: Final = 10497
-#: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
-MAX_FILE_PIXELS: Final = 1 << 29
 Doubles = NDArray[np.float64]
 
 
@@ -46,7 +44,7 @@ class GltfLooks:
         self._skipped = skipped
         self._dresses: dict[object, Dress] = {}
         self._pictures: dict[tuple[object, ...], Picture] = {}
-        self._pixels = 0
+        self._budget = PixelBudget(data.name)
 
     def dress(self, material: object) -> Dress:
         """Of a primitive that names `material`, or none: then as glTF has it, white and rough."""
@@ -135,11 +133,7 @@ class GltfLooks:
         if kept not in self._pictures:
             name = cut(image.get("name") or texture.get("name") or "")
             pixels = read_pixels(self._data.picture_bytes(source), f"image {source} of {self._data.name}")
-            self._pixels += pixels.shape[0] * pixels.shape[1]
-            if self._pixels > MAX_FILE_PIXELS:
-                raise SceneBuildError(
-                    f"the images of {self._data.name} have more than {MAX_FILE_PIXELS:,} pixels together: shrink them"
-                )
+            self._budget.spend(pixels)
             self._pictures[kept] = Picture(pixels if change is None else change(pixels), name, colorspace=space)
         return self._pictures[kept]
 

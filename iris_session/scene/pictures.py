@@ -13,6 +13,25 @@ from iris_session.scene.parts import array_of
 
 #: Most pixels of one image: larger ones are no texture, or a bomb.
 MAX_PIXELS: Final = 1 << 26
+#: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
+MAX_FILE_PIXELS: Final = 1 << 29
+
+
+class PixelBudget:
+    """Counts the pixels of all pictures of the file `name`, each as often as it is kept."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._used = 0
+
+    def spend(self, pixels: Pixels) -> Pixels:
+        """`pixels`. Raises `SceneBuildError` when they are more than one file may have, with those before."""
+        self._used += pixels.shape[0] * pixels.shape[1]
+        if self._used > MAX_FILE_PIXELS:
+            raise SceneBuildError(
+                f"the images of {self._name} have more than {MAX_FILE_PIXELS:,} pixels together: shrink them"
+            )
+        return pixels
 
 
 def read_pixels(data: bytes, what: str) -> Pixels:

@@ -9,7 +9,10 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.scene import Body, SceneSpec, Totals
+from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, LightKind, TextureKind
 from iris_session.scene.budget import QUEST_3, Choice, choose_levels
+from iris_session.scene.extent import Extent
+from iris_session.scene.shapes import ENDLESS
 from iris_session.scene.totals import texture_memory, triangles
 
 #: How many heavy things are listed.
@@ -31,11 +34,14 @@ class Heavy(msgspec.Struct, frozen=True):
 
 
 class SceneReport(msgspec.Struct, frozen=True):
-    """`struggles`: what a Quest 3 will, in words; empty when nothing. `for_headset`: what the levels of detail make of
-    it (triangles, texture bytes, objects drawn, visuals left out)."""
+    """`extent`: of what is drawn at first. `struggles`: what a Quest 3 will, in words; empty when nothing.
+    `for_headset`: what the levels of detail make of it (triangles, texture bytes, objects drawn, visuals left out).
+    `skipped`: what clients are not given. `simplified`: what pictures of recordings and GLB files show otherwise.
+    """
 
     scene_hash: str
     totals: Totals
+    extent: Extent | None
     bodies: int
     moving: int
     kinds: dict[str, int]
@@ -43,15 +49,19 @@ class SceneReport(msgspec.Struct, frozen=True):
     struggles: tuple[str, ...]
     for_headset: dict[str, int]
     skipped: tuple[str, ...]
+    simplified: tuple[str, ...]
 
 
-def report(spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = ()) -> SceneReport:
+def report(
+    spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = (), extent: Extent | None = None
+) -> SceneReport:
     """The report of a scene."""
     choice = choose_levels(spec, QUEST_3)
     heavy = sorted((*_meshes(spec), *_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses))
     return SceneReport(
         scene_hash=scene_hash,
         totals=spec.totals,
+        extent=extent,
         bodies=len(spec.bodies) - 1,
         moving=sum(body.moving for body in spec.bodies),
         kinds=dict(Counter(visual.geometry.kind for visual in spec.visuals if visual.rgba[3] > 0)),
@@ -64,7 +74,31 @@ def report(spec: SceneSpec, scene_hash: str, skipped: tuple[str, ...] = ()) -> S
             "hidden": len(choice.hidden),
         },
         skipped=skipped,
+        simplified=simplified(spec),
     )
+
+
+def simplified(spec: SceneSpec) -> tuple[str, ...]:
+    """What clients draw, and pictures of recordings and GLB files do not, or otherwise; a line each."""
+    worn = {use.texture for material in spec.materials for use in material.textures}
+    cubes = sum(texture.kind != TextureKind.IMAGE for k, texture in enumerate(spec.textures) if k in worn)
+    found = [f"{cubes} cube textures: their mean colour is drawn"] if cubes else []
+    if spec.environment.skybox >= 0:
+        found.append("the skybox: nothing is drawn around the scene")
+    if any(light.kind == LightKind.IMAGE for light in spec.lights):
+        found.append("lights from all around (kind image): they do not shine")
+    return tuple(found)
+
+
+def not_in_glb(spec: SceneSpec) -> tuple[str, ...]:
+    """What is not in the GLB file of a scene, or otherwise; a line each."""
+    opaque = sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures)
+    found = [f"{opaque} textures in a form of their own (KTX): left out"] if opaque else []
+    if any(part.dim == 1 for part in spec.deformables):
+        found.append("ropes: lines without thickness")
+    if any(v.geometry.kind == GeometryKind.PLANE and 0.0 in v.geometry.size[:2] for v in spec.visuals):
+        found.append(f"planes without end: they end after {2 * ENDLESS:.0f} m")
+    return (*simplified(spec), *found)
 
 
 def tree(spec: SceneSpec) -> Iterator[str]:
@@ -96,7 +130,7 @@ def _meshes(spec: SceneSpec) -> Iterator[Heavy]:
         if uses[i] != 1:
             why += f", drawn {uses[i]} times"
         if len(mesh.levels) == 1 and level.triangles > 5_000:
-            why += ", no coarser level: it has texture coordinates"
+            why += ", no coarser level: it has texture coordinates or colours"
         yield Heavy("mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why)
 
 
@@ -105,6 +139,7 @@ def _textures(spec: SceneSpec) -> Iterator[Heavy]:
     for visual in spec.visuals:
         if visual.material >= 0:
             uses.update(use.texture for use in spec.materials[visual.material].textures)
+    uses.update(texture for texture in (spec.environment.skybox, *(light.texture for light in spec.lights)))
     for i, texture in enumerate(spec.textures):
         level, memory = texture.levels[0], texture_memory(texture, texture.levels[0])
         why = f"{level.width} x {level.height} {texture.kind}: {memory / _MIB:.1f} MiB on a graphics card"

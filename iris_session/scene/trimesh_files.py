@@ -1,4 +1,4 @@
-"""Mesh files that trimesh reads: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF and others. Not glTF: see `gltf`.
+"""Mesh files that trimesh reads: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF. Not glTF: see `gltf`.
 
 Colours are taken as they stand in the file. Where it has no normals they are made as MuJoCo makes them, with creases.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import math
 import re
-import zipfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,10 +17,10 @@ from numpy.typing import NDArray
 from iris_session.protocol.scene_looks import Rgba
 from iris_session.protocol.scene_names import TextureRole
 from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.mesh_bytes import CHECKS, absolute_corners
 from iris_session.scene.meshes import index_corners, unique_rows
 from iris_session.scene.parts import (
     GREY,
-    MAX_FILE_BYTES,
     MAX_NODES,
     MAX_TRIANGLES,
     Loaded,
@@ -31,46 +30,58 @@ from iris_session.scene.parts import (
     Surface,
     cut,
 )
-from iris_session.scene.pictures import pixels_of
+from iris_session.scene.pictures import PixelBudget, pixels_of
 from iris_session.scene.references import References, read_bounded
 from iris_session.scene.simplify import creased_normals, unit
 from iris_session.scene.surfaces import recoloured
+from iris_session.scene.xml_files import check_3mf, check_dae
 
-#: Formats of trimesh that are points, or archives of anything.
-_OTHER: Final = frozenset({"glb", "gltf", "xyz", "zip", "tar.gz", "tar.bz2", "bz2", "zae", "svg", "dxf"})
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
-
-
-def formats() -> tuple[str, ...]:
-    """Endings that are read here, without the dot."""
-    return tuple(sorted(set(_trimesh().exchange.load.mesh_formats()) - _OTHER))
+_USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+_DEFINED: Final = re.compile(rb"^[ \t]*newmtl[ \t]+(\S[^\r\n]*)", re.MULTILINE | re.IGNORECASE)
+_LIBRARIES: Final = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+#: What an MTL file may map on a surface besides its colour; the picture of `map_ka` is that of the colour.
+_MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
 
 
 def read_with_trimesh(path: Path, references: References) -> Loaded:
-    """The file. Raises `SceneBuildError`."""
+    """The file. Raises `SceneBuildError`, and whatever trimesh raises for damaged ones."""
     trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
-    data = read_bounded(path)
-    _check(path, kind, data)
+    data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    try:
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    except IndexError:
+        if kind == "obj":
+            absolute_corners(path.name, data)  # says which
+        raise
     reader = _Reader(trimesh, path.name)
     nodes = reader.nodes(scene)
-    skipped = (*(f"{path.name}: {text}" for text in resolver.missing), *reader.skipped)
-    return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), skipped)
+    lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
+    return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
 
 
-def _check(path: Path, kind: str, data: bytes) -> None:
+def _checked(name: str, kind: str, data: bytes) -> bytes:
     if kind == "dae":
         try:
             import collada  # noqa: F401
         except ImportError:
-            raise SceneBuildError(f"{path.name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
-        if b"<!DOCTYPE" in data:  # whose entities may be other files
-            raise SceneBuildError(f"{path.name} has a DOCTYPE: remove it")
-    if zipfile.is_zipfile(io.BytesIO(data)):
-        size = sum(entry.file_size for entry in zipfile.ZipFile(io.BytesIO(data)).infolist())
-        if size > MAX_FILE_BYTES:
-            raise SceneBuildError(f"{path.name} unpacks to {size >> 20} MiB, at most {MAX_FILE_BYTES >> 20} are read")
+            raise SceneBuildError(f"{name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
+        check_dae(name, data)
+    if kind == "3mf":
+        check_3mf(name, data)
+    return CHECKS[kind](name, data) if kind in CHECKS else data
+
+
+def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
+    """Materials that no MTL file has, if there is one: without any, whoever shows the OBJ says how it looks."""
+    libraries = {found.strip() for found in _LIBRARIES.findall(data)}
+    several = (f"{name}: its MTL files but for the first of {len(libraries)}",) if len(libraries) > 1 else ()
+    if not resolver.materials:
+        return several
+    lost = sorted({found.strip() for found in _USED.findall(data)} - resolver.materials)
+    names = ", ".join(cut(found.decode(errors="replace")) for found in lost[:5])
+    return (*several, *([f"{name}: materials that its MTL file does not have: {names}"] if lost else []))
 
 
 def _up(kind: str, data: bytes) -> str:
@@ -78,7 +89,7 @@ def _up(kind: str, data: bytes) -> str:
     if kind != "dae":
         return "z"
     found = _UP.search(data)
-    return "z" if found and found.group(1) == b"Z" else "y"
+    return found.group(1).decode().lower() if found else "y"
 
 
 def _unit(trimesh: Any, scene: Any) -> float:
@@ -91,6 +102,7 @@ class _Reader:
         self._name = name
         self._looks: dict[int, Look | None] = {}
         self._pictures: dict[int, Picture] = {}
+        self._budget = PixelBudget(name)
         self.skipped: list[str] = []
 
     def nodes(self, scene: Any) -> tuple[Node, ...]:
@@ -120,6 +132,9 @@ class _Reader:
         faces = np.ascontiguousarray(geometry.faces, np.int64)
         if not np.isfinite(points).all():
             raise SceneBuildError(f"{self._name}: a vertex of {name} is not finite")
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(points):
+            wrong = int(faces.min()) if faces.min() < 0 else int(faces.max())
+            raise SceneBuildError(f"{self._name}: a triangle of {name} names vertex {wrong} of {len(points)}")
         visual = geometry.visual
         uv: NDArray[np.float32] | None = None
         color: NDArray[np.uint8] | None = None
@@ -164,6 +179,8 @@ class _Reader:
             rgba = _rgba(material.diffuse)
         alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
         pictures = self._picture(material.image)
+        if maps := ", ".join(sorted(key for key in more if _other_map(key))):
+            self.skipped.append(f"{self._name}: of material {cut(material.name)} the pictures {maps}")
         specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
         shine = 0.5 if specular is None else float(np.mean(specular))
         return Look(
@@ -193,7 +210,8 @@ class _Reader:
         if image is None:
             return ()
         if id(image) not in self._pictures:
-            self._pictures[id(image)] = Picture(pixels_of(image, f"a picture of {self._name}"))
+            pixels = pixels_of(image, f"a picture of {self._name}")
+            self._pictures[id(image)] = Picture(self._budget.spend(pixels))
         picture = self._pictures[id(image)]
         return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
 
@@ -204,6 +222,11 @@ def _rgba(color: Any) -> Rgba:
         return GREY
     red, green, blue, alpha = (float(v) / 255 for v in np.asarray(color).reshape(-1)[:4])
     return red, green, blue, alpha
+
+
+def _other_map(key: str) -> bool:
+    """Whether a word of an MTL file stands for a picture of something else than the colour."""
+    return key in _MAPS or (key.startswith("map_") and key not in ("map_kd", "map_ka"))
 
 
 def _first(value: Any, default: float) -> float:
@@ -221,13 +244,17 @@ def _resolver(trimesh: Any, references: References) -> Any:
     class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
         def __init__(self) -> None:
             self.missing: list[str] = []
+            self.materials: set[bytes] = set()  # names that MTL files define
 
         def get(self, name: str) -> bytes:
             try:
-                return read_bounded(references.find(str(name).strip()))
+                data = read_bounded(references.find(str(name).strip()))
             except SceneBuildError as error:
                 self.missing.append(str(error))
                 raise
+            if str(name).strip().lower().endswith(".mtl"):
+                self.materials.update(found.strip() for found in _DEFINED.findall(data))
+            return data
 
         def write(self, name: str, data: Any) -> None:
             raise SceneBuildError("nothing is written where files are read")

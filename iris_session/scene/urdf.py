@@ -1,15 +1,14 @@
 """URDF files: links that fixed joints hold together as one body each, joints with limits and mimics, what is drawn.
 
-XML is read by yourdfpy, the meshes by our own readers, as they stand in their files (no axis of theirs is turned up, as
-in ROS). A mesh with colours of its own keeps them; others have the material of the URDF.
+XML is read by yourdfpy (`urdf_xml`), the meshes by our own readers, as they stand in their files (no axis of theirs is
+turned up, as in ROS). A mesh with colours of its own keeps them; others have the material of the URDF.
 """
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -21,13 +20,13 @@ from iris_session.protocol.scene_looks import Rgba
 from iris_session.protocol.scene_names import GeometryKind, TextureRole
 from iris_session.scene.articulation import Articulation, Part
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.files import load_file
+from iris_session.scene.files import ending, guarded, load_file, present, xacro_advice
 from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, cut, pose_of
-from iris_session.scene.pictures import read_pixels
+from iris_session.scene.pictures import PixelBudget, read_pixels
 from iris_session.scene.references import References, read_bounded
 from iris_session.scene.urdf_joints import read_joints, root_link
+from iris_session.scene.urdf_xml import parsed
 
-_SHAPES: Final = frozenset({"box", "cylinder", "sphere", "mesh"})
 #: Joints that leave their link where it is: nothing sets them.
 _STILL: Final = frozenset({"fixed", "floating", "planar"})
 
@@ -48,73 +47,51 @@ def read_urdf(
     package_dirs: Sequence[str | PathLike[str]] = (),
     *,
     collisions: bool = False,
+    scale: float = 1.0,
 ) -> Robot:
-    """The robot under `name`: its bodies are called `name/link`. `collisions`: draw these instead of visuals.
+    """The robot under `name`: its bodies are called `name/link`. `collisions`: draw these instead of visuals. `scale`:
+    how large it is drawn; joints keep their positions, also those that slide.
 
     Raises `SceneBuildError`.
     """
+    present(path)
+    if ending(path) == "xacro":
+        raise SceneBuildError(f"{path.name}: {xacro_advice(path)}")
     references = References(path, package_dirs)
     data = read_bounded(path)
-    try:
-        robot, skipped = _parsed(path, data)
+
+    def read() -> Robot:  # yourdfpy raises whatever the missing attribute leads to
+        robot, skipped = parsed(path, data)
         return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root)
-    except SceneBuildError:
-        raise
-    except Exception as error:  # yourdfpy raises whatever the missing attribute leads to
-        raise SceneBuildError(f"{path} is damaged, or no URDF: {type(error).__name__}: {error}") from error
+
+    found: Robot = guarded(path, "urdf", read)
+    return found if scale == 1.0 else _scaled(found, scale)
 
 
-def _parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
-    """What yourdfpy makes of it, and shapes that it does not know, taken out before."""
-    try:
-        import yourdfpy
-        from lxml import etree
-    except ImportError:
-        raise SceneBuildError("URDF files need yourdfpy: pip install 'iris-session[files]'") from None
-    root = _xml(etree, path, data)
-    if root.getroottree().docinfo.doctype:
-        raise SceneBuildError(f"{path} has a DOCTYPE: remove it")
-    if root.tag != "robot":
-        raise SceneBuildError(f"{path} is no URDF: it begins with <{root.tag}> where <robot> is needed")
-    if any("xacro" in str(space) for space in root.nsmap.values()) and b"<xacro:" in data:
-        raise SceneBuildError(f"{path} is xacro: make URDF of it first (xacro {path.name} > robot.urdf)")
-    skipped: dict[str, None] = {}
-    for holder in [*root.iter("visual"), *root.iter("collision")]:
-        geometry = holder.find("geometry")
-        shape = (
-            next((child.tag for child in geometry if isinstance(child.tag, str)), "") if geometry is not None else ""
+def _scaled(robot: Robot, scale: float) -> Robot:
+    """The same robot in another size."""
+
+    def at(pose: Pose) -> Pose:
+        x, y, z = pose.p
+        return Pose((scale * x, scale * y, scale * z), pose.q)
+
+    parts = []
+    for part in robot.articulation.parts:
+        slide = scale if part.sliding else 1.0
+        parts.append(
+            part._replace(
+                T_parent_joint=at(part.T_parent_joint), multiplier=slide * part.multiplier, offset=slide * part.offset
+            )
         )
-        if shape not in _SHAPES:
-            link = holder.getparent().get("name", "")
-            skipped[f"{path.name}: {holder.tag} of link {link}: shape {shape or 'none'!r}"] = None
-            holder.getparent().remove(holder)
-    made = yourdfpy.URDF.load(
-        io.BytesIO(etree.tostring(root)),
-        build_scene_graph=False,
-        build_collision_scene_graph=False,
-        load_meshes=False,
-        load_collision_meshes=False,
-    )
-    return made.robot, skipped
-
-
-def _xml(etree: Any, path: Path, data: bytes) -> Any:
-    """The document, without what has a prefix that nobody declared: extensions of one simulator, often found so."""
-    safe = {"resolve_entities": False, "no_network": True, "huge_tree": False}
-    parser = etree.XMLParser(**safe)
-    try:
-        return etree.fromstring(data, parser)
-    except etree.XMLSyntaxError as error:
-        if any(entry.domain_name != "NAMESPACE" for entry in parser.error_log):
-            raise SceneBuildError(f"{path} is no XML: {error}") from None
-    root = etree.fromstring(data, etree.XMLParser(recover=True, **safe))
-    for element in list(root.iter(etree.Element)):
-        if element.prefix is None and ":" in element.tag and not element.tag.startswith("{"):
-            element.getparent().remove(element)
-            continue
-        for name in [name for name in element.attrib if ":" in name and not name.startswith("{")]:
-            del element.attrib[name]
-    return root
+    items = []
+    for item in robot.items:
+        matrix = item.matrix.copy()
+        matrix[:3, 3] *= scale
+        if item.mesh is not None:
+            matrix[:3, :3] *= scale
+        x, y, z = (scale * side for side in item.size)
+        items.append(replace(item, matrix=matrix, size=(x, y, z)))
+    return replace(robot, articulation=replace(robot.articulation, parts=tuple(parts)), items=tuple(items))
 
 
 class _Reader:
@@ -135,6 +112,7 @@ class _Reader:
         self._files: dict[Path, Loaded] = {}
         self._looks: dict[str, Look | None] = {}
         self._pictures: dict[Path, Picture] = {}
+        self._budget = PixelBudget(path.name)
         self._materials: dict[str, Any] = {}
         worn = (visual.material for link in robot.links for visual in link.visuals)
         for material in (*robot.materials, *worn):
@@ -244,7 +222,8 @@ class _Reader:
             return ()
         path = self._references.find(texture.filename)
         if path not in self._pictures:
-            self._pictures[path] = Picture(read_pixels(read_bounded(path), str(path)), cut(path.stem))
+            pixels = self._budget.spend(read_pixels(read_bounded(path), str(path)))
+            self._pictures[path] = Picture(pixels, cut(path.stem))
         picture = self._pictures[path]
         return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
 

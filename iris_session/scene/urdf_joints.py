@@ -13,6 +13,7 @@ from iris_session.scene.articulation import Joint
 from iris_session.scene.errors import SceneBuildError
 
 _MOVING: Final = frozenset({"revolute", "continuous", "prismatic"})
+_TREE: Final = "a URDF is a tree, leave one of them out (closed chains: in MJCF, one joint as an equality constraint)"
 _KNOWN: Final = _MOVING | {"fixed", "floating", "planar"}
 
 
@@ -39,26 +40,45 @@ def root_link(file: str, robot: Any) -> str:
     if len(set(names)) != len(names) or not names:
         raise SceneBuildError(f"{file}: no link, or two of one name: {_repeated(names)}")
     held: dict[str, str] = {}
+    known = set(names)
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
-            if link not in names:
+            if link not in known:
                 raise SceneBuildError(f"{file}: joint {joint.name} refers to link {link!r}, which is not there")
         if joint.child in held:
-            raise SceneBuildError(f"{file}: link {joint.child} hangs on two joints, {held[joint.child]}, {joint.name}")
+            raise SceneBuildError(
+                f"{file}: link {joint.child} hangs on two joints, {held[joint.child]} and {joint.name}: {_TREE}"
+            )
         held[joint.child] = joint.name
     roots = [name for name in names if name not in held]
-    if len(roots) != 1:
-        raise SceneBuildError(f"{file}: one link hangs on no joint in a URDF, here these do: {roots or 'none'}")
+    if len(roots) > 1:
+        raise SceneBuildError(
+            f"{file}: {len(roots)} links hang on no joint ({', '.join(roots[:8])}): in a URDF one does, join the others"
+        )
     below: dict[str, list[str]] = {}
     for joint in robot.joints:
         below.setdefault(joint.parent, []).append(joint.child)
-    reached, waiting = 0, roots.copy()
+    reached, waiting = set(roots), roots.copy()
     while waiting:
-        reached += 1
-        waiting += below.get(waiting.pop(), [])
-    if reached != len(names):
-        raise SceneBuildError(f"{file}: {len(names) - reached} links hang on one another in a loop")
+        found = below.get(waiting.pop(), [])
+        reached.update(found)
+        waiting += found
+    if len(reached) != len(names):
+        joints = _loop(robot, next(name for name in names if name not in reached))
+        raise SceneBuildError(f"{file}: the joints {', '.join(joints[:8])} make a loop: {_TREE}")
     return str(roots[0])
+
+
+def _loop(robot: Any, link: str) -> list[str]:
+    """The joints of the loop that a link hangs in or below, from link to link."""
+    above = {joint.child: (joint.parent, joint.name) for joint in robot.joints}
+    places: dict[str, int] = {}
+    joints: list[str] = []
+    while link not in places:
+        places[link] = len(joints)
+        link, name = above[link]
+        joints.append(name)
+    return joints[places[link] :][::-1]
 
 
 def read_joints(file: str, robot: Any) -> JointTable:

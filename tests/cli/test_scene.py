@@ -41,11 +41,79 @@ def test_export_of_files_and_models(tmp_path: Path, capsys: pytest.CaptureFixtur
             assert extents == pytest.approx([1, 2, 3], abs=1e-6)
 
 
+def test_inspect_says_how_large_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    box = tmp_path / "box.stl"
+    mesh = trimesh.creation.box((30, 20, 10))
+    mesh.apply_translation((0, 0, 5))
+    mesh.export(box)
+    assets = ("--assets", tmp_path / "assets")
+    assert run("scene", "inspect", box, *assets) == 0
+    shown = capsys.readouterr().out
+    assert "extent: 30 x 20 x 10 m along x, y, z, from (-15, -10, 0) to (15, 10, 10), planes not counted" in shown
+    assert "size: 30 m large: in millimetres where metres are meant? --scale 0.001 makes it 30 mm" in shown
+    assert run("scene", "inspect", box, *assets, "--scale", "0.001", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["extent"]["size"] == pytest.approx([0.03, 0.02, 0.01])
+    assert found["unit_hint"] == ""
+    assert run("scene", "inspect", box, *assets, "--scale", "0.00001", "--json") == 0
+    assert "--scale 1000 makes it 0.3 m" in json.loads(capsys.readouterr().out)["unit_hint"]
+
+
+def test_meshes_in_millimetres_are_noticed_in_robots_and_models(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trimesh.creation.box((300, 200, 100)).export(tmp_path / "box.stl")
+    mesh = '<visual><geometry><mesh filename="box.stl"/></geometry></visual>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm"><link name="base">{mesh}</link></robot>')
+    geom = '<asset><mesh file="box.stl"/></asset><worldbody><geom type="mesh" mesh="box"/></worldbody>'
+    (tmp_path / "model.xml").write_text(f"<mujoco>{geom}</mujoco>")
+    ground = '<geom type="box" size="30 30 .1"/>'
+    (tmp_path / "hall.xml").write_text(f"<mujoco><worldbody>{ground}</worldbody></mujoco>")
+    wanted = 'size: its largest mesh is 300 m large: in millimetres where metres are meant? scale="0.001 0.001 0.001"'
+    for name in ("arm.urdf", "model.xml", "hall.xml"):
+        assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") == 0
+        assert (wanted in capsys.readouterr().out) == (name != "hall.xml")
+
+
+def test_export_says_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "sky.xml"
+    texture = '<texture name="{}" type="{}" builtin="gradient" rgb1="1 0 0" rgb2="0 0 1" width="8" height="48"/>'
+    model.write_text(
+        f"<mujoco><asset>{texture.format('sky', 'skybox')}{texture.format('cube', 'cube')}"
+        '<material name="m" texture="cube"/></asset><worldbody><geom type="plane" size="0 0 1" material="m"/>'
+        "</worldbody></mujoco>"
+    )
+    out, assets = tmp_path / "out.glb", ("--assets", tmp_path / "assets")
+    assert run("scene", "export", model, out, *assets, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["file"], found["bytes"], found["skipped"]) == (str(out), out.stat().st_size, [])
+    assert [text.partition(":")[0] for text in found["simplified"]] == [
+        "1 cube textures",
+        "the skybox",
+        "planes without end",
+    ]
+    assert run("scene", "export", model, out, *assets) == 0
+    assert "in the GLB: the skybox" in capsys.readouterr().err
+    assert run("scene", "inspect", model, *assets) == 0
+    assert "in recordings and GLB: 1 cube textures: their mean colour is drawn" in capsys.readouterr().out
+
+
+def test_export_does_not_write_over_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = furniture(tmp_path / "part.glb")
+    before = part.read_bytes()
+    (tmp_path / "link.glb").symlink_to(part)
+    (tmp_path / "hard.glb").hardlink_to(part)
+    for name in ("part.glb", "link.glb", "hard.glb", "../" + tmp_path.name + "/part.glb"):
+        assert run("scene", "export", part, tmp_path / name, "--assets", tmp_path / "assets") == 2
+        assert "is the file that is read: name another one to write" in capsys.readouterr().err
+    assert part.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
         ("lost.glb", None, "no such file"),
-        ("a.step", b"", "are not read. These are: "),
+        ("a.step", b"x", "are not read. These are: "),
         ("a.glb", b"glTF", "it is cut"),
         (
             "a.urdf",

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
-from iris_session.cli.serve import file_to_show
+from iris_session.cli.scene_files import file_of
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -22,14 +23,47 @@ def part(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_mujoco_simulates_or_is_not_there_is_no_file_to_show(tmp_path: Path, part: Path) -> None:
-    for name in ("scene.xml", "scene.MJCF", "scene.mjb", "handover"):
+def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("scene.xml", "scene.MJCF", "scene.mjb"):
         (tmp_path / name).write_text("")
-        assert file_to_show(str(tmp_path / name)) is None
-    assert file_to_show(str(part)) == part
-    assert file_to_show(str(tmp_path / "missing.glb")) is None
-    assert file_to_show(str(tmp_path)) is None
-    assert file_to_show(None) is None
+        assert file_of(str(tmp_path / name)) is None
+    assert file_of(str(part)) == part
+    (tmp_path / "arms3").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert file_of("arms3") is None, "a folder is not in the way of a scene's name"
+    assert file_of("nowhere") is None, "whoever looks for names says what there is"
+    assert file_of("missing.xml") is None
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert file_of(f"~/{part.name}") == part
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("missing.glb", "no such file; in its folder: Part no. 1.off, a.glb, b.urdf, c.xml"),
+        ("lost/missing.glb", "no such file; there is no folder"),
+        (".", "is a folder: name a file; in it: Part no. 1.off, a.glb, b.urdf, c.xml"),
+        ("folder.glb", "is a folder: name a file; none in it is of a kind that is read"),
+        (
+            "part.docx",
+            "part.docx: files that end in .docx are not read. These are: 3mf, dae, glb, gltf, mjb, mjcf, obj,",
+        ),
+        ("part", "part: a file without an ending"),
+        ("empty.glb", "is empty: 0 bytes"),
+        ("arm.urdf.xacro", "xacro arm.urdf.xacro > arm.urdf"),
+    ],
+)
+def test_what_is_no_file_is_told_with_what_there_is(tmp_path: Path, part: Path, name: str, says: str) -> None:
+    for there in ("a.glb", "b.urdf", "c.xml", "part.docx", "part", "arm.urdf.xacro"):
+        (tmp_path / there).write_text("x")
+    (tmp_path / "folder.glb").mkdir()
+    if name == "empty.glb":
+        (tmp_path / name).write_text("")
+    with pytest.raises(CommandError) as raised:
+        file_of(str(tmp_path / name))
+    assert says in str(raised.value)
+    assert raised.value.status == 2
+    assert part.is_file()
 
 
 @pytest.mark.parametrize("name", ["part.off", "arm.urdf"])
@@ -40,7 +74,39 @@ def test_a_file_is_shown_until_the_end(name: str, tmp_path: Path, capfd: pytest.
     out, errors = capfd.readouterr()
     assert json.loads(out)["ok"]
     assert f"session '{path.stem}' on 127.0.0.1:" in errors
-    assert f"showing {name}, which nobody drives" in errors
+    extent = "0.2 x 0.2 x 0.2 m" if name.endswith("urdf") else "1 x 1 x 0 m"
+    assert f"showing {name}, which nobody drives; its extent is {extent}" in errors
+    assert "size:" not in errors
+
+
+def test_a_file_in_millimetres_is_noticed_and_scaled(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "part.off"
+    path.write_text(TRIANGLE.replace("1 0 0", "120 0 0").replace("0 1 0", "0 40 0"))
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    assert (
+        "size: 120 m large: in millimetres where metres are meant? --scale 0.001 makes it 120 mm"
+        in capfd.readouterr().out
+    )
+    assert main(["serve", str(path), "--scale", "0.001", "--seconds", "0.1", *QUIET]) == 0
+    out = capfd.readouterr().out
+    assert "its extent is 0.12 x 0.04 x 0 m" in out
+    assert "size:" not in out
+
+
+@pytest.mark.parametrize("given", ["0", "-1", "nan", "inf", "small"])
+def test_a_scale_that_is_none_is_refused(given: str, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as raised:
+        main(["serve", str(part), f"--scale={given}", *QUIET])
+    assert raised.value.code == 2
+    assert "is no factor: a number above 0, 0.001 for a file in millimetres" in capsys.readouterr().err
+
+
+def test_what_mujoco_simulates_is_not_scaled(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (("serve", "handover"), ("scene", "inspect", "scene.xml")):
+        assert main([*arguments, "--scale", "2"]) == 2
+        error = capsys.readouterr().err
+        assert f"--scale: MuJoCo simulates {arguments[-1]}, and in another size it would move otherwise" in error
+        assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -69,6 +135,8 @@ def test_a_package_elsewhere_is_named(tmp_path: Path, capfd: pytest.CaptureFixtu
     capfd.readouterr()
     assert main(["serve", "handover", *named, *QUIET]) == 2
     assert "--package-dir goes with a file to show" in capfd.readouterr().err
+    assert main(["serve", str(arm), "--package-dir", str(tmp_path / "nodir"), *QUIET]) == 2
+    assert capfd.readouterr().err == f"iris-session: --package-dir {tmp_path / 'nodir'}: no such folder\n"
 
 
 @pytest.mark.parametrize(

@@ -166,18 +166,27 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "data", "text"),
     [
-        ("a.stl", b"", "nothing that can be drawn|damaged"),
-        ("a.stl", b"solid x\nfacet", "nothing that can be drawn|damaged"),
-        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "nothing|damaged"),
+        ("a.stl", b"", "is empty: 0 bytes"),
+        ("a.stl", b"solid x\nfacet", "is cut: an STL of text ends with endsolid"),
+        ("a.stl", b"\x89PNG", "is cut, or no STL"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "cut: its head says 9 lines, and it has 0"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "outside the range of its vertices"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
         ("a.dae", b"<COLLADA>", "damaged"),
         ("a.dae", b"<!DOCTYPE COLLADA [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><COLLADA/>", "has a DOCTYPE"),
-        ("a.3mf", b"PK\3\4", "damaged"),
+        ("a.dae", "<COLLADA/>".encode("utf-16"), "no XML in UTF-8"),
+        ("a.dae", b"<?xml version='1.0' encoding='UTF-7'?><COLLADA/>", "no XML in UTF-8"),
+        ("a.3mf", b"PK\3\4", "is cut, or no 3MF"),
         ("a.glb", b"glTF", "cut"),
+        ("a.glb", b"", "is empty: 0 bytes"),
+        ("a.glb", b"\x89PNG", "no GLB: it begins with .* where b'glTF' is needed"),
         ("a.gltf", b"[]", "no glTF"),
         ("a.gltf", b"{", "no glTF"),
-        ("a.step", b"", "are not read. These are: "),
-        ("a", b"", "are not read"),
+        ("a.step", b"x", r"are not read\. These are: glb, .*, stl; urdf by add_urdf; mjb, mjcf, xml by Session"),
+        ("a", b"x", "no ending"),
+        ("a.urdf", b"<robot/>", "a URDF is a robot: use add_urdf"),
+        ("a.xml", b"<mujoco/>", r"are MuJoCo's: Session\('a\.xml'\) shares one"),
+        ("a.urdf.xacro", b"<robot/>", r"xacro a\.urdf\.xacro > a\.urdf \(ROS has it; else pip install xacro\)"),
     ],
 )
 def test_what_is_no_such_file_is_refused(tmp_path: Path, name: str, data: bytes, text: str) -> None:
@@ -190,13 +199,13 @@ def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(SceneBuildError, match="no such file"):
         load_file(tmp_path / "lost.stl")
     (tmp_path / "folder.stl").mkdir()
-    with pytest.raises(SceneBuildError, match="no such file"):
+    with pytest.raises(SceneBuildError, match=r"is a folder: name a file; none in it is of a kind .* \(3mf, "):
         load_file(tmp_path / "folder.stl")
     with (tmp_path / "large.stl").open("wb") as file:
         file.truncate(MAX_FILE_BYTES + 1)
     with pytest.raises(SceneBuildError, match="at most 512 MiB"):
         load_file(tmp_path / "large.stl")
-    monkeypatch.setattr("iris_session.scene.trimesh_files.MAX_FILE_BYTES", 4 << 20)
+    monkeypatch.setattr("iris_session.scene.xml_files.MAX_FILE_BYTES", 4 << 20)
     with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a", bytes(5 << 20))
     with pytest.raises(SceneBuildError, match="unpacks to 5 MiB, at most 4 are read"):

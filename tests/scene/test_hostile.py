@@ -16,7 +16,7 @@ PIXELS = np.random.default_rng(3).integers(0, 255, (8, 16, 3), dtype=np.uint8)
 
 
 def test_many_large_images_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("iris_session.scene.gltf_looks.MAX_FILE_PIXELS", 3 * 8 * 16)
+    monkeypatch.setattr("iris_session.scene.pictures.MAX_FILE_PIXELS", 3 * 8 * 16)
     document = Document()
     for _ in range(4):
         texture = document.image(PIXELS)

@@ -1,0 +1,145 @@
+"""How large a scene is: the box of what is drawn as it begins, and whether that looks like a mistake of units.
+
+Planes are not counted: a floor is as large as one likes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Vec3
+from iris_session.protocol.scene import Geometry, SceneSpec, Visual
+from iris_session.protocol.scene_names import ArrayKind, GeometryKind
+from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.meshes import decode_mesh
+from iris_session.scene.parts import matrix_of, vec3
+from iris_session.scene.store import AssetStore
+
+#: No part and no robot is larger, few rooms are; a part of a centimetre whose file counts in millimetres is.
+LARGEST_M: Final = 10.0
+#: Nobody can see or grasp what is smaller; a part of two metres that was divided by 1,000 once too often is.
+SMALLEST_M: Final = 0.002
+Points = NDArray[Any]
+
+
+class Extent(msgspec.Struct, frozen=True):
+    """A box in the world: lowest and highest corner, lengths of its sides [m]."""
+
+    low: Vec3
+    high: Vec3
+    size: Vec3
+
+
+def extent_of(spec: SceneSpec, store: AssetStore) -> Extent | None:
+    """Of what is drawn at first, by the vertices of its meshes; `None` where nothing is, planes apart.
+
+    Raises `AssetMissingError` when the store lacks an asset of the scene.
+    """
+    shown = [v for v in spec.visuals if v.rgba[3] > 0 and v.group in spec.groups_shown]
+    bending = (
+        decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)["position"]
+        for part in spec.deformables
+        if part.rgba[3] > 0 and part.group in spec.groups_shown
+    )
+    return bounds(
+        spec, shown, lambda mesh: decode_mesh(store.get(spec.meshes[mesh].levels[0].address)).position, bending
+    )
+
+
+def box_extent(spec: SceneSpec, more: Iterable[Points] = ()) -> Extent | None:
+    """Of everything, meshes by the boxes around them: no asset is read, and what is turned counts as up to 1.7 times as
+    large. `more`: further points (n, 3) [m]."""
+    return bounds(spec, spec.visuals, lambda k: _corners(spec.meshes[k].low, spec.meshes[k].high), more)
+
+
+def bounds(
+    spec: SceneSpec, visuals: Iterable[Visual], points_of: Callable[[int], Points], more: Iterable[Points] = ()
+) -> Extent | None:
+    """Box of `visuals` in the world, of meshes by `points_of` their number (n, 3), and of `more` points (n, 3)."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    T_world_body = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    mesh, points = -1, np.empty((0, 3))
+    for visual in sorted(visuals, key=lambda v: v.geometry.mesh):  # one mesh in memory at a time
+        if visual.geometry.kind == GeometryKind.PLANE:
+            continue
+        T = T_world_body[visual.body] @ matrix_of(visual.T_body_visual)
+        if visual.geometry.mesh >= 0:
+            if visual.geometry.mesh != mesh:
+                mesh = visual.geometry.mesh
+                points = np.asarray(points_of(mesh), np.float64)
+            placed = points @ T[:3, :3].T + T[:3, 3]
+        elif visual.geometry.hfield >= 0:
+            placed = _field_corners(spec, visual.geometry) @ T[:3, :3].T + T[:3, 3]
+        else:
+            reach = _reach(visual.geometry, T[:3, :3])
+            placed = np.stack([T[:3, 3] - reach, T[:3, 3] + reach])
+        low, high = _with(placed, low, high)
+    for vertices in more:
+        low, high = _with(np.asarray(vertices, np.float64), low, high)
+    return Extent(vec3(low), vec3(high), vec3(high - low)) if bool((low <= high).all()) else None
+
+
+def largest_mesh(spec: SceneSpec) -> float:
+    """Longest side of a mesh that is drawn, in its own frame [m]; 0 without meshes."""
+    worn = {v.geometry.mesh for v in spec.visuals if v.rgba[3] > 0 and v.geometry.mesh >= 0}
+    boxes = (spec.meshes[mesh] for mesh in worn)
+    return max((b - a for box in boxes for a, b in zip(box.low, box.high, strict=True)), default=0.0)
+
+
+def unit_hint(side_m: float, remedy: str) -> str:
+    """What is likely wrong with something whose longest side this is; empty where nothing is. `remedy`: what to do,
+    with `{factor}` where the factor stands."""
+    if side_m > LARGEST_M:
+        factor, what = "0.001", "in millimetres where metres are meant?"
+    elif 0.0 < side_m < SMALLEST_M:
+        factor, what = "1000", "divided by 1,000 once too often?"
+    else:
+        return ""
+    return f"{length(side_m)} large: {what} {remedy.format(factor=factor)} makes it {length(side_m * float(factor))}"
+
+
+def size_text(extent: Extent) -> str:
+    """Its sides for people."""
+    x, y, z = (f"{side:.3g}" for side in extent.size)
+    return f"{x} x {y} x {z} m"
+
+
+def length(metres: float) -> str:
+    """A length for people."""
+    value, unit = (metres, "m") if metres >= 0.1 else (1e3 * metres, "mm")
+    return f"{value:,.0f} {unit}" if value >= 1e4 else f"{value:.4g} {unit}"
+
+
+def _corners(low: Vec3, high: Vec3) -> Points:
+    """The eight corners of a box, (8, 3)."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def _with(points: Points, low: Points, high: Points) -> tuple[Points, Points]:
+    if not len(points):
+        return low, high
+    return np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+
+
+def _field_corners(spec: SceneSpec, geometry: Geometry) -> Points:
+    """Of the box around a height field: its highest elevation is 1."""
+    half_x, half_y, top, base = spec.hfields[geometry.hfield].size
+    return _corners((-half_x, -half_y, -base), (half_x, half_y, top))
+
+
+def _reach(geometry: Geometry, R_world_visual: Points) -> Points:
+    """How far a shape reaches from its centre along the axes of the world, (3,) [m]."""
+    R, size = np.abs(R_world_visual), np.array(geometry.size)
+    match geometry.kind:
+        case GeometryKind.SPHERE | GeometryKind.ELLIPSOID:
+            return np.asarray(np.linalg.norm(R * size, axis=1))
+        case GeometryKind.CAPSULE:
+            return np.asarray(R[:, 2] * size[2] + size[0])
+        case GeometryKind.CYLINDER:
+            return np.asarray(R[:, 2] * size[2] + size[0] * np.sqrt(np.maximum(0.0, 1.0 - R[:, 2] ** 2)))
+    return np.asarray(R @ size)

@@ -1,0 +1,97 @@
+"""What trimesh takes without a word, or calls by names of its own: files that are cut, and vertices that are not there.
+
+Of OBJ also corners that count from the end, which mean another vertex in every line and trimesh takes from the end of
+the file. Each check is given the file's name and bytes, and returns the bytes to be read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from iris_session.scene.errors import SceneBuildError
+
+_STL_HEAD: Final = 84
+_STL_TRIANGLE: Final = 50
+#: Largest head of a PLY that is searched.
+_PLY_HEAD: Final = 1 << 16
+#: A corner of a face, of an OBJ line, that is 0 or negative.
+_ODD_CORNER: Final = re.compile(rb"^[ \t]*f(?=[ \t])[^\n]*?[ \t/](?:-|0+(?:[/ \t\r\n]|$))", re.MULTILINE)
+_OBJ_LISTS: Final = (b"v", b"vt", b"vn")
+_WHAT: Final = ("vertex", "texture coordinate", "normal")
+
+
+def stl(name: str, data: bytes) -> bytes:
+    """A binary one has as many triangles as it says, one of text an end."""
+    count = int.from_bytes(data[80:_STL_HEAD], "little")
+    size = _STL_HEAD + count * _STL_TRIANGLE
+    if len(data) >= _STL_HEAD and len(data) == size:
+        return data
+    if data[:512].lstrip()[:5].lower() == b"solid" and b"\0" not in data[:512]:
+        if b"endsolid" not in data[-4096:].lower():
+            raise SceneBuildError(f"{name} is cut: an STL of text ends with endsolid; export or download it again")
+        return data
+    if len(data) < size or len(data) < _STL_HEAD:
+        raise SceneBuildError(
+            f"{name} is cut, or no STL: its head says {count:,} triangles, {size:,} bytes, and it has {len(data):,}; "
+            "export or download it again"
+        )
+    return data[:size]  # some writers fill up their last block
+
+
+def ply(name: str, data: bytes) -> bytes:
+    """One of text has as many lines as its head says."""
+    head, found, _ = data[:_PLY_HEAD].partition(b"end_header")
+    if not found or b"format ascii" not in head or b"\n" not in head:
+        return data
+    rows = sum(int(count) for count in re.findall(rb"^element[ \t]+\S+[ \t]+(\d{1,18})", head, re.MULTILINE))
+    start = len(head) + len(found)
+    lines = data.count(b"\n", start) - data.endswith(b"\n")
+    if lines < rows:
+        raise SceneBuildError(f"{name} is cut: its head says {rows:,} lines, and it has {lines:,}; export it again")
+    return data
+
+
+def obj(name: str, data: bytes) -> bytes:
+    """Corners count from 1, and forward."""
+    return absolute_corners(name, data) if _ODD_CORNER.search(data) else data
+
+
+CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply": ply, "obj": obj}
+
+
+def absolute_corners(name: str, data: bytes) -> bytes:
+    """An OBJ whose faces name vertices, texture coordinates and normals from 1. Raises `SceneBuildError` for the first
+    that names what is not there."""
+    counts = [0, 0, 0]
+    total = [len(re.findall(rb"^[ \t]*" + kind + rb"[ \t]", data, re.MULTILINE)) for kind in _OBJ_LISTS]
+    out = []
+    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").split(b"\n"), start=1):
+        words = line.partition(b"#")[0].split()
+        if words and words[0] in _OBJ_LISTS:
+            counts[_OBJ_LISTS.index(words[0])] += 1
+        if words and words[0] == b"f":
+            corners = (_corner(f"{name}, line {number}", word, counts, total) for word in words[1:])
+            out.append(b"f " + b" ".join(corners))
+        else:
+            out.append(line)
+    return b"\n".join(out)
+
+
+def _corner(where: str, corner: bytes, counts: list[int], total: list[int]) -> bytes:
+    """`counts`: how many there are so far, by which what is negative counts; `total`: in the whole file."""
+    found = []
+    for k, text in enumerate(corner.split(b"/")[:3]):
+        if not text:
+            found.append(b"")
+            continue
+        try:
+            place = int(text)
+        except ValueError:
+            raise SceneBuildError(f"{where}: {corner.decode(errors='replace')!r} is no corner of a face") from None
+        at = place if place > 0 else counts[k] + 1 + place
+        if place == 0 or not 0 < at <= total[k]:
+            raise SceneBuildError(f"{where}: a face names {_WHAT[k]} {place} of {total[k]}: export it again")
+        found.append(b"%d" % at)
+    return b"/".join(found)

@@ -1,0 +1,105 @@
+"""How large a scene is: exactly for what is turned, and what a mistake of units looks like."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from iris_session.scene import AssetStore
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.extent import box_extent, extent_of, length, unit_hint
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.parts import matrix_of
+from iris_session.scene.shapes import primitive
+
+TURN = (0.8, 0.1, -0.3, 0.5)
+
+
+def test_shapes_that_are_turned(tmp_path: Path) -> None:
+    """By the triangles of the same shapes, which lie on it within their tessellation, and never outside."""
+    for kind in ("box", "sphere", "ellipsoid", "capsule", "cylinder"):
+        scene = SceneBuilder()
+        half = {"half_size": (0.3, 0.1, 0.2)}
+        size = {
+            "box": half,
+            "sphere": {"radius": 0.3},
+            "ellipsoid": half,
+        }.get(kind, {"radius": 0.1, "half_length": 0.4})
+        getattr(scene, f"add_{kind}")(position=(1, 2, 3), quaternion=TURN, **size)
+        store = AssetStore(tmp_path / "store")
+        spec = scene.build(store).spec
+        shape = primitive(spec.visuals[0].geometry)
+        assert shape is not None
+        T = matrix_of(spec.visuals[0].T_body_visual)
+        placed = shape.position.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        found = extent_of(spec, store)
+        assert found is not None
+        sides = np.ptp(placed, axis=0)
+        assert (np.array(found.size) >= sides - 1e-6).all()
+        np.testing.assert_allclose(found.size, sides, rtol=0.02 if kind != "box" else 1e-6)
+        np.testing.assert_allclose(np.add(found.low, found.high) / 2, (1, 2, 3), atol=1e-9)
+        np.testing.assert_allclose(np.subtract(found.high, found.low), found.size)
+
+
+def test_meshes_by_their_vertices(tmp_path: Path) -> None:
+    """A ball that is turned is as large as before; the box around it is not."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    scene = SceneBuilder()
+    scene.add_mesh(vertices=ball.vertices, triangles=ball.faces, quaternion=(math.cos(0.4), 0, 0, math.sin(0.4)))
+    scene.add_mesh(vertices=ball.vertices, triangles=ball.faces, rgba=(1, 1, 1, 0), position=(50, 0, 0))
+    scene.add_plane("floor", half_size=(40, 40))
+    scene.add_deformable("cloth", [[0, 0, 2], [0.2, 0, 2], [0, 0.2, 2]], [[0, 1, 2]])
+    store = AssetStore(tmp_path / "store")
+    spec = scene.build(store).spec
+    found, boxes = extent_of(spec, store), box_extent(spec)
+    assert found is not None
+    assert boxes is not None
+    np.testing.assert_allclose(found.low, (-0.5, -0.5, -0.5), atol=2e-3)
+    np.testing.assert_allclose(found.high, (0.5, 0.5, 2.0), atol=2e-3)
+    assert boxes.size[0] > 50, "what is not seen counts there: it may be shown later"
+    assert spec.environment.extent > 25
+
+
+def test_of_a_model(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 2 0.5 0.25" elevation="0 0 0 0 1 0 0 0 0"/></asset>'
+        '<worldbody><geom type="plane" size="9 9 1"/><geom type="hfield" hfield="h" pos="0 0 1"/>'
+        '<geom size="5" group="4"/><body pos="0 3 0"><joint/><geom size="0.5"/></body></worldbody></mujoco>'
+    )
+    store = AssetStore(tmp_path)
+    found = extent_of(parse_mujoco(model, store).spec, store)
+    assert found is not None
+    np.testing.assert_allclose(found.low, (-1, -2, -0.5))
+    np.testing.assert_allclose(found.high, (1, 3.5, 1.5))
+
+
+def test_nothing_has_no_extent(tmp_path: Path) -> None:
+    scene, store = SceneBuilder(), AssetStore(tmp_path)
+    scene.add_plane()
+    spec = scene.build(store).spec
+    assert extent_of(spec, store) is None
+    assert spec.environment.extent == 1.0
+
+
+@pytest.mark.parametrize(
+    ("side", "says"),
+    [
+        (0.0, ""),
+        (0.0021, ""),
+        (9.9, ""),
+        (62.0, "62 m large: in millimetres where metres are meant? --scale 0.001 makes it 62 mm"),
+        (1.5e6, "1,500,000 m large: in millimetres where metres are meant? --scale 0.001 makes it 1500 m"),
+        (0.0005, "0.5 mm large: divided by 1,000 once too often? --scale 1000 makes it 0.5 m"),
+    ],
+)
+def test_what_looks_like_a_mistake_of_units(side: float, says: str) -> None:
+    assert unit_hint(side, "--scale {factor}") == says
+
+
+def test_lengths_for_people() -> None:
+    assert [length(v) for v in (0.1, 0.0999, 12.3456, 12_345.6)] == ["0.1 m", "99.9 mm", "12.35 m", "12,346 m"]

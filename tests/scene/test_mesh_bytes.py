@@ -1,0 +1,89 @@
+"""Mesh files that are cut, or name vertices that are not there; OBJ corners that count from the end."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from iris_session.scene import SceneBuildError
+from iris_session.scene.files import load_file
+
+TRIANGLE = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0)
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {}\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+)
+
+
+def written(tmp_path: Path, name: str, content: str | bytes) -> Path:
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    return tmp_path / name
+
+
+def binary_stl(said: int, there: bytes, head: bytes = b"") -> bytes:
+    return head.ljust(80, b"\0") + struct.pack("<I", said) + there
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("a.stl", binary_stl(10, 10 * TRIANGLE)[:-70], "says 10 triangles, 584 bytes, and it has 514"),
+        ("a.stl", binary_stl(10, 9 * TRIANGLE, b"solid by name only"), "says 10 triangles"),
+        ("a.stl", binary_stl(1, b"")[:60], "is cut, or no STL"),
+        ("a.stl", f"solid x\n{3 * FACET}", "is cut: an STL of text ends with endsolid"),
+        ("a.ply", PLY.format(2) + "3 0 1 2\n", "its head says 5 lines, and it has 4"),
+        ("a.ply", PLY.format(2_000_000_000) + "3 0 1 2", "its head says 2,000,000,003 lines, and it has 4"),
+        ("a.ply", PLY.format(1) + "3 0 1 7\n", "names vertex 7 of 3|names something that it does not have"),
+        ("a.ply", PLY.format(1) + "3 0 1 -1\n", "names vertex -1 of 3"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf 1 2 10\n", r"a\.obj, line 5: a face names vertex 10 of 3"),
+        ("a.obj", f"{CORNERS}f 0 1 2\n", r"a\.obj, line 4: a face names vertex 0 of 3"),
+        ("a.obj", f"{CORNERS}f 1 2 -4\n", r"a\.obj, line 4: a face names vertex -4 of 3"),
+        ("a.obj", f"{CORNERS}vt 0 0\nf 1/1 2/-2 3/1\n", "names texture coordinate -2 of 1"),
+        ("a.obj", f"{CORNERS}f 1 -x 3\n", "'-x' is no corner of a face"),
+    ],
+)
+def test_what_is_cut_or_not_there_is_told(tmp_path: Path, name: str, content: str | bytes, text: str) -> None:
+    with pytest.raises(SceneBuildError, match=text) as raised:
+        load_file(written(tmp_path, name, content))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "triangles"),
+    [
+        ("a.stl", binary_stl(2, 2 * TRIANGLE + bytes(40)), 2),
+        ("a.stl", binary_stl(2, 2 * TRIANGLE, b"solid by name only"), 2),
+        ("a.stl", f"solid x\n{2 * FACET}endsolid x", 2),
+        ("a.ply", PLY.format(1) + "3 0 1 2", 1),
+    ],
+)
+def test_what_is_whole_is_read(tmp_path: Path, name: str, content: str | bytes, triangles: int) -> None:
+    (node,) = load_file(written(tmp_path, name, content)).nodes
+    assert node.surfaces[0].mesh.triangles == triangles
+
+
+def test_corners_of_an_obj_count_back_from_their_own_line(tmp_path: Path) -> None:
+    """Read from the end of the file, both faces would be the second one."""
+    second = CORNERS.replace(" 0\n", " 5\n")
+    path = written(tmp_path, "a.obj", f"{CORNERS}f -3 -2 -1 # the first\n{second}f -3// -2// -1//\nf 1 2 \\\n6\n")
+    (node,) = load_file(path).nodes
+    mesh = node.surfaces[0].mesh
+    heights = sorted(sorted(face) for face in mesh.position[mesh.index][:, :, 2].tolist())
+    assert heights == [[0, 0, 0], [0, 0, 5], [5, 5, 5]]
+
+
+def test_materials_that_are_missing_are_told(tmp_path: Path) -> None:
+    face = f"{CORNERS}usemtl red\nf 1 2 3\n"
+    lost = load_file(written(tmp_path, "a.obj", f"mtllib lost.mtl\n{face}")).skipped
+    assert lost == (f"a.obj refers to lost.mtl: there is no file {tmp_path / 'lost.mtl'}",)
+    written(tmp_path, "b.mtl", "newmtl blue\nKd 0 0 1\nmap_bump waves.png\n")
+    path = written(tmp_path, "b.obj", f"mtllib b.mtl\n{face}usemtl blue\nf 1 2 3\nmtllib c.mtl\n")
+    assert load_file(path).skipped == (
+        "b.obj: its MTL files but for the first of 2",
+        "b.obj: materials that its MTL file does not have: red",
+        "b.obj: of material blue the pictures map_bump",
+    )
