@@ -91,6 +91,21 @@ class ArrayKind:
     DEFORMABLE: Final = "deformable"  # the topology and rest shape of a deformable
 
 
+class ArrayName:
+    """What an array of an asset is; which ones a kind has is in docs/scene.md."""
+
+    INDEX: Final = "index"  # of a mesh: three corners a triangle
+    POSITION: Final = "position"
+    NORMAL: Final = "normal"
+    UV: Final = "uv"
+    COLOR: Final = "color"  # of corners, 0..255: multiplies the colour of what wears the mesh
+    PIXELS: Final = "pixels"
+    ELEVATION: Final = "elevation"
+    ELEMENTS: Final = "elements"  # of a deformable: two vertices an edge, three a triangle
+    VERTEX: Final = "vertex"  # of a deformable: numbers in the simulator
+    PLAN: Final = "plan"  # of a deformable's stream
+
+
 class ArrayFilter:
     """What was done to an array before it was compressed."""
 

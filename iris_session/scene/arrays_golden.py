@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,6 +44,9 @@ def vectors() -> Iterator[tuple[str, str, bytes]]:
     mesh = _mesh()
     yield "a mesh, exact", ArrayKind.MESH, encode_mesh(mesh)
     yield "a mesh, quantised", ArrayKind.MESH, encode_mesh_quantised(mesh)[0]
+    coloured = replace(mesh, uv=None, color=_colors(mesh.vertices))
+    yield "a mesh with colours at its corners, exact", ArrayKind.MESH, encode_mesh(coloured)
+    yield "a mesh with colours at its corners, quantised", ArrayKind.MESH, encode_mesh_quantised(coloured)[0]
     empty = [
         Stored("index", np.zeros((0, 3), np.uint16), ArrayFilter.DELTA),
         Stored("position", np.zeros((0, 3), "f4")),
@@ -129,6 +133,12 @@ def _mesh() -> MeshArrays:
     a, b, c, d = (x.ravel() for x in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
     index = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     return MeshArrays(position, normal, uv, index)
+
+
+def _colors(corners: int) -> NDArray[np.uint8]:
+    """From red to blue, less and less opaque."""
+    along = np.linspace(0, 255, corners).round().astype(np.uint8)
+    return np.stack([255 - along, along // 2, along, 255 - along // 4], axis=1)
 
 
 def _asset(header: ArrayHeader, body: bytes) -> bytes:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName
 from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.streams.deformable_topology import DeformableTopology
 
@@ -28,12 +28,12 @@ def encode_deformable(
     """
     narrow = elements.astype(np.uint16) if len(rest) <= _SHORT else elements
     arrays = [
-        Stored("elements", narrow, ArrayFilter.DELTA),
-        Stored("position", rest, ArrayFilter.SHUFFLE),
-        Stored("plan", np.frombuffer(topology.to_bytes(), np.uint8)),
+        Stored(ArrayName.ELEMENTS, narrow, ArrayFilter.DELTA),
+        Stored(ArrayName.POSITION, rest, ArrayFilter.SHUFFLE),
+        Stored(ArrayName.PLAN, np.frombuffer(topology.to_bytes(), np.uint8)),
     ]
     if numbers is not None:
-        arrays.append(Stored("vertex", numbers.astype(np.uint32), ArrayFilter.DELTA))
+        arrays.append(Stored(ArrayName.VERTEX, numbers.astype(np.uint32), ArrayFilter.DELTA))
     if uv is not None:
-        arrays.append(Stored("uv", uv, ArrayFilter.SHUFFLE))
+        arrays.append(Stored(ArrayName.UV, uv, ArrayFilter.SHUFFLE))
     return encode_arrays(ArrayKind.DEFORMABLE, arrays)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, AssetEncoding
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, filtered, require
 from iris_session.scene.errors import AssetError
 
@@ -30,7 +30,8 @@ class EncodedImage(NamedTuple):
 def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: int = 92) -> EncodedImage:
     """`pixels`: (height, width, channels), first row on top. `quality`: of JPEG, 1..100."""
     if encoding == AssetEncoding.ARRAYS:
-        return EncodedImage(encode_arrays(ArrayKind.IMAGE, [Stored("pixels", pixels, _filter(pixels))]), encoding)
+        stored = Stored(ArrayName.PIXELS, pixels, _filter(pixels))
+        return EncodedImage(encode_arrays(ArrayKind.IMAGE, [stored]), encoding)
     cv2 = _opencv()
     swapped = _swapped(pixels)
     if encoding == AssetEncoding.PNG:
@@ -54,7 +55,7 @@ def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes:
     """Pixels (height, width, channels). Raises `AssetError` for other bytes, or when they would exceed `max_bytes`."""
     if encoding == AssetEncoding.ARRAYS:
         arrays = decode_arrays(data, ArrayKind.IMAGE, max_bytes)
-        return require(arrays, "pixels", "u1", (None, None, None))
+        return require(arrays, ArrayName.PIXELS, "u1", (None, None, None))
     if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
         raise AssetError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
     width, height = _stated_size(bytes(data[:65_536]), encoding)

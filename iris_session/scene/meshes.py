@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, require
 from iris_session.scene.errors import AssetError
 
@@ -86,14 +86,14 @@ def unique_rows(rows: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def encode_mesh(mesh: MeshArrays) -> bytes:
     """The asset, exact to the bit."""
     arrays = [
-        Stored("index", _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
-        Stored("position", mesh.position, ArrayFilter.SHUFFLE),
-        Stored("normal", mesh.normal, ArrayFilter.SHUFFLE),
+        Stored(ArrayName.INDEX, _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        Stored(ArrayName.POSITION, mesh.position, ArrayFilter.SHUFFLE),
+        Stored(ArrayName.NORMAL, mesh.normal, ArrayFilter.SHUFFLE),
     ]
     if mesh.uv is not None:
-        arrays.append(Stored("uv", mesh.uv, ArrayFilter.SHUFFLE))
+        arrays.append(Stored(ArrayName.UV, mesh.uv, ArrayFilter.SHUFFLE))
     if mesh.color is not None:
-        arrays.append(Stored("color", mesh.color))
+        arrays.append(Stored(ArrayName.COLOR, mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays)
 
 
@@ -102,10 +102,10 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
     low, step = _lattice(mesh.position)
     error = float(np.linalg.norm(step)) / 2 + _rounding(mesh.position)
     arrays = [
-        Stored("index", _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
-        _quantised("position", mesh.position, low, step),
+        Stored(ArrayName.INDEX, _narrow(mesh.index, mesh.vertices), ArrayFilter.DELTA),
+        _quantised(ArrayName.POSITION, mesh.position, low, step),
         Stored(
-            "normal",
+            ArrayName.NORMAL,
             np.rint(np.clip(mesh.normal, -1, 1) * _NORMAL_STEPS).astype(np.int8),
             ArrayFilter.SHUFFLE,
             (1 / _NORMAL_STEPS,) * 3,
@@ -113,20 +113,20 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
         ),
     ]
     if mesh.uv is not None:
-        arrays.append(_quantised("uv", mesh.uv, *_lattice(mesh.uv)))
+        arrays.append(_quantised(ArrayName.UV, mesh.uv, *_lattice(mesh.uv)))
     if mesh.color is not None:
-        arrays.append(Stored("color", mesh.color))
+        arrays.append(Stored(ArrayName.COLOR, mesh.color))
     return encode_arrays(ArrayKind.MESH, arrays, error), error
 
 
 def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY_BYTES) -> MeshArrays:
     """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetError` for bytes that are no mesh."""
     arrays = decode_arrays(data, ArrayKind.MESH, max_bytes)
-    position = require(arrays, "position", "f4", (None, 3))
-    normal = require(arrays, "normal", "f4", (len(position), 3))
-    uv = require(arrays, "uv", "f4", (len(position), 2)) if "uv" in arrays else None
-    color = require(arrays, "color", "u1", (len(position), 4)) if "color" in arrays else None
-    index = require(arrays, "index", "u2 u4", (None, 3)).astype(np.uint32)
+    position = require(arrays, ArrayName.POSITION, "f4", (None, 3))
+    normal = require(arrays, ArrayName.NORMAL, "f4", (len(position), 3))
+    uv = require(arrays, ArrayName.UV, "f4", (len(position), 2)) if ArrayName.UV in arrays else None
+    color = require(arrays, ArrayName.COLOR, "u1", (len(position), 4)) if ArrayName.COLOR in arrays else None
+    index = require(arrays, ArrayName.INDEX, "u2 u4", (None, 3)).astype(np.uint32)
     if index.size and int(index.max()) >= len(position):
         raise AssetError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
     if not np.isfinite(position).all():

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene_looks import HeightField, Mesh, Texture
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ColorSpace, TextureKind
+from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, ColorSpace, TextureKind
 from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.scene.build import Builder, MeshNote, Work
 from iris_session.scene.meshes import MeshArrays, index_corners
@@ -129,4 +129,4 @@ def hfields(model: mujoco.MjModel, builder: Builder) -> tuple[HeightField, ...]:
 
 
 def _encode_grid(grid: NDArray[np.float32]) -> Callable[[], bytes]:
-    return lambda: encode_arrays(ArrayKind.GRID, [Stored("elevation", grid, ArrayFilter.SHUFFLE)])
+    return lambda: encode_arrays(ArrayKind.GRID, [Stored(ArrayName.ELEVATION, grid, ArrayFilter.SHUFFLE)])

@@ -210,6 +210,7 @@ _ENUMS: Final[dict[str, str]] = {
     "Camera.follow": "Follow",
     "Deformable.encoding": "AssetEncoding",
     "ArrayHeader.kind": "ArrayKind",
+    "ArrayInfo.name": "ArrayName",
     "ArrayInfo.filter": "ArrayFilter",
     "ArrayInfo.codec": "ArrayCodec",
 }

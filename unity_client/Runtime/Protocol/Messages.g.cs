@@ -463,6 +463,23 @@ namespace IrisSession.Protocol
     }
 
     /// <summary>
+    /// What an array of an asset is; which ones a kind has is in docs/scene.md.
+    /// </summary>
+    public static class ArrayName
+    {
+        public const string Index = "index";
+        public const string Position = "position";
+        public const string Normal = "normal";
+        public const string Uv = "uv";
+        public const string Color = "color";
+        public const string Pixels = "pixels";
+        public const string Elevation = "elevation";
+        public const string Elements = "elements";
+        public const string Vertex = "vertex";
+        public const string Plan = "plan";
+    }
+
+    /// <summary>
     /// What was done to an array before it was compressed.
     /// </summary>
     public static class ArrayFilter

@@ -385,6 +385,21 @@ export const ArrayKind = {
 } as const;
 export type ArrayKind = (typeof ArrayKind)[keyof typeof ArrayKind] | (string & {});
 
+/** What an array of an asset is; which ones a kind has is in docs/scene.md. */
+export const ArrayName = {
+  INDEX: "index",
+  POSITION: "position",
+  NORMAL: "normal",
+  UV: "uv",
+  COLOR: "color",
+  PIXELS: "pixels",
+  ELEVATION: "elevation",
+  ELEMENTS: "elements",
+  VERTEX: "vertex",
+  PLAN: "plan",
+} as const;
+export type ArrayName = (typeof ArrayName)[keyof typeof ArrayName] | (string & {});
+
 /** What was done to an array before it was compressed. */
 export const ArrayFilter = {
   NONE: "none",
@@ -1820,7 +1835,7 @@ export interface ArrayHeader {
  * is not empty.
  */
 export interface ArrayInfo {
-  name: string;
+  name: ArrayName;
   dtype: string;
   shape: number[];
   bytes: number;
