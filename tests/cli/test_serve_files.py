@@ -84,7 +84,7 @@ def test_a_file_in_millimetres_is_noticed_and_scaled(tmp_path: Path, capfd: pyte
     path.write_text(TRIANGLE.replace("1 0 0", "120 0 0").replace("0 1 0", "0 40 0"))
     assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
     assert (
-        "size: 120 m large: in millimetres where metres are meant? --scale 0.001 makes it 120 mm"
+        "size: 120 m large: in millimetres where metres are meant? --scale 0.001 makes it 0.12 m"
         in capfd.readouterr().out
     )
     assert main(["serve", str(path), "--scale", "0.001", "--seconds", "0.1", *QUIET]) == 0

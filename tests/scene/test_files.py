@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -93,6 +94,13 @@ def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
         T = matrix_of(scene.spec.visuals[0].T_body_visual)[:3, :3]
         extent = np.abs(T @ (np.array(mesh.high) - mesh.low))
         np.testing.assert_allclose(extent, 0.01 * np.array(size), atol=1e-7)
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "x.dae")
+    text = (tmp_path / "x.dae").read_text()
+    assert "<up_axis>" in text
+    (tmp_path / "x.dae").write_text(re.sub("[XYZ]_UP", "X_UP", text))
+    with pytest.raises(SceneBuildError, match=r"x\.dae says that x is up: give up='y' or up='z'"):
+        built(tmp_path / "x.dae", tmp_path)
+    built(tmp_path / "x.dae", tmp_path, up="z")
     with pytest.raises(SceneBuildError, match="up is 'x'"):
         built(tmp_path / "a.stl", tmp_path, up="x")
     with pytest.raises(SceneBuildError, match="scale is 0"):

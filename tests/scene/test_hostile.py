@@ -9,6 +9,7 @@ import pytest
 
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.files import load_file
 from tests.scene.documents import Document
 from tests.scene.test_files import write_obj
 
@@ -49,3 +50,79 @@ def test_names_that_cannot_be_sent_are_changed(tmp_path: Path) -> None:
     scene.add_file(document.write(tmp_path / "a.glb"))
     names = [body.name for body in scene.build(AssetStore(tmp_path / "store")).spec.bodies]
     assert names[-2:] == ["half ?", "table"]
+
+
+def test_pictures_of_any_file_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where many materials name one picture: an OBJ file opens it for each."""
+    path = write_obj(tmp_path)
+    material = "newmtl {}\nKd 1 1 1\nmap_Kd picture.png\n"
+    (tmp_path / "parts.mtl").write_text(material.format("red") + material.format("painted"))
+    load_file(path)
+    monkeypatch.setattr("iris_session.scene.pictures.MAX_FILE_PIXELS", 2 * 4 * 8 - 1)
+    with pytest.raises(SceneBuildError, match=r"the images of parts\.obj have more than 63 pixels together"):
+        load_file(path)
+    textures = "".join(
+        f'<link name="l{k}"><visual><geometry><box size="1 1 1"/></geometry><material name="m{k}">'
+        f'<texture filename="{k}.png"/></material></visual></link>'
+        + (f'<joint name="j{k}" type="fixed"><parent link="l0"/><child link="l{k}"/></joint>' if k else "")
+        for k in range(2)
+    )
+    for k in range(2):
+        (tmp_path / f"{k}.png").write_bytes((tmp_path / "picture.png").read_bytes())
+    (tmp_path / "a.urdf").write_text(f'<robot name="a">{textures}</robot>')
+    with pytest.raises(SceneBuildError, match=r"the images of a\.urdf have more than 63"):
+        SceneBuilder().add_urdf(tmp_path / "a.urdf")
+
+
+def test_numbers_without_bytes_are_bounded(tmp_path: Path) -> None:
+    """As doubles they would be eight times as large."""
+    document = Document()
+    document.square()
+    document.json["accessors"].append({"componentType": 5121, "count": 100_000_000, "type": "VEC4", "normalized": True})
+    document.json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(document.json["accessors"]) - 1
+    with pytest.raises(SceneBuildError, match="has 100000000 entries without bytes"):
+        SceneBuilder().add_file(document.write(tmp_path / "a.glb"))
+
+
+def test_copies_in_many_scales_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("iris_session.scene.assembly.MAX_TRIANGLES", 10)
+    for alike in (True, False):
+        document = Document()
+        document.square()
+        document.json["nodes"] = [{"mesh": 0, "scale": [1, 1, 2 if alike else 2 + k]} for k in range(8)]
+        scene, store = SceneBuilder(), AssetStore(tmp_path / "store")
+        scene.add_file(document.write(tmp_path / "a.glb"))
+        if alike:
+            assert len(scene.build(store).spec.meshes) == 1
+            continue
+        with pytest.raises(SceneBuildError, match="in so many scales that they have over 10 triangles"):
+            scene.build(store)
+
+
+def test_a_file_is_added_whole_or_not_at_all(tmp_path: Path) -> None:
+    document = Document()
+    document.square()
+    document.json["nodes"] = [{"mesh": 0}, {"mesh": 0, "translation": [1e308, 0, 0], "children": [2]}]
+    document.json["nodes"].append({"mesh": 0, "scale": [1e200, 1e200, 1e200], "children": [3]})
+    document.json["nodes"].append({"mesh": 0, "scale": [1e200, 1e200, 1e200]})
+    path, scene = document.write(tmp_path / "a.glb"), SceneBuilder()
+    before = scene.build(AssetStore(tmp_path / "store")).scene_hash
+    with pytest.raises(SceneBuildError):
+        scene.add_file(path, name="part", movable=True)
+    assert scene.build(AssetStore(tmp_path / "store")).scene_hash == before
+    assert scene.add_box("part", half_size=(1, 1, 1), movable=True) == "part", "the name is free"
+
+
+def test_cameras_that_see_nothing_are_told(tmp_path: Path) -> None:
+    document = Document()
+    document.square()
+    lens = {"yfov": 0.0}
+    document.json["cameras"] = [{"type": "perspective", "perspective": lens}]
+    document.json["nodes"] = [{"mesh": 0}, {"camera": 0, "name": "eye"}]
+    for angle, skipped in ((0.0, True), (-1.0, True), (4.0, True), (1.0, False)):
+        lens["yfov"] = angle
+        scene = SceneBuilder()
+        scene.add_file(document.write(tmp_path / "a.glb"))
+        made = scene.build(AssetStore(tmp_path / "store"))
+        assert any("camera 'eye': its angle of view" in line for line in made.skipped) == skipped
+        assert len(made.spec.cameras) == (0 if skipped else 1)

@@ -14,6 +14,7 @@ from iris_session.protocol.common import Pose
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.composed import ComposedScene
+from iris_session.scene.extent import extent_of
 from iris_session.scene.parts import matrix_of
 from tests.scene.arm import FREE, JOINTS, write_arm
 from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
@@ -183,6 +184,42 @@ def test_collision_shapes_on_request(tmp_path: Path) -> None:
     assert composed(urdf, tmp_path).spec.visuals == ()
     assert "give collisions=True" in composed(urdf, tmp_path).skipped[0]
     assert len(composed(urdf, tmp_path, collisions=True).spec.visuals) == 11
+
+
+def test_a_robot_in_another_size(tmp_path: Path) -> None:
+    """Every place scales, joints keep their positions, what is drawn is the same picture."""
+    urdf = write_arm(tmp_path)
+    whole, half = composed(urdf, tmp_path), composed(urdf, tmp_path, scale=0.5, position=(1, 0, 0))
+    one, other = whole.articulations["arm"], half.articulations["arm"]
+    assert other.joints == one.joints
+    q = positions(4)
+    for (name, a), b in zip(one.poses(q).items(), other.poses(q).values(), strict=True):
+        np.testing.assert_allclose(b.p, np.array(a.p) / 2, atol=1e-12, err_msg=name)
+        assert b.q == a.q
+    store = AssetStore(tmp_path / "store")
+    a, b = extent_of(whole.spec, store), extent_of(half.spec, store)
+    assert a is not None
+    assert b is not None
+    np.testing.assert_allclose(b.size, np.array(a.size) / 2, rtol=1e-5)
+    np.testing.assert_allclose(b.low, np.array(a.low) / 2 + [1, 0, 0], atol=1e-5)
+    for wrong in (0.0, -1.0, float("nan"), "2", None):
+        with pytest.raises(SceneBuildError, match="scale is"):
+            composed(urdf, tmp_path, scale=wrong)
+
+
+def test_a_robot_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace('<robot name="arm">', "<robot>"))
+    assert SceneBuilder().add_urdf(urdf) == "arm"
+
+
+def test_xacro_is_to_be_expanded(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text("<robot/>")
+    with pytest.raises(SceneBuildError, match=r"xacro arm\.urdf\.xacro > arm\.urdf"):
+        SceneBuilder().add_urdf(path)
+    with pytest.raises(SceneBuildError, match="is a folder: name a file"):
+        SceneBuilder().add_urdf(tmp_path)
 
 
 def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:

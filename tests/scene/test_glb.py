@@ -1,0 +1,136 @@
+"""GLB files: whole or not written at all, what has no form in glTF, and nothing that is hidden."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from iris_session.protocol.scene import SceneSpec
+from iris_session.scene import AssetStore, SceneBuildError
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.glb import write_glb
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.report import not_in_glb
+from tests.scene.test_shapes import document
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AssetStore:
+    return AssetStore(tmp_path / "store")
+
+
+def box(store: AssetStore) -> SceneSpec:
+    scene = SceneBuilder("box")
+    scene.add_box(half_size=(0.5, 0.5, 0.5))
+    return scene.build(store).spec
+
+
+def exported(spec: SceneSpec, store: AssetStore, tmp_path: Path) -> dict[str, Any]:
+    write_glb(spec, store, tmp_path / "a.glb")
+    return document(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("fault", ["write_bytes", "replace"])
+def test_a_full_disk_leaves_what_was_there(
+    tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    spec, out = box(store), tmp_path / "out" / "a.glb"
+    out.parent.mkdir()
+    out.write_bytes(b"from before")
+
+    def full(path: Any, data: Any) -> None:
+        if fault == "write_bytes":
+            with Path(path).open("wb") as file:
+                file.write(data[:100])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if fault == "write_bytes":
+        monkeypatch.setattr(Path, "write_bytes", full)
+    else:
+        monkeypatch.setattr("iris_session.scene.glb.os.replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_glb(spec, store, out)
+    assert [path.name for path in out.parent.iterdir()] == ["a.glb"]
+    assert out.read_bytes() == b"from before"
+
+
+def test_a_link_stays_one_and_a_device_a_device(tmp_path: Path, store: AssetStore) -> None:
+    spec, target, link = box(store), tmp_path / "there.glb", tmp_path / "here.glb"
+    link.symlink_to(target)
+    write_glb(spec, store, link)
+    assert link.is_symlink()
+    assert target.stat().st_mode & 0o777 == (tmp_path / "store").stat().st_mode & 0o666, "as the user has files"
+    write_glb(spec, store, Path(os.devnull))
+    assert not Path(os.devnull).is_file()
+
+
+def test_numbers_that_json_does_not_have_and_files_that_are_too_large_are_refused(
+    tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = box(store)
+    light = SceneBuilder()
+    light.add_light(kind="point")
+    shining = light.build(store).spec
+    endless = msgspec.structs.replace(
+        shining, lights=(msgspec.structs.replace(shining.lights[0], intensity=float("inf")),)
+    )
+    with pytest.raises(SceneBuildError, match="not finite, which glTF cannot hold"):
+        write_glb(endless, store, tmp_path / "b.glb")
+    monkeypatch.setattr("iris_session.scene.glb._MAX_BYTES", 1000)
+    with pytest.raises(SceneBuildError, match="export its parts"):
+        write_glb(spec, store, tmp_path / "b.glb")
+    assert not (tmp_path / "b.glb").exists()
+
+
+def test_ropes_are_lines_and_what_is_hidden_is_not_there(tmp_path: Path, store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_deformable("rope", [[0, 0, 1], [0.5, 0, 1], [1, 0, 1]], edges=[[0, 1], [1, 2]], rgba=(1, 0, 0, 1))
+    corners, faces = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
+    scene.add_deformable("hidden", corners, faces, rgba=(1, 0, 0, 0))
+    spec = scene.build(store).spec
+    found = exported(spec, store, tmp_path)
+    assert [node["name"] for node in found["nodes"] if "mesh" in node] == ["rope"]
+    (rope,) = found["meshes"][0]["primitives"]
+    assert rope["mode"] == 1
+    assert found["accessors"][rope["indices"]]["count"] == 4
+    assert "ropes: lines without thickness" in not_in_glb(spec)
+    (path,) = (one for one in trimesh.load_scene(tmp_path / "a.glb").geometry.values())
+    assert path.length == pytest.approx(1.0)
+
+
+def test_a_cube_leaves_its_mean_colour(tmp_path: Path, store: AssetStore) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><texture name="c" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="1 .5 0" width="8" height="8"/>'
+        '<texture name="s" type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/>'
+        '<material name="m" texture="c" rgba=".5 1 1 1"/></asset>'
+        '<worldbody><geom size="1" material="m"/></worldbody></mujoco>'
+    )
+    spec = parse_mujoco(model, store).spec
+    (material,) = exported(spec, store, tmp_path)["materials"]
+    seen = np.array([0.5, 128 / 255, 0.0])
+    linear = np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(material["pbrMetallicRoughness"]["baseColorFactor"], [*linear, 1.0], atol=5e-3)
+    assert not_in_glb(spec) == (
+        "1 cube textures: their mean colour is drawn",
+        "the skybox: nothing is drawn around the scene",
+    )
+
+
+def test_a_mesh_with_coordinates_of_its_own_is_there_once(tmp_path: Path, store: AssetStore) -> None:
+    """However its materials repeat their texture on other shapes."""
+    scene = SceneBuilder()
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
+    for repeat in ((1, 1), (2, 2)):
+        scene.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=pixels, repeat=repeat)
+    found = exported(scene.build(store).spec, store, tmp_path)
+    assert len({mesh["primitives"][0]["attributes"]["POSITION"] for mesh in found["meshes"]}) == 1
+    assert len(found["materials"]) == 2
