@@ -1,4 +1,4 @@
-"""Image files to the pixels of textures: PNG, JPEG, WebP, TGA, BMP and whatever else Pillow reads."""
+"""Image files to the pixels of textures: PNG, JPEG, WebP, TGA, BMP and a few more (`FORMATS`)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import Pixels
 from iris_session.scene.parts import array_of
 
+#: As Pillow calls them. Not all that it reads: it hands EPS to Ghostscript, whatever the file is called.
+FORMATS: Final = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "GIF", "TIFF", "PPM", "DDS")
+_JPEGS: Final = "MPO"  # JPEG with further pictures: cameras make them
 #: Most pixels of one image: larger ones are no texture, or a bomb.
 MAX_PIXELS: Final = 1 << 26
 #: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
@@ -38,7 +41,7 @@ def read_pixels(data: bytes, what: str) -> Pixels:
     """(height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
     image_module = _pillow()
     try:
-        return pixels_of(image_module.open(io.BytesIO(data)), what)
+        return pixels_of(image_module.open(io.BytesIO(data), formats=FORMATS), what)
     except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
         raise SceneBuildError(f"{what} is no image that can be read: {error}") from None
 
@@ -46,6 +49,8 @@ def read_pixels(data: bytes, what: str) -> Pixels:
 def pixels_of(image: Any, what: str) -> Pixels:
     """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque. Raises `SceneBuildError`
     for too many, before they are decoded."""
+    if image.format not in (None, *FORMATS, _JPEGS):  # None: made in memory
+        raise SceneBuildError(f"{what} is a picture in the form {image.format}; {', '.join(FORMATS)} are read")
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise SceneBuildError(f"{what} has {width} x {height} pixels, at most {MAX_PIXELS:,} are read: shrink it")

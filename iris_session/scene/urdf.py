@@ -20,7 +20,7 @@ from iris_session.protocol.scene_looks import Rgba
 from iris_session.protocol.scene_names import GeometryKind, TextureRole
 from iris_session.scene.articulation import Articulation, Part
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.files import ending, guarded, load_file, present, xacro_advice
+from iris_session.scene.files import ENDINGS, ROBOTS, ending, guarded, load_file, present, xacro_advice
 from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, cut, pose_of
 from iris_session.scene.pictures import PixelBudget, read_pixels
 from iris_session.scene.references import References, read_bounded
@@ -57,6 +57,8 @@ def read_urdf(
     present(path)
     if ending(path) == "xacro":
         raise SceneBuildError(f"{path.name}: {xacro_advice(path)}")
+    if ending(path) in ENDINGS and ending(path) not in (*ROBOTS, "xml"):
+        raise SceneBuildError(f"{path.name} is no URDF: files that end in .{ending(path)} go with add_file, or Session")
     references = References(path, package_dirs)
     data = read_bounded(path)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.compose import SceneBuilder
@@ -126,3 +127,15 @@ def test_cameras_that_see_nothing_are_told(tmp_path: Path) -> None:
         made = scene.build(AssetStore(tmp_path / "store"))
         assert any("camera 'eye': its angle of view" in line for line in made.skipped) == skipped
         assert len(made.spec.cameras) == (0 if skipped else 1)
+
+
+def test_pictures_that_other_programs_would_have_to_read_are_refused(tmp_path: Path) -> None:
+    """Pillow gives PostScript to Ghostscript, by its content and not by the name of the file."""
+    path = write_obj(tmp_path)
+    picture = tmp_path / "picture.png"
+    Image.fromarray(PIXELS).save(tmp_path / "a.eps")
+    picture.write_bytes((tmp_path / "a.eps").read_bytes())
+    with pytest.raises(SceneBuildError, match="in the form EPS; PNG, JPEG"):
+        load_file(path)
+    with pytest.raises(SceneBuildError, match="no image that can be read"):
+        SceneBuilder().add_box(half_size=(1, 1, 1), texture=picture)

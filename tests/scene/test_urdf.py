@@ -220,6 +220,9 @@ def test_xacro_is_to_be_expanded(tmp_path: Path) -> None:
         SceneBuilder().add_urdf(path)
     with pytest.raises(SceneBuildError, match="is a folder: name a file"):
         SceneBuilder().add_urdf(tmp_path)
+    (tmp_path / "part.glb").write_bytes(b"glTF")
+    with pytest.raises(SceneBuildError, match=r"part\.glb is no URDF: files that end in \.glb go with add_file"):
+        SceneBuilder().add_urdf(tmp_path / "part.glb")
 
 
 def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
