@@ -121,8 +121,10 @@ class Owner(Publishing, ScenePatches):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What people should know about how the session started: another name, other addresses; one line each."""
-        return () if self._processes is None else tuple(self._processes.notes)
+        """What people should know about how the session started (another name, other addresses), and what clients do
+        not see of its scenes; one line each."""
+        live = self._processes
+        return () if live is None else tuple(dict.fromkeys((*live.notes, *live.scenes.notes)))
 
     @property
     def recording(self) -> Path | None:

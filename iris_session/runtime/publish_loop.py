@@ -26,7 +26,7 @@ from iris_session.runtime.deformables import Bending
 from iris_session.runtime.draft import Frame
 from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.processes import SessionProcesses
-from iris_session.runtime.stepper import Stepper
+from iris_session.runtime.stepper import Stepper, ended_by
 from iris_session.scene.composed import ComposedScene
 
 #: Silence after which steps without a frame begin, and their distance.
@@ -85,7 +85,7 @@ class PublishLoop:
         self._cadence = Cadence()
         self._closed = threading.Event()
         self._wake = threading.Event()
-        self._error: BaseException | None = None
+        self._error: Exception | None = None
         self._where: TracebackType | None = None
         with self.lock:
             self._idle()  # who joins before the first frame sees the scene as it was composed
@@ -163,7 +163,7 @@ class PublishLoop:
     def _step(self, n_ticks: int, plant: bytes = b"") -> None:
         try:
             self._stepper.step(n_ticks, plant, publish=False)
-        except Exception as error:  # whoever took it, the helper ends
+        except BaseException as error:  # whoever took it, the helper ends; Ctrl-C breaks one off, too
             self._fail(error)
             raise
         self._processes.watch(self._stepper)
@@ -176,7 +176,7 @@ class PublishLoop:
         self._stepper.publish_now(self._state_ns, self._shown_ns)
 
     def _fail(self, error: BaseException) -> None:
-        self._error, self._where = error, error.__traceback__
+        self._error, self._where = ended_by(error), error.__traceback__
 
     # --- the helper ---------------------------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ from iris_session.runtime.errors import ConfigError, OwnershipError, PublishErro
 from iris_session.runtime.owner import Owner
 from iris_session.runtime.processes import Composed, SessionProcesses
 from iris_session.runtime.publish_loop import PublishLoop, ShownVertices
-from iris_session.runtime.stepper import session_clock
+from iris_session.runtime.stepper import NextPatch, session_clock
 from iris_session.scene import AssetStore, SceneBuildError
 from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.composed import ComposedScene
@@ -95,7 +95,7 @@ class ScenePublisher(Owner):
             raise ConfigError(f"the scene cannot be built: {error}") from error
         except OSError as error:
             raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from error
-        with store.hold(composed.addresses):  # until the processes hold them
+        with _held(store, composed.addresses):  # until the processes hold them
             self._begin(composed, carrier)
 
     def _begin(self, composed: ComposedScene, carrier: Carrier) -> None:
@@ -209,6 +209,7 @@ class ScenePublisher(Owner):
     def post(self, message: EntryMessage) -> None:
         """Puts an input of the owner (connection 0, rights of a director) into the next step."""
         self._live()
+        self._started()[1].check()  # else nobody would take it
         assert self._stepper is not None
         self._stepper.post(message)
 
@@ -242,6 +243,10 @@ class ScenePublisher(Owner):
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
+    def _queue(self, patch: NextPatch) -> None:
+        self._started()[1].check()
+        super()._queue(patch)
+
     def _unchanging(self) -> AbstractContextManager[object]:
         return nullcontext() if self._loop is None else self._loop.lock
 
@@ -250,6 +255,13 @@ class ScenePublisher(Owner):
         if self._draft is None or self._loop is None:
             raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
         return self._draft, self._loop
+
+
+def _held(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
+    try:
+        return store.hold(addresses)
+    except OSError:  # no locks, or no room: the session says so when it cannot hold them either
+        return nullcontext()
 
 
 def _checked(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:

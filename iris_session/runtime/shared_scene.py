@@ -27,6 +27,7 @@ from iris_session.transport import SceneInfo
 #: them for the recording. A session that is patched ten times a second must not fill the disk.
 KEPT_LOOKS: Final = 96
 KEPT_LOOKS_S: Final = 10.0
+NOTHING_TO_SEE: Final = "clients get no meshes and textures"
 
 
 class Shown(NamedTuple):
@@ -59,7 +60,7 @@ class SharedScenes:
             try:
                 self._store = AssetStore(None if where is True else where)
             except OSError as error:
-                self._without(f"{error.filename or where}: {error.strerror or error}")
+                self._say(f"{NOTHING_TO_SEE}: {error.filename or where}: {error.strerror or error}")
 
     def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> Shown:
         """Of the scene as it begins (`initial_state` empty: as the model says) and what has changed in it since: so
@@ -79,7 +80,7 @@ class SharedScenes:
             )
             shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
-            self._without(str(error))
+            self._say(f"{NOTHING_TO_SEE}: {error}")
             return Shown(plain)
         self._say(*(f"clients do not see {what}" for what in parsed.skipped))
         return shown
@@ -88,7 +89,10 @@ class SharedScenes:
         """The newest scene with `ops`. Raises `SceneError`, `OSError`. Hold `lock` until `take`."""
         newest = self.newest
         if self._store is None or newest is None or newest.spec is None:
-            raise SceneError("this session shares no specification of its scene: set `assets` of SessionConfig")
+            why = (
+                "; ".join(note for note in self.notes if NOTHING_TO_SEE in note) or "`assets` of SessionConfig is False"
+            )
+            raise SceneError(f"this session shares no specification of its scene: {why}")
         merging = merged(newest.patches, ops)
         if len(merging) > MAX_PATCHES:
             raise SceneError(
@@ -136,10 +140,6 @@ class SharedScenes:
         while len(looks) > KEPT_LOOKS and now - looks[0].shown_s > KEPT_LOOKS_S:
             look = looks.popleft()
             store.discard(look.address, look.used_at)
-
-    def _without(self, why: str) -> None:
-        self._store = None
-        self._say(f"clients get no meshes and textures: {why}")
 
     def _say(self, *texts: str) -> None:
         """Each once: a session may load its scenes, and patch them, for days."""

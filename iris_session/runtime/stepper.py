@@ -34,6 +34,7 @@ from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, make_row
 from iris_session.runtime.core import Plant, SessionCore, StepOutcome, unmeasured
 from iris_session.runtime.deformables import Bending
+from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.shared_scene import Shown
 from iris_session.runtime.status import SessionLedger
 
@@ -146,7 +147,7 @@ class Stepper:
         self.step_count = 0 if resumed_from is None else resumed_from.step + 1
         self._newest_step = 0
         self.last: StepOutcome | None = None
-        self._crash: Exception | None = None
+        self._ended: Exception | None = None
         self._host: deque[EntryMessage] = deque()
         self._scenes: deque[NextScene | NextPatch] = deque()
         #: Called with another scene before the step that loads it.
@@ -194,10 +195,18 @@ class Stepper:
         """Takes one step now. `plant`: see `SessionCore.step` (open sessions).
 
         `publish` false: the state that this step leads to is not there yet, its maker calls `publish` when it is.
-        After an error in the core no step is taken any more, whoever asks for it: that one is raised again.
+        After one that raised, or that Ctrl-C broke off, no step is taken any more, whoever asks for it: half a step is
+        in no journal, and what followed would not fit it. What ended the first is raised again (`ended_by`).
         """
-        if self._crash is not None:
-            raise self._crash
+        if self._ended is not None:
+            raise self._ended
+        try:
+            return self._step(n_ticks, plant, publish)
+        except BaseException as error:
+            self._ended = ended_by(error)
+            raise
+
+    def _step(self, n_ticks: int, plant: bytes, publish: bool) -> StepOutcome:
         now_ns = self.clock()
         if now_ns <= self._last_now_ns:  # one step per instant: session time strictly grows
             now_ns = self._last_now_ns + 1
@@ -209,8 +218,7 @@ class Stepper:
         self._last_now_ns = now_ns
         try:
             outcome = self.core.step(now_ns, entries, n_ticks, plant, digest=self.recorder is not None, lap=self.lap)
-        except Exception as error:
-            self._crash = error
+        except Exception:
             if self.recorder is not None:  # what led to it is worth more than all before
                 self.recorder.row(make_row(self._chain, self.step_count, now_ns, n_ticks, entries, CRASHED, plant))
                 self.recorder.flush()
@@ -339,6 +347,15 @@ def _checked(message: EntryMessage) -> EntryMessage:
         return decode_entry(encode_entry(Entry(HOST, HOST, 0, checked))).message
     except msgspec.ValidationError as error:
         raise ValueError(f"{type(message).__name__} cannot be used: {error}") from error
+
+
+def ended_by(error: BaseException) -> Exception:
+    """What whoever goes on after an error is told: that error, unless it was an interrupt, which is not theirs."""
+    if isinstance(error, Exception):
+        return error
+    ended = OwnershipError("a step was broken off by an interrupt, so the session cannot go on: close it")
+    ended.__cause__ = error
+    return ended
 
 
 def session_clock(origin_ns: int) -> Callable[[], int]:

@@ -278,6 +278,27 @@ def test_no_step_follows_one_that_failed_in_the_publishers_thread(rig: Rig) -> N
     assert len(rig.recorder.rows) == rows
 
 
+def test_ctrl_c_within_a_step_ends_the_session_and_the_journal_before_it(rig: Rig) -> None:
+    rig.publish(1.0)
+    steps = rig.stepper.core.step
+
+    def interrupted(*_: object, **__: object) -> None:
+        rig.stepper.core.step = steps  # type: ignore[method-assign]
+        raise KeyboardInterrupt
+
+    with rig.loop.lock:  # the helper waits
+        rig.now_ns += 100 * MS
+        rig.stepper.core.step = interrupted  # type: ignore[method-assign,assignment]
+        with pytest.raises(KeyboardInterrupt):
+            rig.publish(2.0)
+    rows = len(rig.recorder.rows)
+    with pytest.raises(OwnershipError, match="broken off by an interrupt"):
+        rig.publish(3.0)
+    rig.loop.close()
+    assert len(rig.recorder.rows) == rows
+    assert rig.recorder.rows[-1].digest != CRASHED, "nothing of the step is at fault"
+
+
 def test_what_stops_the_helper_is_raised_where_it_is_seen(rig: Rig) -> None:
     def broken() -> list[Entry]:
         raise RuntimeError("the link is broken")

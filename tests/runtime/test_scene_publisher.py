@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +22,12 @@ from iris_session import (
     Session,
     SessionConfig,
 )
-from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.runtime.cadence import SILENT_NS
 from iris_session.runtime.verification import verify_recording
+from iris_session.scene import AssetStore
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
 NAN = float("nan")
@@ -230,6 +233,40 @@ def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="cannot be built"):
         ScenePublisher(broken, CONFIG).start()
+
+
+def test_a_store_without_locks_is_no_reason_not_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As network drives are: what is shared may be taken away by others, which is said."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(AssetStore, "hold", no_locks)
+    with ScenePublisher(scene(), replace(CONFIG, assets=tmp_path)) as session:
+        session.publish()
+        assert any("cannot be held" in note for note in session.notes)
+
+
+def test_what_stopped_the_session_is_raised_to_whoever_asks_something_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ScenePublisher(scene(), CONFIG) as session:
+        assert session._stepper is not None
+        assert session.scene is not None
+        before, floor = session.scene, session.scene.visuals[0]
+
+        def broken(*_: object, **__: object) -> None:
+            raise KeyError("the core is broken")
+
+        monkeypatch.setattr(session._stepper.core, "step", broken)
+        with pytest.raises(KeyError, match="broken"):
+            session.run(seconds=30.0)
+        for call in (
+            session.publish,
+            lambda: session.estop("now"),
+            lambda: session.patch_scene(RemoveVisual(floor.id)),
+        ):
+            with pytest.raises(KeyError, match="broken"):
+                call()
+        assert session.scene is before
 
 
 def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import signal
@@ -20,11 +21,12 @@ from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import encode_scene
-from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
+from iris_session.protocol.scene_patch import AddVisual, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.runtime import scene_change
 from iris_session.runtime.core import plant_state
 from iris_session.runtime.verification import verify_recording
+from iris_session.scene import AssetStore
 
 QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
 
@@ -159,12 +161,23 @@ def test_a_look_can_be_changed_before_the_first_step(tmp_path: Path, monkeypatch
             session.patch_scene(RemoveVisual(seen.id))
         assert session.scene.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
         told = session.scene
-        session.run(until=lambda: sum(isinstance(body, SceneChanged) for body in _bodies(session)) == 2, seconds=30.0)
+
+        def changes() -> list[SceneChanged]:
+            return [body for body in _bodies(session) if isinstance(body, SceneChanged)]
+
+        session.run(until=lambda: len(changes()) == 2, seconds=30.0)
+        assert changes()[1].scene_hash == hashlib.sha256(encode_scene(told)).hexdigest()
         session.patch_scene(RemoveVisual(seen.id))
-        session.run(seconds=0.1)
-        changes = [body for body in _bodies(session) if isinstance(body, SceneChanged)]
-        assert [change.scene_revision for change in changes] == [1, 2, 3]
-        assert changes[1].scene_hash == hashlib.sha256(encode_scene(told)).hexdigest()
+        session.run(until=lambda: len(changes()) == 3, seconds=30.0)
+        assert [change.scene_revision for change in changes()] == [1, 2, 3]
+        assert not [note for note in session.notes if "cannot be held" in note]
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(AssetStore, "hold", full)
+        session.patch_scene(AddVisual(seen))
+        assert "No space left" in session.notes[-1], "what comes up later is said as well"
     assert verify_recording(path).ok
 
 

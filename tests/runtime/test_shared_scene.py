@@ -73,6 +73,27 @@ def test_a_disk_that_is_full_does_not_undo_a_scene(
     assert len(scenes.notes) == said, "once, however often it is patched"
 
 
+def test_a_scene_that_cannot_be_shared_leaves_the_next_one_its_picture(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = SharedScenes(tmp_path, "test")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(AssetStore, "_write", full)
+        scenes.take(scenes.make(world))
+    with pytest.raises(SceneError, match=r"no specification of its scene: clients get no meshes .*No space left"):
+        scenes.patch([SetVisual(0, rgba=(0.0, 0.0, 0.0, 1.0))])
+    scenes.take(scenes.make(world))
+    assert scenes.newest is not None
+    assert scenes.newest.spec is not None
+    scenes.close()
+    with pytest.raises(SceneError, match="`assets` of SessionConfig is False"):
+        SharedScenes(False, "test").patch([SetVisual(0)])
+
+
 def test_what_no_store_has_is_not_shown(world: World, tmp_path: Path) -> None:
     """It would be asked for by everybody, and refused."""
     scenes = SharedScenes(tmp_path, "test")

@@ -16,6 +16,7 @@ from iris_session.protocol.entries import HOST, Entry, RecordingGap, decode_entr
 from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
+from iris_session.runtime.errors import OwnershipError
 from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
 from iris_session.transport import link_messages
 from tests.runtime.play import TICK_NS, entries, make_core
@@ -162,6 +163,23 @@ def test_the_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
     with pytest.raises(KeyError):
         rig.steps(1)
     assert rig.recorder.rows[-1] is row, "no row follows, whatever thread would take the next step"
+
+
+def test_a_step_that_an_interrupt_broke_off_is_the_last(rig: Rig) -> None:
+    """Ctrl-C in a script's own loop: a helper thread would go on from half a step, which no journal has."""
+    rig.steps(3)
+
+    def interrupted(step: int, decision: Decision) -> None:
+        raise KeyboardInterrupt
+
+    rig.front.send_decision = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        rig.steps(1)
+    del rig.front.send_decision
+    for _ in range(2):
+        with pytest.raises(OwnershipError, match="broken off by an interrupt"):
+            rig.steps(1)
+    assert len(rig.recorder.rows) == 3
 
 
 def test_keyframes_at_the_start_and_at_their_distance(rig: Rig) -> None:
