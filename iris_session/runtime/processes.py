@@ -274,10 +274,10 @@ class SessionProcesses:
             self.front.set_anchors(stepper.core.authority.anchors)
             fault = self.front.fault or "ended"
             what = replaced(self.front.restart, FrontError)
-            stepper.post(Marker(request_id=0, text=f"the front process {fault} and {what}"))
+            stepper.say(Marker(request_id=0, text=f"the front process {fault} and {what}"))
         if self.supervisor is not None and self.feed is not None:
             for text in self.supervisor.look(now_ns, self.feed.silence_ns):
-                stepper.post(Marker(request_id=0, text=text))
+                stepper.say(Marker(request_id=0, text=text))
         self._watch_plant(stepper)
         if self.front is not None and self.reporter.due(now_ns):
             self.front.link.send_report(self.reporter.report(stepper, self))
@@ -288,7 +288,7 @@ class SessionProcesses:
         for what, count in seen.items():
             before = self._trouble_seen.get(what, 0)
             if what not in self._trouble:
-                stepper.post(Marker(request_id=0, text=f"MuJoCo: {what}; give the model <size memory='...'/>"))
+                stepper.say(Marker(request_id=0, text=f"MuJoCo: {what}; give the model <size memory='...'/>"))
             self._trouble[what] = self._trouble.get(what, 0) + (count - before if count >= before else count)
         self._trouble_seen = seen
 

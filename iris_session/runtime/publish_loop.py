@@ -11,6 +11,7 @@ A row of the journal has a plant's state only where a frame came: in between it 
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from types import TracebackType
@@ -35,6 +36,8 @@ IDLE_PERIOD_S: Final = 0.01
 #: Silence after which the state is sent again, and again after as long; two periods of the state at least. Longer
 #: than the distance of the frames of any source that moves: a repeated pose between two would be seen as a halt.
 REPEAT_NS: Final = 250_000_000
+
+_log = logging.getLogger(__name__)
 
 
 class ShownVertices:
@@ -86,7 +89,7 @@ class PublishLoop:
         self._closed = threading.Event()
         self._wake = threading.Event()
         self._error: Exception | None = None
-        self._where: TracebackType | None = None
+        self._traceback: TracebackType | None = None
         with self.lock:
             self._idle()  # who joins before the first frame sees the scene as it was composed
         self._helper = threading.Thread(target=self._work, name="iris-session-publish", daemon=True)
@@ -121,7 +124,7 @@ class PublishLoop:
     def check(self) -> None:
         """Raises what stopped the helper, `OwnershipError` after `close`."""
         if self._error is not None:
-            raise self._error.with_traceback(self._where)  # which would grow with every time that it is raised
+            raise self._error.with_traceback(self._traceback)  # which would grow with every time that it is raised
         if self._closed.is_set():
             raise OwnershipError("the session is closed: nothing can be published any more")
 
@@ -147,7 +150,7 @@ class PublishLoop:
         if self._due_ns <= now_ns:
             self._due_ns = now_ns + self._period_ns
         if frame.anew:
-            self._stepper.post(ExternalReset())
+            self._stepper.say(ExternalReset())
         self._step(1, self._carrier.state(frame.time_s, frame.poses))
         self._vertices.newest = frame.vertices
         self._delay_ns = max(0, now_ns - frame.capture_ns)
@@ -176,7 +179,7 @@ class PublishLoop:
         self._stepper.publish_now(self._state_ns, self._shown_ns)
 
     def _fail(self, error: BaseException) -> None:
-        self._error, self._where = ended_by(error), error.__traceback__
+        self._error, self._traceback = ended_by(error), error.__traceback__
 
     # --- the helper ---------------------------------------------------------------------------------------------------
 
@@ -187,8 +190,9 @@ class PublishLoop:
                 self._wake.clear()
                 with self.lock:
                     self._turn()
-        except BaseException as error:  # shown at the next `publish`, where it can be seen
+        except BaseException as error:  # raised at the next `publish`, which may not come
             self._fail(error)
+            _log.error("no step is taken any more: %s: %s", type(error).__name__, error)
 
     def _pause_s(self) -> float:
         """Until the frame that waits is due, but never long."""

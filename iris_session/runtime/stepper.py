@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.client_messages import Control, GetSnapshot, Marker
+from iris_session.protocol.client_messages import Control, EStop, GetSnapshot, Marker
 from iris_session.protocol.common import MAX_TEXT, Applied, Pose
 from iris_session.protocol.entries import (
     HOST,
@@ -40,6 +40,8 @@ from iris_session.runtime.status import SessionLedger
 
 #: Host entries waiting for the next step; a script that posts more in one step is refused with an error.
 MAX_HOST_ENTRIES: Final = 256
+#: As many more are kept for e-stops, and for what the session says itself: a few a step.
+ROOM_FOR_OURS: Final = 64
 #: Scenes and patches that wait; a step takes one.
 MAX_SCENES: Final = 64
 
@@ -178,10 +180,17 @@ class Stepper:
     def post(self, message: EntryMessage) -> None:
         """Queues an input of the session's owner for the next step. Thread-safe (`deque.append`).
 
-        Texts are cut to the length of a `Text`. Raises `ValueError` for anything else that the protocol does not take.
+        Texts are cut to the length of a `Text`. Raises `ValueError` for anything else that the protocol does not take,
+        `OwnershipError` when too many wait; an e-stop is not refused for that.
         """
-        if len(self._host) >= MAX_HOST_ENTRIES:
-            raise RuntimeError(f"more than {MAX_HOST_ENTRIES} host entries wait for one step: is the loop running?")
+        if len(self._host) >= MAX_HOST_ENTRIES and not isinstance(message, EStop):
+            raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for one step: is the loop running?")
+        self.say(message)
+
+    def say(self, message: EntryMessage) -> None:
+        """As `post`, of what befell the session itself: whatever its owner has posted, there is room for it."""
+        if len(self._host) >= MAX_HOST_ENTRIES + ROOM_FOR_OURS:
+            raise RuntimeError(f"{len(self._host)} inputs wait for one step: is the loop running?")
         self._host.append(_checked(message))
 
     def change_scene(self, scene: NextScene | NextPatch) -> None:
@@ -229,8 +238,8 @@ class Stepper:
         anew = self.last is None or not self.last.diverged
         if outcome.diverged and (anew or not (plant or outcome.decision.paused)):  # no resume but by a reset
             if not plant:  # a user's loop is not ours to pause
-                self.post(Control(request_id=0, action="pause"))
-            self.post(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
+                self.say(Control(request_id=0, action="pause"))
+            self.say(Marker(request_id=0, text=f"physics stands still until a reset: {outcome.diverged}"))
         self.last = outcome
         self.front.send_decision(self.step_count, outcome.decision)
         self._newest_step = self.step_count
@@ -322,7 +331,7 @@ class Stepper:
         recorder.row(row)
         lost = recorder.take_gap()
         if lost:
-            self.post(RecordingGap(lost))
+            self.say(RecordingGap(lost))
         if recorder.wants_keyframe or now_ns >= self._next_keyframe_ns:
             self._keyframe(now_ns)
 

@@ -84,7 +84,7 @@ class UserLoop:
             now_ns = self._stepper.clock()
             silence_ns = now_ns - self._last_tick_ns
             if silence_ns > GAP_NS:
-                self._stepper.post(StalledGap(silence_ns))
+                self._stepper.say(StalledGap(silence_ns))
             self._last_tick_ns = now_ns
             if not self._take_plant():
                 self._stepper.step(0, self._plant)
@@ -174,10 +174,10 @@ class UserLoop:
         diverged = not np.isfinite(np.frombuffer(plant)).all()
         if diverged and not self._diverged:
             text = "the user's simulation has numbers that are not finite: robots hold until it is reset"
-            self._stepper.post(Marker(request_id=0, text=text))
+            self._stepper.say(Marker(request_id=0, text=text))
             self._diverged_ns = self._stepper.clock()
         elif self._diverged and not diverged:
-            self._stepper.post(StalledGap(self._stepper.clock() - self._diverged_ns))
+            self._stepper.say(StalledGap(self._stepper.clock() - self._diverged_ns))
         self._diverged = diverged
         if diverged:
             return False
@@ -189,7 +189,7 @@ class UserLoop:
         if self._was_reset:
             self._was_reset = False
             self._began_time = None
-            self._stepper.post(ExternalReset())
+            self._stepper.say(ExternalReset())
 
     def _idle(self) -> None:
         try:

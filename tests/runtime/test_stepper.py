@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.client_messages import Assign, Control, EStop, Marker
 from iris_session.protocol.common import Applied
-from iris_session.protocol.entries import HOST, Entry, RecordingGap, decode_entries
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, RecordingGap, decode_entries
 from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
 from iris_session.protocol.steps import Decision
 from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
 from iris_session.runtime.errors import OwnershipError
-from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper
 from iris_session.transport import link_messages
 from tests.runtime.play import TICK_NS, entries, make_core
 
@@ -241,9 +241,16 @@ def test_rows_that_the_recorder_lost_are_told_in_the_next_step(rig: Rig) -> None
 def test_host_entries_are_bounded(rig: Rig) -> None:
     for i in range(MAX_HOST_ENTRIES):
         rig.stepper.post(Marker(0, f"m{i}"))
-    with pytest.raises(RuntimeError, match="is the loop running"):
+    with pytest.raises(OwnershipError, match="is the loop running"):
         rig.stepper.post(Marker(0, "one more"))
+    rig.stepper.say(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
+    for _ in range(ROOM_FOR_OURS - 1):
+        rig.stepper.post(EStop("somebody shouts"))
+    with pytest.raises(RuntimeError, match="is the loop running"):
+        rig.stepper.post(EStop("one more"))
     rig.steps(1)
+    assert rig.stepper.last is not None
+    assert rig.stepper.last.decision.estop
     rig.stepper.post(Marker(0, "there is room again"))
 
 
