@@ -6,6 +6,7 @@ Colours are taken as they stand in the file. Where it has no normals they are ma
 from __future__ import annotations
 
 import io
+import logging
 import math
 import re
 from pathlib import Path
@@ -50,13 +51,14 @@ def read_with_trimesh(path: Path, references: References) -> Loaded:
     data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+        with np.errstate(all="ignore"):  # what is not finite is looked for after that
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+            reader = _Reader(trimesh, path.name)
+            nodes = reader.nodes(scene)
     except IndexError:
         if kind == "obj":
             absolute_corners(path.name, data)  # says which
         raise
-    reader = _Reader(trimesh, path.name)
-    nodes = reader.nodes(scene)
     lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
     return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
 
@@ -273,4 +275,7 @@ def _trimesh() -> Any:
         import trimesh
     except ImportError:
         raise SceneBuildError("mesh files need trimesh: pip install 'iris-session[files]'") from None
+    logger = logging.getLogger("trimesh")
+    if not logger.handlers:  # else Python prints its tracebacks where nobody has asked for a log
+        logger.addHandler(logging.NullHandler())
     return trimesh

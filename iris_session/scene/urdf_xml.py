@@ -77,7 +77,7 @@ def _document(etree: Any, path: Path, data: bytes) -> Any:
         return etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         if any(entry.domain_name != "NAMESPACE" for entry in parser.error_log):
-            raise SceneBuildError(f"{path} is no XML: {error}") from None
+            raise SceneBuildError(f"{path} is no XML: {' '.join(str(error).split())}") from None
     root = etree.fromstring(data, etree.XMLParser(recover=True, **safe))
     for element in list(root.iter(etree.Element)):
         if element.prefix is None and ":" in element.tag and not element.tag.startswith("{"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -87,3 +89,21 @@ def test_materials_that_are_missing_are_told(tmp_path: Path) -> None:
         "b.obj: materials that its MTL file does not have: red",
         "b.obj: of material blue the pictures map_bump",
     )
+
+
+def test_nothing_is_printed_besides_the_refusal(tmp_path: Path) -> None:
+    """In a process of its own: a library that logs has no handler there, and Python prints what it logs."""
+    broken = FACET.replace("normal 0 0 1", "normal 0 zero 1")
+    path = written(tmp_path, "a.stl", f"solid x\n{broken}{FACET}endsolid")
+    far = written(tmp_path, "b.obj", CORNERS.replace("0 1 0", "0 1e999 -1e999") + "f 1 2 3\n")
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom iris_session.scene.files import load_file\n"
+        "from iris_session.scene import SceneBuildError\n"
+        "for name in sys.argv[1:]:\n    try:\n        load_file(Path(name))\n"
+        "    except SceneBuildError as error:\n        print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path), str(far)], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stderr == ""
+    assert "b.obj: a vertex of" in done.stdout

@@ -137,6 +137,7 @@ def test_picture_is_mujocos(tmp_path: Path) -> None:
         ('rgba="0.9 0.5', 'rgba="nan 0.5', "4 finite numbers must stand"),
         ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
         ("</robot>", "", "no XML"),
+        ("</robot>", "\0</robot>", "no XML: .*allowed range"),
         ('<link name="base">', "<link>", r"arm\.urdf, line 1: <link> has no name"),
         ('<joint name="turn" type="revolute">', '<joint name="turn">', "<joint> turn has no type"),
         ('<parent link="base"/>', "", '<joint> turn has no <parent link="...">'),
@@ -152,8 +153,9 @@ def test_faults_are_named(tmp_path: Path, before: str, after: str, text: str) ->
     urdf = write_arm(tmp_path)
     assert before in urdf.read_text()
     urdf.write_text(urdf.read_text().replace(before, after))
-    with pytest.raises(SceneBuildError, match=text):
+    with pytest.raises(SceneBuildError, match=text) as raised:
         SceneBuilder().add_urdf(urdf)
+    assert "\n" not in str(raised.value)
 
 
 def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
