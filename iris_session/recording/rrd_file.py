@@ -32,6 +32,8 @@ END_MESSAGE: Final = _HEAD.pack(KIND_END, 0)
 _ARROW_HEAD: Final = struct.pack("<Q", KIND_ARROW)
 #: Messages that are tried together; a group that fails is halved until the bad ones are alone.
 GROUP: Final = 256
+#: What is searched at once for messages behind a damaged one.
+WINDOW_BYTES: Final = 1 << 20
 
 
 class Message(NamedTuple):
@@ -46,7 +48,8 @@ class Scan(NamedTuple):
     """`holes`: spans between readable messages that are none. `good_bytes`: after the last readable message.
 
     `cut`: the file ends in the middle of a message, as after a kill or a full disk. Behind the message that ends a file
-    nothing belongs to it, but the tail that Rerun's own files have.
+    nothing belongs to it, but the tail that Rerun's own files have. `indexed`: it ends with Rerun's index, which a
+    recorder does not write: one of Rerun's tools has made it, from one file or several.
     """
 
     messages: list[Message]
@@ -54,6 +57,7 @@ class Scan(NamedTuple):
     good_bytes: int
     size: int
     cut: bool
+    indexed: bool
 
 
 class Mark(NamedTuple):
@@ -89,7 +93,7 @@ def scan(path: str | Path) -> Scan:
                 at += FILE_TAIL if FOOT in file.read(FILE_TAIL) else 0
                 break
     ended = bool(found) and found[-1].kind == KIND_END
-    return Scan(found, holes, min(at, size), size, at < size and not ended)
+    return Scan(found, holes, min(at, size), size, at < size and not ended, ended and found[-1].length > 0)
 
 
 def end_of_messages(data: bytes) -> int:
@@ -114,16 +118,18 @@ def _message_at(file: BinaryIO, at: int, size: int) -> Message | None:
 
 def _next_message(file: BinaryIO, begin: int, size: int) -> int | None:
     """Where messages go on behind a damaged head: an Arrow message that is followed by another one or by the end."""
-    file.seek(begin)
-    rest = file.read()
-    at = rest.find(_ARROW_HEAD)
-    while at >= 0:
-        message = _message_at(file, begin + at, size)
-        if message is not None:
-            end = message.offset + _HEAD.size + message.length
-            if end == size or _message_at(file, end, size) is not None:
-                return message.offset
-        at = rest.find(_ARROW_HEAD, at + 1)
+    overlap = len(_ARROW_HEAD) - 1
+    for window in range(begin, size, WINDOW_BYTES):
+        file.seek(window)
+        data = file.read(WINDOW_BYTES + overlap)
+        at = data.find(_ARROW_HEAD)
+        while at >= 0:
+            message = _message_at(file, window + at, size)
+            if message is not None:
+                end = message.offset + _HEAD.size + message.length
+                if end == size or _message_at(file, end, size) is not None:
+                    return message.offset
+            at = data.find(_ARROW_HEAD, at + 1)
     return None
 
 
@@ -133,6 +139,8 @@ def changed_spans(path: str | Path, marks: Sequence[Mark]) -> list[str]:
     None of a file that another tool has rewritten: there the marks end nowhere between messages.
     """
     found = scan(path)
+    if found.indexed:
+        return []
     ends = {m.offset for m in found.messages} | {found.size}
     if not any(mark.end in ends for mark in marks):
         return []
@@ -154,13 +162,20 @@ def _crc(file: BinaryIO, mark: Mark) -> int:
 
 
 def chunks(path: str | Path, entity: str) -> Iterator[Any]:
-    """Chunks of one entity in the order of writing. The file must be readable, see `Prober`."""
+    """Chunks of one entity in the order of the file. It must be readable, see `Prober`.
+
+    Raises `NotARecordingError` when it is so no longer.
+    """
     from rerun.chunk import RrdReader
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a file without a footer is normal here: the recorder may have been killed
-        stream = RrdReader(str(path)).stream().filter(content=entity)
-    return iter(stream)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a file without a footer is normal here: the recorder may have been killed
+            stream = RrdReader(str(path)).stream().filter(content=entity)
+        yield from stream
+    except (OSError, RuntimeError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise NotARecordingError(f"{path} can no longer be read: {said}") from error
 
 
 def salvage(path: str | Path, copy: str | Path, prober: Prober) -> list[str]:

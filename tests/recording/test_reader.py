@@ -46,7 +46,11 @@ def test_a_file_that_was_cut_reads_up_to_the_cut(path: Path, lost_messages: int,
     assert (report.steps, report.last_step, report.finished) == (len(steps), len(steps) - 1, lost_messages == 1)
 
 
-def test_a_damaged_length_hides_one_message_and_not_the_rest(path: Path) -> None:
+@pytest.mark.parametrize("window", [rrd_file.WINDOW_BYTES, 1000, 9])
+def test_a_damaged_length_hides_one_message_and_not_the_rest(
+    path: Path, monkeypatch: pytest.MonkeyPatch, window: int
+) -> None:
+    monkeypatch.setattr(rrd_file, "WINDOW_BYTES", window)
     data = bytearray(path.read_bytes())
     messages = [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW]
     victim = messages[-6]
@@ -120,6 +124,33 @@ def test_an_empty_part_is_said_and_skipped(tmp_path: Path, path: Path) -> None:
     report = verify(path, SmallCore)
     assert report.ok, report.line()
     assert "part2" in report.line()
+
+
+def test_a_part_of_another_session_is_left_out_and_said(path: Path) -> None:
+    header, batch = journal(100)
+    write(Path(part_path(str(path), 2)), msgspec.structs.replace(header, session_name="another"), batch)
+    with Recording.open(path, warn=False) as recording:
+        assert recording.damage == ["session.part2.rrd is of another session, and left out"]
+        assert [row.step for row in recording.rows()] == list(range(200))
+        assert recording.finished
+
+
+def test_a_folder_is_told_from_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(NotARecordingError, match=r"is a folder: name the first file of the recording in it"):
+        Recording.open(tmp_path)
+
+
+def test_a_file_that_is_gone_meanwhile_is_said(path: Path) -> None:
+    with Recording.open(path) as recording:
+        path.unlink()
+        with pytest.raises(NotARecordingError, match="can no longer be read"):
+            list(recording.rows())
+
+
+@pytest.mark.parametrize("name", ["a\nb.rrd", 'a "b".rrd'])
+def test_a_file_may_have_any_name(path: Path, name: str) -> None:
+    with Recording.open(path.rename(path.with_name(name))) as recording:
+        assert (recording.damage, recording.finished) == ([], True)
 
 
 def test_a_part_that_is_missing_is_found(tmp_path: Path) -> None:

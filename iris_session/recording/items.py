@@ -1,0 +1,173 @@
+"""What stands in the columns of a recording, as values: rows, keyframes, states, events, raw messages. Pure.
+
+Each function takes an Arrow record batch and gives one value per row. What it raises (`UNREADABLE`) says that the bytes
+mean something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Applied
+from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
+from iris_session.recording import paths
+from iris_session.recording.joining import entity_of
+from iris_session.recording.journal import JournalRow, Keyframe, open_blob
+from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
+from iris_session.recording.rrd_file import Mark
+
+#: What decoding of bytes that mean something else may raise.
+UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+_T = TypeVar("_T")
+
+_decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
+_decode_applied = msgspec.msgpack.Decoder(tuple[Applied, ...]).decode
+
+
+class RawSample(NamedTuple):
+    """A message of a client as it came. `receive_ns`: session time."""
+
+    connection: int
+    receive_ns: int
+    data: bytes
+
+
+class State(NamedTuple):
+    """`poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, world frame, exactly as the session had them. `bodies`: of
+    which body each is."""
+
+    step: int
+    tick: int
+    sim_time: float
+    session_time: int
+    poses: NDArray[np.float64]
+    presence: tuple[PresenceItem, ...]
+    applied: tuple[Applied, ...]
+    bodies: tuple[BodyInfo, ...] = ()
+
+
+class Scalar(NamedTuple):
+    """A value of a plot. `session_time`: [ns]."""
+
+    entity: str
+    session_time: int
+    value: float
+
+
+def rows(batch: Any) -> Iterator[JournalRow]:
+    """Rows of the journal."""
+    columns = zip(
+        index(batch, paths.STEP),
+        index(batch, paths.SESSION_TIME),
+        values(batch, "n_ticks"),
+        values(batch, "entries"),
+        _lists(batch, "entry_lengths"),
+        _lists(batch, "entry_crcs"),
+        values(batch, "digest"),
+        values(batch, "chain"),
+        _lists(batch, "field_crcs"),
+        _plants(batch),
+        strict=True,
+    )
+    return (JournalRow(*row) for row in columns)
+
+
+def states(batch: Any) -> Iterator[State]:
+    """States without their `bodies`."""
+    _flat(batch, "poses")
+    lists = batch.column("poses")
+    ends = np.cumsum(np.asarray(lists.value_lengths(), np.intp))  # another scene has other bodies
+    poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
+    columns = zip(
+        index(batch, paths.STEP),
+        index(batch, paths.TICK),
+        values(batch, "sim_time_s"),
+        index(batch, paths.SESSION_TIME),
+        poses,
+        map(_decode_presence, values(batch, "presence")),
+        map(_decode_applied, values(batch, "applied")),
+        strict=True,
+    )
+    return (State(*row) for row in columns)
+
+
+def models(batch: Any) -> Iterator[SceneModel]:
+    """Scenes that were loaded."""
+    for sealed in values(batch, "scene"):
+        blob, intact = open_blob(sealed)
+        if not intact:
+            raise ValueError("a model was changed (checksum)")
+        yield decode_scene(blob)
+
+
+def samples(batch: Any) -> Iterator[RawSample]:
+    """Raw messages."""
+    columns = (values(batch, "connection"), index(batch, paths.SESSION_TIME), values(batch, "data"))
+    return (RawSample(*row) for row in zip(*columns, strict=True))
+
+
+def scalars(batch: Any) -> Iterator[Scalar]:
+    """Values of plots."""
+    columns = (index(batch, paths.SESSION_TIME), values(batch, "Scalars:scalars"))
+    return (Scalar(entity_of(batch), *row) for row in zip(*columns, strict=True))
+
+
+def numbered_denials(batch: Any) -> Iterator[tuple[int, DenialRecord]]:
+    """Denials, and how many of the same step come before each: two may be alike."""
+    step, n = -1, 0
+    for record in denials(batch):
+        step, n = record.step, n + 1 if record.step == step else 0
+        yield n, record
+
+
+def _packed(column: str, kind: type[_T]) -> Callable[[Any], Iterator[_T]]:
+    """Reads a column with one MessagePack value per row."""
+    decode = msgspec.msgpack.Decoder(kind).decode
+    return lambda batch: map(decode, values(batch, column))
+
+
+keyframes: Final = _packed("keyframe", Keyframe)
+events: Final = _packed("event", Event)
+denials: Final = _packed("denial", DenialRecord)
+marks: Final = _packed("mark", Mark)
+ends: Final = _packed("end", EndMark)
+
+
+def values(batch: Any, column: str) -> list[Any]:
+    """One value per row of a component column."""
+    flat = _flat(batch, column)
+    if len(flat) != batch.num_rows:
+        raise ValueError(f"{column} has {len(flat)} values in {batch.num_rows} rows")
+    return list(flat.to_pylist())
+
+
+def index(batch: Any, timeline: str) -> list[int]:
+    """Integer values of a timeline (durations in nanoseconds)."""
+    return [int(v) for v in np.asarray(batch.column(timeline).cast("int64"))]
+
+
+def _plants(batch: Any) -> list[bytes]:
+    """Empty for rows without one; where no row has one there is no such column."""
+    if "plant" not in batch.schema.names:
+        return [b""] * batch.num_rows
+    return [value[0] if value else b"" for value in batch.column("plant").to_pylist()]
+
+
+def _lists(batch: Any, column: str) -> Iterator[tuple[Any, ...]]:
+    """A tuple per row of a component column."""
+    _flat(batch, column)
+    return map(tuple, batch.column(column).to_pylist())
+
+
+def _flat(batch: Any, column: str) -> Any:
+    """All values of a column that every row has something in."""
+    lists = batch.column(column)
+    flat = lists.flatten()
+    if missing := lists.null_count + flat.null_count:
+        raise ValueError(f"{column} has {missing} values less than it ought to have")
+    return flat

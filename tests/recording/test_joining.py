@@ -1,0 +1,111 @@
+"""Rows that were split into columns, and merged, are whole again; what contradicts itself is said."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from iris_session.recording.joining import ROW_ID, count, entity_of, join, spans
+
+COLUMNS = ("a", "b", "c")
+
+
+def table(first: int, rows: int, columns: tuple[str, ...] = COLUMNS, entity: str = "/rows") -> Any:
+    """Rows `first` and so on, as Rerun has them: an id, a time, and a list in every column."""
+    fields = [pa.field(ROW_ID, pa.binary(16), nullable=False, metadata={"rerun:kind": "control"})]
+    fields.append(pa.field("step", pa.int64(), metadata={"rerun:kind": "index"}))
+    fields += [pa.field(name, pa.list_(pa.binary()), metadata={"rerun:kind": "data"}) for name in columns]
+    numbers = range(first, first + rows)
+    arrays = [pa.array([n.to_bytes(16, "big") for n in numbers], pa.binary(16)), pa.array(numbers, pa.int64())]
+    arrays += [pa.array([[f"{name}{n}".encode()] for n in numbers], pa.list_(pa.binary())) for name in columns]
+    return pa.RecordBatch.from_arrays(arrays, schema=pa.schema(fields, metadata={"rerun:entity_path": entity}))
+
+
+def values(batches: list[Any]) -> dict[str, list[Any]]:
+    return {name: [v for b in batches for v in b.column(name).to_pylist()] for name in (ROW_ID, "step", *COLUMNS)}
+
+
+def test_rows_as_they_were_written_stay_as_they_are() -> None:
+    written = [table(0, 5), table(5, 1), table(6, 3)]
+    assert [join(pieces) for pieces in spans(written)] == written
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_columns_cut_at_any_place_are_joined(seed: int) -> None:
+    rng = random.Random(seed)
+    groups = rng.choice([[("a",), ("b", "c")], [("a",), ("b",), ("c",)], [("c", "a"), ("b",)]])
+    batches = []
+    for group in groups:
+        cuts = [0, *sorted(rng.sample(range(1, 100), rng.randrange(8))), 100]
+        batches += [table(a, b - a, group) for a, b in pairwise(cuts)]
+    batches.sort(key=lambda batch: (batch.column("step")[0].as_py(), rng.random()))
+    found = list(spans(batches))
+    assert values([join(pieces) for pieces in found]) == values([table(0, 100)])
+    assert sum(map(count, found)) == 100
+
+
+def test_no_more_is_waited_for_than_lies_side_by_side() -> None:
+    taken = 0
+
+    def thick_and_thin() -> Iterator[Any]:
+        nonlocal taken
+        for first in range(0, 1000, 10):
+            if first % 200 == 0:
+                yield table(first, 200, ("b", "c"))
+            taken += 1
+            yield table(first, 10, ("a",))
+
+    for n, pieces in enumerate(spans(thick_and_thin())):
+        assert count(pieces) == 10
+        assert taken <= n + 2
+
+
+def test_rows_without_a_column_have_null_in_it() -> None:
+    first, second = table(0, 4), table(4, 2, ("b", "c"))
+    batch = join([first, second])
+    assert batch.column("a").to_pylist() == [[b"a0"], [b"a1"], [b"a2"], [b"a3"], None, None]
+    assert batch.column("b").null_count == 0
+
+
+def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
+    (pieces,) = spans([table(0, 6).take(pa.array([3, 1, 0, 5, 4, 2])), table(0, 6, ())])
+    assert values([join(pieces)]) == values([table(0, 6)])
+
+
+def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
+    """As when a batch of one column was merged with a batch of another, of the same rows."""
+    names = table(0, 1).schema
+    first, second = (pa.Table.from_batches([batch]) for batch in (table(0, 6, ("a", "c")), table(0, 6, ("b",))))
+    merged = (
+        pa.concat_tables([first, second], promote_options="default")
+        .select(names.names)
+        .cast(names)
+        .combine_chunks()
+        .to_batches()
+    )
+    assert merged[0].num_rows == 12
+    (pieces,) = spans(merged)
+    assert count(pieces) == 6
+    assert values([join(pieces)]) == values([table(0, 6)])
+
+
+def test_entities_are_kept_apart() -> None:
+    mixed = [table(0, 2, entity="/x"), table(1, 3, entity="/y"), table(2, 2, entity="/x")]
+    assert [(entity_of(join(p)), count(p)) for p in spans(mixed)] == [("/x", 2), ("/x", 2), ("/y", 3)]
+
+
+def test_two_values_of_one_row_are_an_error() -> None:
+    with pytest.raises(ValueError, match="more than one b"):
+        join([table(0, 3, ("a", "b")), table(0, 3, ("b", "c"))])
+
+
+def test_two_times_of_one_row_are_an_error() -> None:
+    other = table(0, 3, ("b", "c"))
+    moved = other.set_column(1, other.schema.field(1), pa.array([0, 1, 7], pa.int64()))
+    with pytest.raises(ValueError, match="more than one step"):
+        join([table(0, 3, ("a",)), moved])

@@ -1,0 +1,250 @@
+"""Copies that Rerun's tools make of recordings read and verify like the original, and show what was changed in them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from iris_session.protocol.common import Denial
+from iris_session.protocol.server_messages import Event, MarkerAdded
+from iris_session.recording import CLOSED, OPEN, Recording, rrd_file, verify
+from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame
+from iris_session.recording.paths import ROWS, part_path
+from iris_session.recording.writer import RrdWriter
+from tests.recording.support import SmallCore, journal, write
+
+STEPS = 200
+RERUN = Path(sys.executable).parent / "rerun"
+#: Defaults; every column in chunks of its own; small chunks with several columns; many small ones; the other profile.
+OPTIONS = (
+    (),
+    ("--split-size-ratio", "1"),
+    ("--split-size-ratio", "1.5", "--max-size", "12KiB"),
+    ("--split-size-ratio", "1", "--max-rows", "7"),
+    ("--profile", "live"),
+)
+
+
+def optimize(copy: Path, *files: Path | str) -> Path:
+    """The copy that `rerun rrd optimize` makes. `files`: and options before them."""
+    done = subprocess.run([RERUN, "rrd", "optimize", *files, "-o", copy], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return copy
+
+
+def record(path: Path, recording_class: str) -> Path:
+    """A whole recording, with something of every kind in it."""
+    header, batch = journal(STEPS, recording_class)
+    writer = RrdWriter(path, "id")
+    writer.header(header)
+    rng = np.random.default_rng(5)
+    for i in range(0, STEPS, 20):
+        part = Batch(rows=batch.rows[i : i + 20])
+        part.keyframes = [k for k in batch.keyframes if i == 0 > k.step or i <= k.step < i + 20]
+        for row in part.rows:
+            poses = rng.normal(size=(len(header.bodies), 7))
+            part.states.append(StateFrame(row.step, row.step + 1, row.step / 500, row.now_ns, poses.tobytes()))
+            part.metrics.append(MetricRecord(row.step, row.now_ns, "late_ms", row.step / 7))
+            writer.add_sample(3, row.now_ns, rng.bytes(row.step % 50))
+        now_ns = part.rows[0].now_ns
+        part.events.append(Event(i // 20 + 1, i, now_ns, MarkerAdded("p1", f"event {i}")))
+        part.denials += [DenialRecord(i, now_ns, 3, Denial("held", "it is held"))] * 2  # twice the same
+        writer.add(part)
+        writer.flush()
+    writer.close()
+    return path
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """Everything that `Recording` gives."""
+    with Recording.open(path) as recording:
+        assert recording.damage == recording.notes == []
+        return {
+            "header": recording.header,
+            "end": recording.end,
+            "counts": (recording.count_rows(), recording.count_samples()),
+            "rows": list(recording.rows()),
+            "later": [row.step for row in recording.rows(after=77)],
+            "keyframes": list(recording.keyframes()),
+            "states": [state._replace(poses=state.poses.tobytes()) for state in recording.states()],  # type: ignore[arg-type]
+            "events": list(recording.events()),
+            "denials": list(recording.denials()),
+            "samples": list(recording.samples()),
+            "metrics": {name: (t.tolist(), v.tolist()) for name, (t, v) in recording.metrics().items()},
+        }
+
+
+@pytest.mark.parametrize(
+    ("recording_class", "options"),
+    [*((OPEN, options) for options in OPTIONS), (CLOSED, OPTIONS[0]), (CLOSED, OPTIONS[2])],
+)
+def test_a_copy_reads_and_verifies_like_the_original(
+    tmp_path: Path, recording_class: str, options: tuple[str, ...]
+) -> None:
+    path = record(tmp_path / "session.rrd", recording_class)
+    copy = optimize(tmp_path / "indexed.rrd", *options, path)
+    original = contents(path)
+    assert (len(original["rows"]), len(original["states"]), len(original["samples"])) == (STEPS, STEPS, STEPS)
+    assert len(original["denials"]) == 20
+    assert contents(copy) == original
+    report = verify(copy, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.keyframes, report.finished) == (STEPS, 5, True)
+
+
+def test_columns_do_lie_in_chunks_of_their_own(tmp_path: Path) -> None:
+    """Else the tests above would show nothing."""
+    copy = optimize(tmp_path / "indexed.rrd", "--split-size-ratio", "1.5", record(tmp_path / "session.rrd", OPEN))
+    columns = [set(chunk.to_record_batch().schema.names) for chunk in rrd_file.chunks(copy, ROWS)]
+    assert any("plant" in names and "chain" not in names for names in columns)
+    assert rrd_file.scan(copy).indexed
+    assert not rrd_file.scan(tmp_path / "session.rrd").indexed
+
+
+def test_a_plant_that_only_some_rows_have(tmp_path: Path) -> None:
+    """As of publishers, who say it where it changes: merged chunks have null elsewhere."""
+    header, batch = journal(STEPS, CLOSED)
+    _, full = journal(STEPS, OPEN)
+    header = msgspec.structs.replace(header, recording_class=OPEN)
+    batch.rows[100:130] = full.rows[100:130]
+    path = write(tmp_path / "session.rrd", header, batch)
+    with Recording.open(path) as original, Recording.open(optimize(tmp_path / "indexed.rrd", path)) as copy:
+        rows = list(original.rows())
+        assert [row.step for row in rows if row.plant] == list(range(100, 130))
+        assert list(copy.rows()) == rows
+        assert copy.damage == []
+
+
+def changed(path: Path, to: Path, change: Callable[[Any], Any]) -> Path:
+    """A copy in which `change` has taken each record batch of the journal in hand; None leaves it out."""
+    from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+
+    chunks = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for chunk in RrdReader(path).stream().to_chunks():
+            if chunk.entity_path != ROWS:
+                chunks.append(chunk)
+            elif (batch := change(chunk.to_record_batch())) is not None:
+                chunks += Chunk.from_record_batch(batch)
+    LazyChunkStream.from_iter(chunks).write_rrd(to, application_id="iris-session", recording_id="id")
+    return to
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    """A copy whose rows lie in chunks of 50, plants apart from the rest."""
+    path = record(tmp_path / "session.rrd", OPEN)
+    return optimize(tmp_path / "indexed.rrd", "--split-size-ratio", "1.5", "--max-rows", "50", path)
+
+
+def _steps(batch: Any) -> list[int]:
+    return list(batch.column("step").to_pylist())
+
+
+def _set(batch: Any, column: str, at: int, value: Any) -> Any:
+    i = batch.schema.get_field_index(column)
+    values = batch.column(column).to_pylist()
+    values[at] = value
+    return batch.set_column(i, batch.schema.field(i), pa.array(values, batch.schema.field(i).type))
+
+
+def test_a_missing_plant_is_found(tmp_path: Path, split: Path) -> None:
+    def drop(batch: Any) -> Any:
+        return None if "plant" in batch.schema.names and 100 in _steps(batch) else batch
+
+    report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
+    first = report.problems[0]
+    assert (report.ok, first.kind, first.field) == (False, "changed", "plant")
+    assert 50 < first.step <= 100
+
+
+def test_an_altered_plant_is_found(tmp_path: Path, split: Path) -> None:
+    def alter(batch: Any) -> Any:
+        if "plant" not in batch.schema.names or 123 not in _steps(batch):
+            return batch
+        at = _steps(batch).index(123)
+        plant = bytearray(batch.column("plant")[at].as_py()[0])
+        plant[-3] ^= 1
+        return _set(batch, "plant", at, [bytes(plant)])
+
+    report = verify(changed(split, tmp_path / "c.rrd", alter), SmallCore)
+    first = report.problems[0]
+    assert (report.ok, first.step, first.kind, first.field) == (False, 123, "changed", "plant")
+
+
+def test_rows_of_which_only_a_column_is_left_are_missing(tmp_path: Path, split: Path) -> None:
+    def drop(batch: Any) -> Any:
+        return None if "chain" in batch.schema.names and 100 in _steps(batch) else batch
+
+    report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
+    assert not report.ok
+    assert len(report.gaps) == 1
+    assert report.gaps[0][0] <= 100 <= report.gaps[0][1]
+    assert any("c.rrd: /journal/rows holds something damaged" in line for line in report.damage)
+
+
+def test_missing_rows_are_a_gap(tmp_path: Path, split: Path) -> None:
+    def drop(batch: Any) -> Any:
+        return batch.filter(pa.array([not 100 <= step < 110 for step in _steps(batch)]))
+
+    report = verify(changed(split, tmp_path / "c.rrd", drop), SmallCore)
+    assert (report.ok, report.gaps, report.damage) == (False, [(100, 109)], [])
+
+
+def test_parts_of_a_row_that_name_different_steps_are_said(tmp_path: Path, split: Path) -> None:
+    def alter(batch: Any) -> Any:
+        if "plant" not in batch.schema.names or 100 not in _steps(batch):
+            return batch
+        return _set(batch, "step", _steps(batch).index(100), 1100)
+
+    report = verify(changed(split, tmp_path / "c.rrd", alter), SmallCore)
+    assert not report.ok
+    assert report.damage == [
+        "c.rrd: /journal/rows holds something damaged, which is left out: rows have more than one step"
+    ]
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> tuple[Path, Path]:
+    """Two parts, of which the second repeats fifteen rows."""
+    header, batch = journal(STEPS, OPEN)
+    rows, keyframes = batch.rows, batch.keyframes
+    first, second = tmp_path / "session.rrd", Path(part_path(str(tmp_path / "session.rrd"), 2))
+    write(first, header, Batch(rows=rows[:110], keyframes=keyframes[:3]))
+    write(second, header, Batch(rows=rows[95:], keyframes=keyframes[2:]))
+    return first, second
+
+
+def test_parts_may_be_optimized_each_for_itself_or_into_one(tmp_path: Path, parts: tuple[Path, Path]) -> None:
+    first, second = parts
+    (tmp_path / "out").mkdir()
+    for part in parts:
+        optimize(tmp_path / "out" / part.name, part)
+    reports = [verify(tmp_path / "out" / first.name, SmallCore)]
+    reports += [verify(optimize(tmp_path / "one.rrd", *files), SmallCore) for files in (parts, (second, first))]
+    for report in reports:
+        assert report.ok, report.line()
+        assert (report.steps, report.keyframes, report.finished) == (STEPS, 5, True)
+    assert [report.parts for report in reports] == [2, 1, 1]
+
+
+def test_of_several_recordings_in_a_file_it_is_said_that_one_is_read(tmp_path: Path) -> None:
+    header, batch = journal(60)
+    first = write(tmp_path / "a.rrd", header, batch)
+    second = tmp_path / "b.rrd"
+    writer = RrdWriter(second, "another id")
+    writer.header(header)
+    writer.close()
+    report = verify(optimize(tmp_path / "one.rrd", first, second), SmallCore)
+    assert report.notes == ["one.rrd holds 2 recordings: only the first one is read"]
+    assert report.notes[0] in report.line()
