@@ -94,6 +94,7 @@ class RecorderFeed:
     ) -> None:
         self.stats = FeedStats()
         self._lost = False
+        self._complete = False
         self._window_limit = window_bytes
         self._spill = SpillFile(Path(spill_dir) / f"feed-{os.getpid()}.spill", spill_bytes)
         self._context = zmq.Context(io_threads=1)
@@ -244,7 +245,7 @@ class RecorderFeed:
         Without a header nothing was recorded, and there is nothing to wait for. A second call does nothing.
         """
         if self._socket.closed:
-            return not self._window
+            return self._complete
         self.flush()
         waits = max(1, round(timeout_s / 0.02))
         silent, said = 0, self.stats.recorder
@@ -254,13 +255,15 @@ class RecorderFeed:
             waits -= 1
             silent = 0 if self.stats.recorder is not said else silent + 1
             said = self.stats.recorder
-        complete = not self._window and not self._spill
+        self._complete = not self._window and not self._spill
+        if self._spill:
+            self._lose(self._spill.rows, self._spill.others, "the session ended before the recorder could take it all")
         self._spill.close()
         if self._vertices is not None:
             self._vertices.close(0)
         self._socket.close(0)
         self._context.term()
-        return complete
+        return self._complete
 
     def _add(self, items: list[_T], item: _T) -> None:
         if len(items) < BATCH_ITEMS:

@@ -29,7 +29,7 @@ Moment = tuple[int, int, int, int]
 #: Names of things that cannot be drawn, in the line that says so.
 NAMED: Final = 5
 #: What keeps a scene or a part of it from being drawn. The journal is worth more than its picture: it goes on.
-_NOT_DRAWN: Final = (ValueError, KeyError, OSError, zlib.error, SceneBuildError)
+_NOT_DRAWN: Final = (ValueError, LookupError, TypeError, OSError, zlib.error, SceneBuildError)
 
 
 class Source(NamedTuple):

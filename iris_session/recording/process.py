@@ -75,7 +75,11 @@ class Recorder:
         self._vertices = self._bind(zmq.PULL, vertices, DRAIN_VERTICES) if vertices else None
         self._begin_part()
         if os.path.exists(config.path):  # somebody may have moved the first file away
-            self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
+            try:
+                self._lock = RecordingLock(config.path, shared=True, patience_s=0.0)
+            except RecorderError:
+                self._remove()  # of a recording that somebody else continues, no part without content
+                raise
         self._header: SessionHeader | None = None
         self._instance = time.monotonic_ns()  # differs from that of every recorder before it
         self._expecting = -1
@@ -126,10 +130,11 @@ class Recorder:
 
     def _remove(self) -> None:
         """Of a session that never began (its port was in use) nothing stays behind: not the file, nor its folder."""
-        self._writer.abandon()
+        path = Path(part_path(self._config.path, self._config.part))
+        path.unlink(missing_ok=True)
         if self._made_folder:
             with suppress(OSError):
-                Path(self._writer.path).parent.rmdir()
+                path.parent.rmdir()
 
     def stop(self) -> None:
         """Asks the loop to finish the file."""
@@ -138,13 +143,16 @@ class Recorder:
     def _begin_part(self) -> None:
         path = part_path(self._config.path, self._config.part)
         self._made_folder = claim(Path(path))
-        self._writer = RrdWriter(path, self._config.recording_id)
         try:
+            self._writer = RrdWriter(path, self._config.recording_id)
             self._writer.flush()
+            self._syncer = _Syncer(path)
         except WriteError:
             self._remove()  # the next attempt takes the same number
             raise
-        self._syncer = _Syncer(path)
+        except (OSError, RuntimeError, ValueError) as error:
+            self._remove()
+            raise WriteError(f"{path} cannot be written: {error}") from error
 
     def _bind(self, kind: int, endpoint: str, messages: int = 20_000) -> zmq.Socket[bytes]:
         socket = self._context.socket(kind)
@@ -247,12 +255,11 @@ class Recorder:
         self._writer.add_sample(connection, receive_ns, sample)
 
     def _say(self, written: int) -> None:
-        size = os.stat(self._writer.path).st_size
         status = RecorderStatus(
             self._instance,
             self._expecting,
             written,
-            size,
+            self._writer.size,
             time.process_time_ns(),
             self._lag_ns,
             self._samples,
@@ -266,9 +273,13 @@ class Recorder:
 
 
 class _Syncer:
-    """Makes the file durable once a second from its own thread: a slow disk delays no write. Rerun never syncs."""
+    """Makes the file durable once a second from its own thread: a slow disk delays no write. Rerun never syncs.
+
+    It also sees that the file is still there: what is written into one that was removed is lost without an error.
+    """
 
     def __init__(self, path: str) -> None:
+        self._path = path
         self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         self._ended = threading.Event()
         self._fault = ""
@@ -276,7 +287,7 @@ class _Syncer:
         self._thread.start()
 
     def check(self) -> None:
-        """Raises `WriteError` when the disk reported an error."""
+        """Raises `WriteError` when the disk reported an error, or the file is gone."""
         if self._fault:
             raise WriteError(self._fault)
 
@@ -291,6 +302,9 @@ class _Syncer:
         while not self._ended.wait(SYNC_S):
             try:
                 os.fsync(self._fd)
+                if os.fstat(self._fd).st_nlink == 0:
+                    self._fault = f"{self._path} was removed while it was being written"
+                    return
             except OSError as error:
                 self._fault = f"the recording cannot be made durable: {error.strerror}"
                 return

@@ -30,7 +30,7 @@ class RrdStream:
         self.recording = rr.RecordingStream(application, recording_id=recording_id, batcher_config=_BATCHER)
         self._encoded = self.recording.binary_stream()
         self._file: Any = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by `close`
-        self._size = 0
+        self.size = 0  # bytes in the file
         self._marked = 0  # bytes of the file that marks cover
         self._crc = 0  # of the bytes after them
 
@@ -41,12 +41,12 @@ class RrdStream:
             return
         if data[: len(MAGIC)] != MAGIC:
             raise ValueError("this version of Rerun encodes its messages in another way")
-        self._append(memoryview(data)[FILE_HEAD if self._size else 0 : end_of_messages(data)])
+        self._append(memoryview(data)[FILE_HEAD if self.size else 0 : end_of_messages(data)])
 
     def mark(self) -> Mark:
         """CRC-32 of all bytes since the last mark, so that any later change of them is found."""
-        mark = Mark(self._marked, self._size, self._crc)
-        self._marked, self._crc = self._size, 0
+        mark = Mark(self._marked, self.size, self._crc)
+        self._marked, self._crc = self.size, 0
         return mark
 
     def close(self) -> None:
@@ -62,8 +62,8 @@ class RrdStream:
                 rest = rest[self._file.write(rest) :]
         except OSError:
             with suppress(OSError):  # half a message would only be in the way of readers
-                os.ftruncate(self._file.fileno(), self._size)
+                os.ftruncate(self._file.fileno(), self.size)
             self._file.close()
             raise
-        self._size += len(data)
+        self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)

@@ -48,7 +48,8 @@ class SpillFile:
             return False
         try:
             if self._fd < 0:
-                flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+                self._path.unlink(missing_ok=True)
+                flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC  # never through a link of somebody else
                 self._fd = os.open(self._path, flags, 0o600)
                 self._path.unlink()  # nobody else reads it, and a killed session leaves nothing behind
             written = os.pwrite(self._fd, record, at)

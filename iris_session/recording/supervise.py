@@ -79,7 +79,11 @@ class RecorderProcess:
     def start(self) -> None:
         """Begins the recording and waits until it writes. Raises `RecorderError`: no right, no space, file exists."""
         self.part = 1
-        self._spawn()
+        try:
+            self._spawn()
+        except RecorderError:
+            self.close(0.0)
+            raise
         answer = self._answer()
         if answer != "ready":
             self.close(0.0)
@@ -141,9 +145,11 @@ class RecorderProcess:
         assert process is not None
         assert process.stdout is not None
         text = b""
+        ready = select.poll()  # `select.select` takes no descriptor above 1023
+        ready.register(process.stdout, select.POLLIN)
         until = time.monotonic() + START_S
         while b"\n" not in text and (left := until - time.monotonic()) > 0:
-            if select.select([process.stdout], [], [], left)[0]:
+            if ready.poll(left * 1e3):
                 chunk = os.read(process.stdout.fileno(), 4096)
                 if not chunk:
                     break

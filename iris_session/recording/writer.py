@@ -160,9 +160,10 @@ class RrdWriter:
         said = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         return WriteError(f"{self.path} cannot be written: {said}")
 
-    def abandon(self) -> None:
-        """Removes the file, in which nothing is."""
-        Path(self.path).unlink(missing_ok=True)
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far."""
+        return self._stream.size
 
     def _mark(self) -> None:
         times = [sequence(paths.STEP, [self._newest_row[0]])]

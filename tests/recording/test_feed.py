@@ -175,6 +175,18 @@ def test_when_the_spill_is_full_rows_are_dropped_counted_and_told(played) -> Non
     assert not feed.close(0.0)
 
 
+def test_what_nobody_took_before_the_end_is_counted(played) -> None:  # type: ignore[no-untyped-def]
+    _, endpoint, folder = played
+    feed = RecorderFeed(endpoint, folder, window_bytes=2000)
+    feed.header(make_header())
+    steps(feed, 0, 300)
+    waiting = feed._spill.rows
+    assert not feed.close(0.0)
+    assert feed.stats.dropped_rows == waiting > 0
+    assert "ended before" in feed.stats.spill_fault
+    assert not feed.close(0.0), "asked again"
+
+
 def test_the_silence_of_a_recorder_that_has_something_to_write_is_measured(feed: RecorderFeed, played) -> None:  # type: ignore[no-untyped-def]
     played[0].say(feed, 1, -1, -1)
     steps(feed, 0, 100)

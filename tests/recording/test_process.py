@@ -18,7 +18,7 @@ import pytest
 import zmq
 
 from iris_session.protocol.scene_names import ArrayKind
-from iris_session.recording import RecorderError, RecorderProcess, Recording, verify
+from iris_session.recording import RecorderError, RecorderProcess, Recording, RecordingLock, verify
 from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
@@ -260,6 +260,55 @@ def test_vertices_come_into_the_picture_and_cost_the_journal_nothing(tmp_path: P
     assert len(rows) >= 30
     highest = max(max(z for _, _, z in row) for row in rows)
     assert highest == pytest.approx(rest[:, 2].max() + 0.39, abs=0.001)
+
+
+def test_a_file_that_is_moved_is_written_on(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        wait_until(lambda: _status(feed).written >= 4)
+        moved = path.rename(tmp_path / "moved.rrd")
+        session.take(50)
+        assert feed.close(20.0)
+        assert process.close()
+    report = verify(moved, SmallCore)
+    assert report.ok, report.line()
+    assert (report.steps, report.finished) == (100, True)
+
+
+def test_a_file_that_was_removed_is_said_and_another_begun(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        session = SmallSession(feed)
+        session.take(50)
+        wait_until(lambda: _status(feed).written >= 4)
+        path.unlink()
+        wait_until(lambda: not process.alive)
+        assert "was removed while it was being written" in process.failure
+        process.restart()
+        session.take(150)
+        assert feed.close(20.0)
+        assert process.close()
+    report = verify(path, SmallCore)
+    assert not report.ok
+    assert report.gaps[0][0] == 0
+    assert report.last_step == 199
+
+
+def test_beside_who_continues_the_recording_no_part_is_begun(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    with recorder(path) as (process, feed):
+        SmallSession(feed).take(20)
+        wait_until(lambda: _status(feed).written >= 1)
+        os.kill(process.pid, signal.SIGKILL)
+        wait_until(lambda: not process.alive)
+        mine = RecordingLock(path, shared=False)
+        process.restart()
+        wait_until(lambda: not process.alive)
+        assert "is in use" in process.failure
+        assert not os.path.exists(part_path(str(path), 2))
+        mine.release()
 
 
 def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:

@@ -24,6 +24,16 @@ def test_first_in_first_out_and_gone_when_empty(tmp_path: Path) -> None:
         assert spill.rows == 0
 
 
+def test_a_link_that_somebody_else_put_there_is_not_followed(tmp_path: Path) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.write_bytes(b"precious")
+    (tmp_path / "s").symlink_to(theirs)
+    spill = SpillFile(tmp_path / "s", 1000)
+    assert spill.push(b"x", 1)
+    assert theirs.read_bytes() == b"precious"
+    spill.close()
+
+
 def test_the_limit_refuses_and_says_so(tmp_path: Path) -> None:
     spill = SpillFile(tmp_path / "s", 100)
     assert spill.push(b"x" * 60, 10)
