@@ -117,8 +117,10 @@ class LiveView:
         finally:
             self.update(force=True)
             until = time.monotonic() + END_S
+            ready = select.poll()  # `select.select` takes no descriptor above 1023
+            ready.register(self._pipe, select.POLLOUT)
             while not self._send() and child.poll() is None and time.monotonic() < until:
-                select.select([], [self._pipe], [], 0.1)
+                ready.poll(100)
             child.stdin.close()
             try:
                 child.wait(timeout=END_S)

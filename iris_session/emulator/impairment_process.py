@@ -111,8 +111,10 @@ class ImpairmentProcess:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         fd = self._process.stdout.fileno()
+        ready = select.poll()  # `select.select` takes no descriptor above 1023
+        ready.register(fd, select.POLLIN)
         while b"\n" not in self._rest:
-            if not select.select([fd], [], [], ANSWER_S)[0]:
+            if not ready.poll(ANSWER_S * 1e3):
                 raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s")
             data = os.read(fd, 65536)
             if not data:

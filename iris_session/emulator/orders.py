@@ -18,12 +18,14 @@ class Orders:
 
     def __init__(self, fd: int, names: Sequence[str]) -> None:
         self._fd = fd
+        self._ready = select.poll()  # takes files as well as pipes, and descriptors above 1023
+        self._ready.register(fd, select.POLLIN)
         self._names = tuple(names)
         self._rest = b""
         self._open = True
 
     def __call__(self) -> list[tuple[str, str]]:
-        while self._open and select.select([self._fd], [], [], 0.0)[0]:
+        while self._open and self._ready.poll(0):
             data = os.read(self._fd, 4096)
             self._open = bool(data)
             self._rest += data

@@ -1,0 +1,80 @@
+"""A session with many clients has descriptors above 1023, which `select.select` refuses: nothing of ours uses it."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from iris_session.cli.live import LiveView
+from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.emulator.orders import Orders
+from iris_session.protocol.server_messages import Event, MarkerAdded
+from iris_session.recording import RecorderProcess
+
+ROOT = Path(__file__).parents[1]
+BEYOND = 1024
+
+
+@pytest.fixture
+def crowded() -> Iterator[None]:
+    """No descriptor below 1024 is free."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4 * BEYOND), hard))
+    taken = [os.open(os.devnull, os.O_RDONLY)]
+    try:
+        while taken[-1] < BEYOND:
+            taken.append(os.dup(taken[0]))
+        yield
+    finally:
+        for fd in taken:
+            os.close(fd)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+class _Session:
+    """What `LiveView` asks of a session; its status fills a pipe, so that the display must be waited for."""
+
+    def recent_events(self) -> list[Event]:
+        return [Event(1, 0, 0, MarkerAdded("p1", "hello"))]
+
+    def status(self) -> _Session:
+        return self
+
+    def as_dict(self) -> dict[str, str]:
+        return {"text": "x" * 200_000}
+
+
+def test_nothing_uses_select() -> None:
+    users = [path for path in (ROOT / "iris_session").rglob("*.py") if "select.select(" in path.read_text("utf-8")]
+    assert users == []
+
+
+@pytest.mark.usefixtures("crowded")
+def test_orders_are_read() -> None:
+    read, write = os.pipe()
+    assert read > BEYOND
+    os.write(write, b"bump ann\n")
+    assert Orders(read, ["ann"])() == [("bump", "ann")]
+    os.close(read)
+    os.close(write)
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("crowded")
+def test_processes_are_heard(tmp_path: Path) -> None:
+    recorder = RecorderProcess(tmp_path / "session.rrd", time.monotonic_ns())
+    recorder.start()
+    assert recorder.alive
+    assert recorder.close()
+    with ImpairmentProcess({"127.0.0.2": "none"}, []) as proxy:
+        assert proxy.do("stats")["ok"]
+    with (tmp_path / "shown").open("w+") as out:
+        with LiveView(_Session(), out, "title").open() as update:  # type: ignore[arg-type]
+            update()
+        out.seek(0)
+        assert "hello" in out.read()
