@@ -1,4 +1,4 @@
-"""Reads a recording back: who was there, what happened, how far each free object travelled.
+"""Reads a recording back: who was there, what happened, how far every body travelled.
 
 python examples/read_recording.py sessions/*/session.rrd
 """
@@ -6,9 +6,12 @@ python examples/read_recording.py sessions/*/session.rrd
 from __future__ import annotations
 
 import sys
+from collections import Counter
+from itertools import groupby
 
 import numpy as np
 
+from iris_session.protocol.server_messages import ParticipantJoined
 from iris_session.recording import Recording
 
 
@@ -16,17 +19,19 @@ def main(path: str) -> None:
     with Recording.open(path) as recording:
         header = recording.header
         print(f"{header.session_name}, {header.created_utc}, class {header.recording_class}")
-        print(f"robots: {', '.join(robot.name for robot in header.robots)}")
-        kinds: dict[str, int] = {}
-        for event in recording.events():
-            name = type(event.body).__name__
-            kinds[name] = kinds.get(name, 0) + 1
-        print("events:", ", ".join(f"{n} {name}" for name, n in sorted(kinds.items())))
-        rows = {body.name: i for i, body in enumerate(header.bodies)}
-        poses = np.array([state.poses for state in recording.states()])  # (frames, bodies, 7), exact float64
-        for spec in header.objects:
-            path_m = np.linalg.norm(np.diff(poses[:, rows[spec.body], :3], axis=0), axis=1).sum()
-            print(f"{spec.name}: {len(poses)} frames, travelled {path_m:.2f} m")
+        print(f"robots: {', '.join(robot.name for robot in header.robots) or 'none'}")
+        events = [event.body for event in recording.events()]
+        people = {body.participant.name for body in events if isinstance(body, ParticipantJoined)}
+        print(f"people: {', '.join(sorted(people)) or 'none'}")
+        kinds = Counter(type(body).__name__ for body in events)
+        print("events:", ", ".join(f"{n} {name}" for name, n in sorted(kinds.items())) or "none")
+        # Another scene has other bodies, which is why each state says of which ones its poses are.
+        for bodies, states in groupby(recording.states(), key=lambda state: state.bodies):
+            poses = np.array([state.poses for state in states])  # (frames, bodies, 7), exact float64
+            path_m = np.linalg.norm(np.diff(poses[:, :, :3], axis=0), axis=2).sum(axis=0)
+            for body, travelled_m in zip(bodies, path_m, strict=True):
+                if body.moving:
+                    print(f"{body.name}: {len(poses)} frames, travelled {travelled_m:.2f} m")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session import Session, SessionConfig
+from iris_session import SceneBuilder, ScenePublisher, Session, SessionConfig
 from iris_session.cli.main import build_parser
 from iris_session.physics.scenes import scene_path
 from iris_session.protocol import names
@@ -223,6 +223,20 @@ def test_examples_of_recordings_run(tmp_path: Path, run_python: Callable[..., st
     output = run_python((ROOT / "examples" / "read_recording.py").read_text(encoding="utf-8"), str(path))
     assert "class closed" in output
     assert re.search(r"hammer: [1-9]\d* frames, travelled 0\.\d+ m", output), output
+
+
+@pytest.mark.e2e
+def test_example_reads_recordings_of_published_worlds(tmp_path: Path, run_python: Callable[..., str]) -> None:
+    path, scene = tmp_path / "session.rrd", SceneBuilder("bench")
+    scene.add_box("crate", half_size=(0.1, 0.1, 0.1), movable=True)
+    with ScenePublisher(scene, SessionConfig(control_port=0, state_port=0, record=path)) as session:
+        for i in range(3):
+            session.set_pose("crate", (i * 0.5, 0.0, 0.0))
+            session.publish(i / 10)
+            session.run(seconds=0.1)
+    output = run_python((ROOT / "examples" / "read_recording.py").read_text(encoding="utf-8"), str(path))
+    assert "class open" in output
+    assert re.search(r"crate: [1-9]\d* frames, travelled 1\.00 m", output), output
 
 
 def test_every_example_is_run_here() -> None:
