@@ -7,6 +7,7 @@ authority answers them with typed reasons).
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from typing import Final, TypeVar, get_args
 
@@ -205,15 +206,24 @@ def encode_media_frames(
 ) -> list[bytes]:
     """All frames of what a source hands in. `frames`: of class `full`, or by class. Raises `ValueError`."""
     by_class = frames if isinstance(frames, Mapping) else {BudgetClass.FULL: frames}
-    if not is_stream_name(stream):
+    if not isinstance(stream, str) or not is_stream_name(stream):
         raise ValueError(not_a_stream(stream))
     if BudgetClass.FULL not in by_class or any(name not in CLASSES[:-1] for name in by_class):
         raise ValueError(f"a media frame has class 'full', and may have 'half' and 'quarter', not {list(by_class)}")
     for data in by_class.values():
-        if len(data) > MAX_MEDIA_FRAME_BYTES:
-            raise ValueError(f"a media frame of {len(data)} bytes: at most {MAX_MEDIA_FRAME_BYTES} for each class")
-    push = MediaPush(stream, scene_epoch, capture_ns, tuple(by_class), encoding)
-    return [encode_media_push(push), *by_class.values()]
+        try:
+            size = memoryview(data).nbytes
+        except TypeError:
+            raise ValueError(f"a media frame is {type(data).__name__}: bytes are expected") from None
+        if size > MAX_MEDIA_FRAME_BYTES:
+            raise ValueError(f"a media frame of {size} bytes: at most {MAX_MEDIA_FRAME_BYTES} for each class")
+    try:
+        push = MediaPush(stream, scene_epoch, operator.index(capture_ns), tuple(by_class), encoding)
+        header = encode_media_push(push)
+        decode_media_push(header)
+    except (TypeError, OverflowError, ProtocolError) as error:  # a time or an encoding that is none
+        raise ValueError(f"a media frame of capture_ns {capture_ns!r}, encoding {encoding!r}: {error}") from None
+    return [header, *by_class.values()]
 
 
 def decode_media_push(data: Bytes) -> MediaPush:

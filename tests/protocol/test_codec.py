@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 
 import msgspec
 import pytest
@@ -15,7 +16,13 @@ from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MAX_ERROR_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.generate.examples import extreme, full, least
-from iris_session.protocol.limits import LIMITS, MAX_CLIENT_BYTES, MAX_INTRODUCTION_BYTES, MAX_SERVER_BYTES
+from iris_session.protocol.limits import (
+    LIMITS,
+    MAX_CLIENT_BYTES,
+    MAX_INTRODUCTION_BYTES,
+    MAX_MEDIA_FRAME_BYTES,
+    MAX_SERVER_BYTES,
+)
 from iris_session.protocol.server_messages import Event, Presence, ProtocolFault, ServerEnvelope, StateHeader
 
 pack = msgspec.msgpack.encode
@@ -286,3 +293,30 @@ def test_equal_values_give_equal_bytes() -> None:
     one = ClientEnvelope(1, 2, "", Acquire(1, ("a", "b")))
     assert codec.encode_client(one) == codec.encode_client(ClientEnvelope(1, 2, "", Acquire(1, ("a", "b"))))
     assert codec.tag_of(Bye) == "bye"
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"frames": 3}, "int: bytes are expected"),
+        ({"frames": "text"}, "str: bytes are expected"),
+        ({"frames": {"full": None}}, "NoneType: bytes are expected"),
+        ({"frames": {"half": b""}}, "has class 'full'"),
+        ({"frames": array("d", bytes(MAX_MEDIA_FRAME_BYTES + 8))}, f"at most {MAX_MEDIA_FRAME_BYTES}"),
+        ({"stream": 3}, "3 cannot be the name"),
+        ({"capture_ns": "now"}, "capture_ns 'now'"),
+        ({"capture_ns": 0.5}, "capture_ns 0.5"),
+        ({"capture_ns": 10**30}, "capture_ns 1000"),
+        ({"encoding": 3}, "encoding 3"),
+    ],
+)
+def test_media_that_no_front_would_take_are_refused_where_they_are_handed_in(
+    given: dict[str, object], says: str
+) -> None:
+    """Else the call says that it was published, and nobody gets it."""
+    good = {"stream": "cloud", "frames": b"points", "capture_ns": 5, "scene_epoch": 1, "encoding": "bytes"}
+    header, *data = codec.encode_media_frames(**good)  # type: ignore[arg-type]
+    assert codec.decode_media_push(header).stream == "cloud"
+    assert data == [b"points"]
+    with pytest.raises(ValueError, match=says):
+        codec.encode_media_frames(**(good | given))  # type: ignore[arg-type]
