@@ -52,20 +52,24 @@ class AssetFetch:
 
     def read(self, address: str) -> bytes:
         """The bytes of an asset that is here. Raises its `AssetError` when it is not."""
-        return bytes(self.view(address))
+        self._check_here(address)
+        return self._cache.read(address)
 
     def view(self, address: str) -> memoryview:
         """As `read`, mapped instead of copied: whoever refuses it, for its size or its beginning, has not read it."""
-        if address in self.failed:
-            raise self.failed[address]
-        if address in self.pending:
-            raise AssetError(address, "gone", f"asset {address} has not come yet")
+        self._check_here(address)
         return self._cache.view(address)
 
     def check(self) -> None:
         """Raises the first `AssetError`, if there is one."""
         for error in self.failed.values():
             raise error
+
+    def _check_here(self, address: str) -> None:
+        if address in self.failed:
+            raise self.failed[address]
+        if address in self.pending:
+            raise AssetError(address, "gone", f"asset {address} has not come yet")
 
     # --- for the client ----------------------------------------------------------------------------------------------
 
