@@ -141,7 +141,7 @@ class SceneBuilder:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
         look = look_of(options)
-        with self._world.whole():
+        with self._world.whole(), np.errstate(all="ignore"):  # places that are not finite are refused
             body, T_body_thing = self._place(name, options, named=True)
             self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
         return name

@@ -7,6 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.parts import Loaded
 from iris_session.scene.references import References
@@ -53,7 +55,8 @@ def present(path: Path) -> None:
 def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
     """What `read` returns. Damaged files make libraries raise anything, `AssertionError` too: `SceneBuildError`."""
     try:
-        return read()
+        with np.errstate(all="ignore"):  # readers look for what is not finite
+            return read()
     except SceneBuildError:
         raise
     except MemoryError:

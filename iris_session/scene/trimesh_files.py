@@ -51,10 +51,9 @@ def read_with_trimesh(path: Path, references: References) -> Loaded:
     data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
     try:
-        with np.errstate(all="ignore"):  # what is not finite is looked for after that
-            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
-            reader = _Reader(trimesh, path.name)
-            nodes = reader.nodes(scene)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+        reader = _Reader(trimesh, path.name)
+        nodes = reader.nodes(scene)
     except IndexError:
         if kind == "obj":
             absolute_corners(path.name, data)  # says which
