@@ -220,6 +220,7 @@ class Recorder:
     def _take(self, frames: list[bytes]) -> None:
         """Batches are taken in order only: what a new process gets before its header comes again after it."""
         if len(frames) not in (2, 3) or len(frames[0]) != FRAME.size:
+            self._refused += 1
             return
         kind, number = FRAME.unpack(frames[0])
         if kind == HEADER and self._expecting < 0:

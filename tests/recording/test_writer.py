@@ -198,6 +198,7 @@ def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp
     assert column(found["/tf"], "Transform3D:child_frame")[-1] == ["cup"]
     with Recording.open(path, warn=False) as recording:
         assert [state.poses.shape for state in recording.states()] == [first.shape, first.shape, (1, 7)]
+        assert [state.bodies for state in recording.states()] == [header.bodies, header.bodies, cup.bodies]
         assert recording.model(cup.model_hash) == mjb
         with pytest.raises(LookupError, match="does not hold the model feed"):
             recording.model("feed" * 8)
@@ -217,6 +218,7 @@ def test_states_of_the_scene_before_may_come_after_another_scene(tmp_path: Path)
     writer.close()
     with Recording.open(path, warn=False) as recording:
         assert [len(state.poses) for state in recording.states()] == [len(before), len(before), 1]
+        assert [state.bodies for state in recording.states()] == [header.bodies, header.bodies, cup.bodies]
 
 
 def shared(store: AssetStore, model: mujoco.MjModel, **changes: Any) -> tuple[SceneSpec, SceneAssets]:
