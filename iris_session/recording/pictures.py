@@ -221,6 +221,7 @@ def drawing(form: Form, rgba: scene.Rgba8, frame: str, T_frame_visual: PoseTuple
             vertex_normals=form.mesh.normal,
             triangle_indices=form.mesh.index,
             vertex_texcoords=form.uv,
+            vertex_colors=form.mesh.color,
             albedo_texture=form.texture,
             albedo_factor=rgba,
         )

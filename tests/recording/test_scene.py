@@ -15,7 +15,9 @@ from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import pack_model, scene
 from iris_session.recording.messages import SceneAssets
+from iris_session.recording.pictures import drawing
 from iris_session.scene import AssetMissingError, AssetStore
+from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape
@@ -105,6 +107,22 @@ def test_every_shape_wears_its_texture_or_the_mean_of_it(tmp_path: Path) -> None
         is_mesh = visual.geometry.mesh >= 0 or visual.geometry.hfield >= 0
         assert (form.kind == scene.MESH) == (is_mesh or look in ("image", "uniform"))
     assert len(looks) >= len(SHAPES) * len(LOOKS)
+
+
+def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:
+    """The viewer multiplies them by the colour of the mesh, as clients do."""
+    colors = np.array([[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 128]], np.uint8)
+    builder, store = SceneBuilder(), AssetStore(tmp_path)
+    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]], colors=colors)
+    builder.add_mesh(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], triangles=[[0, 1, 2]])
+    spec = builder.build(store).spec
+    reader = scene.SceneReader(spec, store, [])
+    drawn = [
+        drawing(reader.form(visual), scene.colour(visual.rgba), *reader.place(visual))[-1] for visual in spec.visuals
+    ]
+    packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
+    assert drawn[0].vertex_colors.as_arrow_array().to_pylist() == packed.tolist()
+    assert drawn[1].vertex_colors is None
 
 
 def test_a_shape_that_nobody_knows_is_a_box_of_its_size(tmp_path: Path) -> None:
