@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from iris_session.cli.common import CommandError, add_json, open_scene, print_json
-from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, unit_advice
+from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, path_of, unit_advice
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
@@ -124,10 +124,10 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.scene.glb import write_glb
     from iris_session.scene.report import not_in_glb
 
-    out = arguments.out.expanduser()
+    out = path_of(arguments.out)
     if out.suffix.lower() != ".glb":
         raise CommandError(f"{out} does not end in .glb: GLB is the only format of `scene export`")
-    if _same_file(Path(arguments.scene).expanduser(), out):
+    if _same_file(path_of(arguments.scene), out):
         raise CommandError(f"{out} is the file that is read: name another one to write")
     parsed, store = _parse(arguments)
     try:

@@ -53,6 +53,14 @@ def _factor(text: str) -> float:
     return factor
 
 
+def path_of(text: str | Path) -> Path:
+    """A path that may begin with `~`."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # of a user who is not there
+        raise CommandError(f"{text}: there is no such home folder") from None
+
+
 def file_of(scene: str) -> Path | None:
     """The file that is meant, if MuJoCo does not read it; else `None`, and others say what is wrong.
 
@@ -61,7 +69,7 @@ def file_of(scene: str) -> Path | None:
     from iris_session.scene import SceneBuildError
     from iris_session.scene.files import ENDINGS, present, xacro_advice
 
-    path = Path(scene).expanduser()
+    path = path_of(scene)
     kind = path.suffix.lower()
     if kind in SIMULATED and not path.is_dir():
         return None

@@ -50,6 +50,7 @@ def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, m
         ),
         ("part", "part: a file without an ending"),
         ("empty.glb", "is empty: 0 bytes"),
+        ("~nobody-is-called-so/a.glb", "there is no such home folder"),
         ("arm.urdf.xacro", "xacro arm.urdf.xacro > arm.urdf"),
     ],
 )
@@ -60,7 +61,7 @@ def test_what_is_no_file_is_told_with_what_there_is(tmp_path: Path, part: Path, 
     if name == "empty.glb":
         (tmp_path / name).write_text("")
     with pytest.raises(CommandError) as raised:
-        file_of(str(tmp_path / name))
+        file_of(name if name.startswith("~") else str(tmp_path / name))
     assert says in str(raised.value)
     assert raised.value.status == 2
     assert part.is_file()
