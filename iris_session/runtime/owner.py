@@ -82,8 +82,8 @@ class Owner(Publishing, ScenePatches):
     # --- what the owner says -----------------------------------------------------------------------------------------
 
     def estop(self, reason: str = "") -> None:
-        """Stops every robot, latched. Not a safety-rated stop."""
-        self.post(EStop(reason=reason))
+        """Stops every robot, latched, whatever the `reason` is. Not a safety-rated stop."""
+        self.post(EStop(reason=str(reason).encode("utf-8", "replace").decode()))
 
     def clear_estop(self) -> None:
         self.post(ClearEStop(request_id=0))

@@ -43,7 +43,7 @@ from iris_session.runtime.owner import Owner
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.scene_change import SceneChanges, follow_timestep
 from iris_session.runtime.scheduling import quiet_collector, tick_priority
-from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, session_clock
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, checked, session_clock
 from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
 
@@ -81,6 +81,7 @@ class Session(Owner, SceneChanges):
         self._stepper: Stepper | None = None
         self._user_loop: UserLoop | None = None
         self._early: list[EntryMessage] = []  # posted before anybody drove the session
+        self._handing_over = threading.RLock()  # of those; a signal handler may post, too
         self._early_patches = []
         self._pacer: Pacer | None = None
         self._stop = threading.Event()
@@ -255,13 +256,15 @@ class Session(Owner, SceneChanges):
     # --- what the owner may do ---------------------------------------------------------------------------------------
 
     def post(self, message: EntryMessage) -> None:
-        """Puts an input of the owner (connection 0, rights of a director) into the next step."""
-        if self._stepper is not None:
-            self._stepper.post(message)
-        elif len(self._early) < MAX_HOST_ENTRIES:
-            self._early.append(message)
-        else:
-            raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for the first step: call run() first")
+        """Puts an input of the owner (connection 0, rights of a director) into the next step. From any thread."""
+        self._check_open()
+        with self._handing_over:
+            if self._stepper is not None:
+                self._stepper.post(message)
+            elif len(self._early) < MAX_HOST_ENTRIES:
+                self._early.append(checked(message))
+            else:
+                raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for the first step: call run() first")
 
     def pause(self) -> None:
         """Stops physics; leases, heartbeats and requests go on."""
@@ -305,18 +308,19 @@ class Session(Owner, SceneChanges):
         else:
             live, core = self._live(), self._make_core(user_owned=user_owned)
             stepper = live.make_stepper(core, self.clock, user_owned=user_owned)
-            with live.scenes.lock:  # no patch comes between
-                for patch in self._early_patches:
-                    stepper.change_scene(patch)
-                self._early_patches.clear()
-                self._stepper = stepper
             if not user_owned:
                 self.data = core.world.data
-                self._stepper.on_scene.append(self._take_scene)
-            for message in self._early:
-                # The data of a user's loop is taken as it is now: there is nothing to go back from.
-                if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
-                    self._stepper.post(message)
+                stepper.on_scene.append(self._take_scene)
+            with live.scenes.lock, self._handing_over:  # nothing of another thread comes between
+                for patch in self._early_patches:
+                    stepper.change_scene(patch)
+                for message in self._early:
+                    # The data of a user's loop is taken as it is now: there is nothing to go back from.
+                    if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
+                        stepper.post(message)
+                self._early_patches.clear()
+                self._early.clear()
+                self._stepper = stepper
         return self._stepper
 
     def _make_core(self, *, user_owned: bool) -> SessionCore:

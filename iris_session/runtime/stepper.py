@@ -191,7 +191,7 @@ class Stepper:
         """As `post`, of what befell the session itself: whatever its owner has posted, there is room for it."""
         if len(self._host) >= MAX_HOST_ENTRIES + ROOM_FOR_OURS:
             raise RuntimeError(f"{len(self._host)} inputs wait for one step: is the loop running?")
-        self._host.append(_checked(message))
+        self._host.append(checked(message))
 
     def change_scene(self, scene: NextScene | NextPatch) -> None:
         """Another scene, or another look of it, from the next step on. From any thread; of several that wait each gets
@@ -346,15 +346,18 @@ class Stepper:
         self.recorder.keyframe(frame, self._chain)
 
 
-def _checked(message: EntryMessage) -> EntryMessage:
-    """What a client's message has passed in the front: front and recorder would end at an input that breaks a limit."""
-    texts = {name: getattr(message, name, "") for name in ("text", "reason", "label")}
-    cut = {name: text[: MAX_TEXT - 3] + "..." for name, text in texts.items() if len(text) > MAX_TEXT}
-    checked: EntryMessage = msgspec.structs.replace(message, **cut) if cut else message
+def checked(message: EntryMessage) -> EntryMessage:
+    """What a client's message has passed in the front: front and recorder would end at an input that breaks a limit.
+
+    Raises `ValueError`.
+    """
     try:
+        texts = {name: getattr(message, name, "") for name in ("text", "reason", "label")}
+        cut = {name: text[: MAX_TEXT - 3] + "..." for name, text in texts.items() if len(text) > MAX_TEXT}
+        short: EntryMessage = msgspec.structs.replace(message, **cut) if cut else message
         # What is journaled is what is used: whole numbers in float fields become floats, lists tuples.
-        return decode_entry(encode_entry(Entry(HOST, HOST, 0, checked))).message
-    except msgspec.ValidationError as error:
+        return decode_entry(encode_entry(Entry(HOST, HOST, 0, short))).message
+    except (TypeError, OverflowError, msgspec.ValidationError) as error:
         raise ValueError(f"{type(message).__name__} cannot be used: {error}") from error
 
 

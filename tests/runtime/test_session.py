@@ -48,6 +48,21 @@ def test_what_the_owner_says_before_the_first_step_is_in_it(session: Session) ->
     assert session.status().tick >= 1
 
 
+def test_what_the_owner_cannot_say_is_refused_at_once_and_an_e_stop_never(session: Session) -> None:
+    session.marker("before")
+    with pytest.raises(ValueError, match="Marker cannot be used"):
+        session.marker(3)  # type: ignore[arg-type]
+    session.estop(None)  # type: ignore[arg-type]
+    session.marker("after")
+    session.run(until=lambda: len(_bodies(session)) >= 3, seconds=30.0)
+    kinds = {type(body) for body in _bodies(session) if not isinstance(body, Gap)}
+    assert kinds == {MarkerAdded, EStopChanged}, "what was refused costs nothing of what comes after it"
+    assert session.status().estop
+    with pytest.raises(ValueError, match="Marker cannot be used"):
+        session.marker(3)  # type: ignore[arg-type]
+    session.estop("\ud800")
+
+
 def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
     session.pause()
     session.resume()
@@ -140,7 +155,7 @@ def test_targets_for_an_environment_with_its_own_controller() -> None:
 def test_closing_twice_and_using_it_afterwards(session: Session) -> None:
     session.close()
     session.close()
-    for call in (session.run, session.start, session.patch_scene, lambda: session.address):
+    for call in (session.run, session.start, session.patch_scene, session.estop, lambda: session.address):
         with pytest.raises(OwnershipError, match="the session is closed: make another Session"):
             call()
     assert session.recording is None
