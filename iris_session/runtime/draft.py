@@ -100,7 +100,7 @@ class SceneDraft:
             self._poses[rows, :3] = p
             self._poses[rows, 3:] = q / lengths[:, None]
 
-    def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
+    def set_joints(self, name: str, positions: object) -> None:
         _check_name(name)
         articulation = self._scene.articulations.get(name)
         if articulation is None:
