@@ -197,7 +197,7 @@ def checked_pose(position: Any, quaternion: Any) -> Pose:
 
 def _finite(what: str, values: Any, count: int, names: str) -> list[float]:
     try:
-        found = [float(v) for v in ((None,) if isinstance(values, str | bytes) else values)]
+        found = [float(v) for v in ([] if isinstance(values, str | bytes) else values)]  # digits are no numbers
     except (TypeError, ValueError):
         found = []
     if len(found) != count or not np.isfinite(found).all():

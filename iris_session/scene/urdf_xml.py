@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,7 +29,7 @@ _NEEDED: Final = {
 #: Elements that a joint needs.
 _ENDS: Final = ("parent", "child")
 #: Attributes that are numbers, and how many of them.
-_NUMBERS: Final = {
+_NUMBERS: Final[Mapping[str, Mapping[str, int | tuple[int, ...]]]] = {
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
     "box": {"size": 3},
