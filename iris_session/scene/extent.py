@@ -57,6 +57,7 @@ def box_extent(spec: SceneSpec, more: Iterable[Points] = ()) -> Extent | None:
     return bounds(spec, spec.visuals, lambda k: _corners(spec.meshes[k].low, spec.meshes[k].high), more)
 
 
+@np.errstate(all="ignore")  # a length that is not finite is refused with the specification
 def bounds(
     spec: SceneSpec, visuals: Iterable[Visual], points_of: Callable[[int], Points], more: Iterable[Points] = ()
 ) -> Extent | None:

@@ -14,6 +14,7 @@ from iris_session.scene.parts import Matrix
 from iris_session.scene.simplify import unit
 
 
+@np.errstate(all="ignore")  # what gets out of reach is refused by its coordinates
 def scaled(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
     """`mesh` with the matrix (3, 3) in its vertices; the triangles are turned over where that mirrors."""
     if scale is None:

@@ -138,3 +138,18 @@ def test_pictures_that_other_programs_would_have_to_read_are_refused(tmp_path: P
         load_file(path)
     with pytest.raises(SceneBuildError, match="no image that can be read"):
         SceneBuilder().add_box(half_size=(1, 1, 1), texture=picture)
+
+
+def test_lengths_beyond_all_reach_are_refused_without_a_warning(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    scene = SceneBuilder()
+    scene.add_sphere(radius=1e200, quaternion=(0.5, 0.5, 0.5, 0.5))
+    with pytest.raises(SceneBuildError, match="cannot be drawn"):
+        scene.build(store)
+    document = Document()
+    document.square()
+    document.json["nodes"] = [{"mesh": 0, "scale": [1e300, 1e300, 1e300]}]
+    scene = SceneBuilder()
+    scene.add_file(document.write(tmp_path / "a.glb"))
+    with pytest.raises(SceneBuildError, match="reaches farther than 1,000,000 m"):
+        scene.build(store)
