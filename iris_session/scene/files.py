@@ -45,7 +45,7 @@ def present(path: Path) -> None:
         if path.is_dir():
             raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
         if not path.is_file():
-            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder')}")
+            raise SceneBuildError(f"{path}: no such file{readable_in(path.parent, 'in its folder', ending(path))}")
         if not path.stat().st_size:
             raise SceneBuildError(f"{path} is empty: 0 bytes")
     except (OSError, ValueError) as error:  # a name that no file can have
@@ -73,10 +73,11 @@ def ending(path: Path) -> str:
     return path.suffix.lower().lstrip(".")
 
 
-def readable_in(folder: Path, where: str) -> str:
-    """For error texts: the files of a folder that can be read."""
+def readable_in(folder: Path, where: str, wanted: str = "") -> str:
+    """For error texts: the files of a folder that can be read, those that end in `wanted` first."""
     try:
-        names = sorted(entry.name for entry in folder.iterdir() if ending(entry) in ENDINGS and entry.is_file())
+        found = [entry for entry in folder.iterdir() if ending(entry) in ENDINGS and entry.is_file()]
+        names = [entry.name for entry in sorted(found, key=lambda one: (ending(one) != wanted, one.name))]
     except OSError:
         return "" if folder.is_dir() else f"; there is no folder {folder} either"
     if not names:

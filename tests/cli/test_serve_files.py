@@ -40,7 +40,7 @@ def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, m
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("missing.glb", "no such file; in its folder: Part no. 1.off, a.glb, b.urdf, c.xml"),
+        ("missing.glb", "no such file; in its folder: a.glb, Part no. 1.off, b.urdf, c.xml"),
         ("lost/missing.glb", "no such file; there is no folder"),
         (".", "is a folder: name a file; in it: Part no. 1.off, a.glb, b.urdf, c.xml"),
         ("folder.glb", "is a folder: name a file; none in it is of a kind that is read"),
