@@ -185,11 +185,11 @@ class Recording:
     def _unique(
         self, entity: str, decode: Callable[[Any], Iterator[_T]], key: Callable[[_T], Hashable]
     ) -> Iterator[_T]:
-        """Items of all parts; what a part repeats from the end of the one before counts once. Of a file that Rerun's
-        tools have rewritten, which may be of several parts, every repetition does."""
+        """Items of all parts; what a part repeats from the end of the one before counts once. A file that Rerun's tools
+        have rewritten may hold several parts: there, whatever comes again counts once."""
         before: frozenset[Hashable] = frozenset()
         tail: deque[Hashable] = deque(maxlen=REPEATED_ITEMS)
-        seen: dict[Hashable, None] = {}
+        seen: set[Hashable] = set()  # what of a rewritten file is in `tail`
         part = 0
         for i, item in self._items(entity, decode):
             if i != part:
@@ -197,11 +197,11 @@ class Recording:
             name = key(item)
             if name in before or name in seen:
                 continue
-            tail.append(name)
             if self._readable[i] in self._rewritten:
-                seen[name] = None
-                if len(seen) > REPEATED_ITEMS:
-                    del seen[next(iter(seen))]
+                if len(tail) == REPEATED_ITEMS:
+                    seen.discard(tail[0])
+                seen.add(name)
+            tail.append(name)
             yield item
 
     def _items(self, entity: str, decode: Callable[[Any], Iterator[_T]]) -> Iterator[tuple[int, _T]]:

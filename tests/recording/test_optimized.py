@@ -16,7 +16,7 @@ import pytest
 
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, MarkerAdded
-from iris_session.recording import CLOSED, OPEN, Recording, rrd_file, verify
+from iris_session.recording import CLOSED, OPEN, Recording, reader, rrd_file, verify
 from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame
 from iris_session.recording.paths import ROWS, part_path
 from iris_session.recording.writer import RrdWriter
@@ -225,7 +225,11 @@ def parts(tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
-def test_parts_may_be_optimized_each_for_itself_or_into_one(tmp_path: Path, parts: tuple[Path, Path]) -> None:
+@pytest.mark.parametrize("remembered", [reader.REPEATED_ITEMS, 20])
+def test_parts_may_be_optimized_each_for_itself_or_into_one(
+    tmp_path: Path, parts: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, remembered: int
+) -> None:
+    monkeypatch.setattr(reader, "REPEATED_ITEMS", remembered)
     first, second = parts
     (tmp_path / "out").mkdir()
     for part in parts:
