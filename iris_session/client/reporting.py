@@ -38,20 +38,21 @@ class ArrivalMeter:
         """A frame was handed to the application.
 
         One that is sent again, because its source is silent, is as old as that silence, and says nothing of its way.
+        The first of a connection may be one of those.
         """
         seq = state.header.state_seq
         if 0 < self._seq < seq:
             self._missed += seq - self._seq - 1
         self._seq = seq
         self._delivered += 1
-        if len(self._ages_ns) < MAX_AGES and state.header.session_time != self._shown_ns:
+        if len(self._ages_ns) < MAX_AGES and self._shown_ns not in (-1, state.header.session_time):
             self._ages_ns.append(state.age_ns)
         self._shown_ns = state.header.session_time
 
     def take(self, connection: Connection, now_ns: int) -> ClientReport | None:
         """The report of the last second, when it is due and there is a session to tell it."""
         if not connection.joined:
-            self._since_ns, self._seq, self._ages = -1, 0, None
+            self._since_ns, self._seq, self._ages, self._shown_ns = -1, 0, None, -1
             return None
         received = connection.stream.counters.bytes_received
         if self._since_ns < 0:

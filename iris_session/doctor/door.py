@@ -3,7 +3,9 @@ that comes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final
 
 from iris_session.client import Client, ClientError, RefusedError, VersionError
@@ -193,9 +195,8 @@ def _clock(client: Client) -> Finding:
 
 def _state(client: Client, states: list[SceneState]) -> Finding:
     """State at our own place."""
-    ages = quantiles(state.age_ns for state in states)
     welcome = client.connection.welcome
-    if ages is None:
+    if not states:
         port = 0 if welcome is None else welcome.endpoints.state
         address = Address.parse(client.address)
         client.close()  # the next takes seconds, in which we would say nothing and be kept as somebody who was lost
@@ -206,8 +207,20 @@ def _state(client: Client, states: list[SceneState]) -> Finding:
         if finding.failed:
             return finding
         return failed("state", f"no state comes though port {port} takes connections", "the session does not step?")
-    missed = client.connection.stream.counters.queued_old
-    text = f"state comes at {len(states) / LOOK_S:.0f} Hz, age p50 {ages.p50:.1f} ms, p99 {ages.p99:.1f} ms"
+    return state_age(states, client.connection.stream.counters.queued_old)
+
+
+def state_age(states: Sequence[SceneState], missed: int) -> Finding:
+    """How old state is that came in `LOOK_S`; `missed`: frames that waited too long."""
+    text = f"state comes at {len(states) / LOOK_S:.0f} Hz"
+    new = [b for a, b in pairwise(states) if b.header.session_time != a.header.session_time]
+    if len(states) > 1 and not new:  # one state, sent again and again
+        age_s = states[-1].age_ns * 1e-9
+        why = "nothing new is published"
+        return warning("state", f"{text}, all as it was {age_s:.1f} s ago", why, "look at the program that publishes")
+    ages = quantiles(state.age_ns for state in new or states)
+    assert ages is not None
+    text = f"{text}, age p50 {ages.p50:.1f} ms, p99 {ages.p99:.1f} ms"
     if ages.p99 > OLD_MS:
         why = f"{missed} frames waited too long in a queue" if missed else "see the check `age`"
         return warning("state", text, why, "look at this machine's network and load")

@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from iris_session.client.address import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
-from iris_session.doctor.door import knock, refusal, server_key, unpaired
+from iris_session.client.state_stream import SceneState
+from iris_session.doctor.door import knock, refusal, server_key, state_age, unpaired
 from iris_session.keys import KeyHome, KeyPair, SessionNote
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.server_messages import Refused
+from iris_session.protocol.server_messages import Refused, StateHeader
 
 ADDRESS = Address("192.0.2.7", 7721)
 
@@ -103,3 +105,20 @@ def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:
     assert (found.check, found.state) == ("code", "failed")
     assert "like 7KQ2-M4XD-9PTR" in found.text
     assert "iris-session pair" in found.advice
+
+
+def state(session_time: int, age_ms: int) -> SceneState:
+    return SceneState(StateHeader(1, 0, 0, 0.0, session_time, 0, 0, 0), np.zeros((0, 7)), 0, age_ms * 1_000_000)
+
+
+def test_old_state_is_blamed_on_the_link_only_when_something_new_comes() -> None:
+    moving = [state(n, 3) for n in range(90)]
+    assert state_age(moving, 0).state == "ok"
+    slow = state_age([state(n, 300) for n in range(90)], 7)
+    assert (slow.state, slow.why) == ("warning", "7 frames waited too long in a queue")
+    silent = state_age([state(5, 9000 + 250 * n) for n in range(6)], 0)
+    assert silent.state == "warning"
+    assert silent.text == "state comes at 4 Hz, all as it was 10.2 s ago"
+    assert silent.why == "nothing new is published"
+    assert state_age([state(5, 9000), *(state(6 + n, 3) for n in range(80))], 0).state == "ok", "it goes on"
+    assert state_age([state(5, 3)], 0).state == "ok", "of one alone nobody can say"
