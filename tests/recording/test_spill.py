@@ -82,7 +82,12 @@ def test_a_file_that_cannot_be_read_back_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs the device that is always full")
 def test_a_full_disk_refuses(tmp_path: Path) -> None:
-    (tmp_path / "s").symlink_to("/dev/full")
     spill = SpillFile(tmp_path / "s", 1 << 20)
+    assert spill.push(b"x", 1)
+    full = os.open("/dev/full", os.O_RDWR)
+    os.dup2(full, spill._fd)
+    os.close(full)
     assert not spill.push(b"x", 1)
     assert "No space left" in spill.fault
+    assert spill.rows == 1
+    spill.close()
