@@ -73,8 +73,10 @@ def test_rows_without_a_column_have_null_in_it() -> None:
 
 
 def test_rows_out_of_order_within_a_batch_are_sorted() -> None:
-    (pieces,) = spans([table(0, 6).take(pa.array([3, 1, 0, 5, 4, 2])), table(0, 6, ())])
-    assert values([join(pieces)]) == values([table(0, 6)])
+    mixed = table(0, 6, ("a", "c")).take(pa.array([3, 1, 0, 5, 4, 2]))
+    found = list(spans([mixed, table(0, 3, ("b",)), table(3, 3, ("b",))]))
+    assert list(map(count, found)) == [3, 3]
+    assert values(list(map(join, found))) == values([table(0, 6)])
 
 
 def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
