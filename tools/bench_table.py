@@ -2,6 +2,8 @@
 
 python tools/bench_table.py --seconds 20 > table.md
 python tools/bench_table.py --profiles lan,busy-wifi --seconds 5 --json
+
+Ctrl-C (or SIGTERM) ends it with the table of what was measured till then; exit status 130.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import subprocess
 import sys
 from typing import Any, Final
@@ -37,6 +40,9 @@ BENCHES: Final = (
 )
 
 
+NOTHING: Final[dict[str, Any]] = {"results": {}}
+
+
 def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> dict[str, Any]:
     """One benchmark in processes of its own; its JSON object, without results when it failed (its error is on
     standard error)."""
@@ -47,7 +53,7 @@ def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> 
     done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
     if done.returncode != 0:
         print(f"failed: {' '.join(command)}", file=sys.stderr, flush=True)
-        return {"results": {}}
+        return NOTHING
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 
@@ -59,7 +65,7 @@ def rows(reports: dict[str, dict[str, dict[str, Any]]]) -> str:
     lines.append("|---" * (2 + len(profiles)) + "|")
     for label, _, keys in BENCHES:
         for key, name in keys if label in reports else ():
-            values = [reports[label][profile]["results"].get(key, math.nan) for profile in profiles]
+            values = [reports[label].get(profile, NOTHING)["results"].get(key, math.nan) for profile in profiles]
             lines.append(f"| {label} | {name} | {' | '.join(map(number, values))} |")
     return "\n".join(lines)
 
@@ -72,7 +78,7 @@ def number(value: float | None) -> str:
     return f"{value:.0f}" if value >= 100.0 else f"{value:.1f}"
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profiles", default=",".join(PROFILES), help="comma-separated; empty: no link (%(default)s)")
     parser.add_argument("--benches", default=",".join(label.replace(", ", "/") for label, _, _ in BENCHES))
@@ -81,20 +87,34 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="the reports instead of the table")
     options = parser.parse_args()
     chosen = options.benches.split(",")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     reports: dict[str, dict[str, dict[str, Any]]] = {}
+    status = 0
+    try:
+        measure(reports, chosen, options)
+    except KeyboardInterrupt:
+        print("ended before everything was measured", file=sys.stderr)
+        status = 130
+    if options.json:
+        print(json.dumps(reports))
+    elif reports:
+        print(rows(reports))
+        machine = contract.machine()
+        versions = f"Python {machine['python']}, MuJoCo {machine['mujoco']}"
+        print(f"\n{machine['cpus']} cores, {versions}; {options.seconds:g} s each, seed {options.seed}.")
+    return status
+
+
+def measure(reports: dict[str, dict[str, dict[str, Any]]], chosen: list[str], options: argparse.Namespace) -> None:
+    """Fills `reports`, one benchmark after the other."""
     for label, arguments, _ in BENCHES:
         if label.replace(", ", "/") not in chosen:
             continue
         for profile in options.profiles.split(","):
             print(f"{label}, {profile or 'no link'}", file=sys.stderr, flush=True)
-            reports.setdefault(label, {})[profile] = run(arguments, profile, options.seconds, options.seed)
-    if options.json:
-        print(json.dumps(reports))
-        return
-    print(rows(reports))
-    machine = contract.machine()
-    print(f"\n{machine['cpus']} cores, Python {machine['python']}, MuJoCo {machine['mujoco']}; seed {options.seed}.")
+            report = run(arguments, profile, options.seconds, options.seed)
+            reports.setdefault(label, {})[profile] = report
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
