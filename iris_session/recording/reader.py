@@ -122,12 +122,15 @@ class Recording:
 
     def states(self) -> Iterator[State]:
         """Poses of all bodies at the state rate, with presence and the applied samples."""
-        loaded = [(scene.session_time, scene.bodies) for _, scene in self._items(paths.MODELS, items.models)]
+        # By steps, not times: the state of the row before a scene is later than that row, by the time that it took.
+        # A scene from before the first row has time 0.
+        scenes = (scene for _, scene in self._items(paths.MODELS, items.models))
+        loaded = [(scene.step if scene.session_time else -1, scene.bodies) for scene in scenes]
         loaded.sort(key=lambda scene: scene[0])
-        since = [session_time for session_time, _ in loaded]
+        before = [step for step, _ in loaded]  # the newest step that each was not yet there in
         bodies = [self.header.bodies, *(bodies for _, bodies in loaded)]
         for state in self._unique(paths.STATE, items.states, lambda state: state.session_time):
-            yield state._replace(bodies=bodies[bisect_left(since, state.session_time)])
+            yield state._replace(bodies=bodies[bisect_left(before, state.step)])
 
     def model(self, model_hash: str) -> bytes:
         """Binary form (mjb) of the model of a scene that was loaded in the session, else `LookupError`."""

@@ -173,7 +173,8 @@ def other_scene(step: int) -> tuple[SceneModel, bytes]:
     """A scene with one body, and the binary form of its model."""
     model = mujoco.MjModel.from_xml_string(OTHER)
     mjb = bytes(model_bytes(model))
-    return SceneModel(step, 20_000_000, scene_hash(mjb), pack_model(mjb), (BodyInfo(1, "cup", moving=True),)), mjb
+    row_ns = step * 2_000_000  # the state of that row is later, see `frame`
+    return SceneModel(step, row_ns, scene_hash(mjb), pack_model(mjb), (BodyInfo(1, "cup", moving=True),)), mjb
 
 
 def test_another_scene_is_drawn_from_its_moment_on_and_its_model_can_be_read(tmp_path: Path) -> None:
