@@ -28,7 +28,7 @@ from typing import Final, Self
 import mujoco
 
 from iris_session.physics import Pacer, PacerStats
-from iris_session.protocol.client_messages import Assign, Control, SetScale
+from iris_session.protocol.client_messages import Assign, Control, EStop, SetScale
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
@@ -43,7 +43,7 @@ from iris_session.runtime.owner import Owner
 from iris_session.runtime.processes import SessionProcesses
 from iris_session.runtime.scene_change import SceneChanges, follow_timestep
 from iris_session.runtime.scheduling import quiet_collector, tick_priority
-from iris_session.runtime.stepper import MAX_HOST_ENTRIES, Stepper, checked, session_clock
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper, checked, session_clock
 from iris_session.runtime.tick_times import TickTimes
 from iris_session.runtime.user_loop import UserLoop
 
@@ -261,7 +261,7 @@ class Session(Owner, SceneChanges):
         with self._handing_over:
             if self._stepper is not None:
                 self._stepper.post(message)
-            elif len(self._early) < MAX_HOST_ENTRIES:
+            elif len(self._early) < MAX_HOST_ENTRIES + (ROOM_FOR_OURS if isinstance(message, EStop) else 0):
                 self._early.append(checked(message))
             else:
                 raise OwnershipError(f"more than {MAX_HOST_ENTRIES} inputs wait for the first step: call run() first")
@@ -312,15 +312,15 @@ class Session(Owner, SceneChanges):
                 self.data = core.world.data
                 stepper.on_scene.append(self._take_scene)
             with live.scenes.lock, self._handing_over:  # nothing of another thread comes between
+                self._stepper = stepper  # first: what a signal handler posts meanwhile goes there, and is not lost
                 for patch in self._early_patches:
                     stepper.change_scene(patch)
                 for message in self._early:
                     # The data of a user's loop is taken as it is now: there is nothing to go back from.
                     if not (user_owned and isinstance(message, Control) and message.action == ControlAction.RESET):
-                        stepper.post(message)
+                        stepper.say(message)
                 self._early_patches.clear()
                 self._early.clear()
-                self._stepper = stepper
         return self._stepper
 
     def _make_core(self, *, user_owned: bool) -> SessionCore:

@@ -25,6 +25,7 @@ from iris_session.protocol.scene_patch import AddVisual, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.runtime import scene_change
 from iris_session.runtime.core import plant_state
+from iris_session.runtime.stepper import MAX_HOST_ENTRIES
 from iris_session.runtime.verification import verify_recording
 from iris_session.scene import AssetStore
 
@@ -61,6 +62,16 @@ def test_what_the_owner_cannot_say_is_refused_at_once_and_an_e_stop_never(sessio
     with pytest.raises(ValueError, match="Marker cannot be used"):
         session.marker(3)  # type: ignore[arg-type]
     session.estop("\ud800")
+
+
+def test_an_e_stop_before_the_first_step_is_taken_however_much_waits(session: Session) -> None:
+    for _ in range(MAX_HOST_ENTRIES):
+        session.clear_estop()
+    with pytest.raises(OwnershipError, match="inputs wait for the first step"):
+        session.clear_estop()
+    session.estop("at once")
+    session.run(until=lambda: session.status().estop, seconds=30.0)
+    assert session.status().estop
 
 
 def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
