@@ -210,20 +210,23 @@ def encode_media_frames(
         raise ValueError(not_a_stream(stream))
     if BudgetClass.FULL not in by_class or any(name not in CLASSES[:-1] for name in by_class):
         raise ValueError(f"a media frame has class 'full', and may have 'half' and 'quarter', not {list(by_class)}")
+    payloads = []
     for data in by_class.values():
         try:
-            size = memoryview(data).nbytes
+            view = memoryview(data)
         except TypeError:
             raise ValueError(f"a media frame is {type(data).__name__}: bytes are expected") from None
-        if size > MAX_MEDIA_FRAME_BYTES:
-            raise ValueError(f"a media frame of {size} bytes: at most {MAX_MEDIA_FRAME_BYTES} for each class")
+        if view.nbytes > MAX_MEDIA_FRAME_BYTES:
+            raise ValueError(f"a media frame of {view.nbytes} bytes: at most {MAX_MEDIA_FRAME_BYTES} for each class")
+        # An array may be counted in rows, or lie in memory in pieces, which a socket refuses with half a message sent.
+        payloads.append(data if isinstance(data, bytes) else view.tobytes())
     try:
         push = MediaPush(stream, scene_epoch, operator.index(capture_ns), tuple(by_class), encoding)
         header = encode_media_push(push)
         decode_media_push(header)
     except (TypeError, OverflowError, ProtocolError) as error:  # a time or an encoding that is none
         raise ValueError(f"a media frame of capture_ns {capture_ns!r}, encoding {encoding!r}: {error}") from None
-    return [header, *by_class.values()]
+    return [header, *payloads]
 
 
 def decode_media_push(data: Bytes) -> MediaPush:

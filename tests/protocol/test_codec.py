@@ -6,6 +6,7 @@ import math
 from array import array
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -320,3 +321,12 @@ def test_media_that_no_front_would_take_are_refused_where_they_are_handed_in(
     assert data == [b"points"]
     with pytest.raises(ValueError, match=says):
         codec.encode_media_frames(**(good | given))  # type: ignore[arg-type]
+
+
+def test_media_in_arrays_are_bytes_in_their_order() -> None:
+    """As a picture that was turned upside down is, which lies in memory in pieces: no socket takes it so."""
+    rows = np.arange(6, dtype=np.uint8).reshape(3, 2)
+    frames = {"full": rows[::-1], "half": array("H", [1, 2])}
+    _, *data = codec.encode_media_frames("cloud", frames, 5, 1, "bytes")  # type: ignore[arg-type]
+    assert data == [bytes([4, 5, 2, 3, 0, 1]), array("H", [1, 2]).tobytes()]
+    assert [len(one) for one in data] == [6, 4]
