@@ -24,7 +24,6 @@ _NEEDED: Final = {
     "geometry/box": ("size",),
     "geometry/cylinder": ("radius", "length"),
     "geometry/sphere": ("radius",),
-    "material/texture": ("filename",),
 }
 #: Elements that a joint needs.
 _ENDS: Final = ("parent", "child")
@@ -104,12 +103,12 @@ def _without_other_shapes(path: Path, root: Any) -> dict[str, None]:
 
 
 def _check(path: Path, root: Any) -> None:
-    """Raises `SceneBuildError` for what is missing, and for numbers that are none. Only what the robot is made of:
-    transmissions and sensors have joints and limits of their own."""
+    """Raises `SceneBuildError` for what is missing, and for numbers that are none. Only what the robot is drawn of:
+    transmissions and sensors have joints and limits of their own, and exporters write masses as they know them."""
     for part in root:
         if part.tag in ("link", "joint", "material"):
             for element in part.iter():
-                if isinstance(element.tag, str):
+                if isinstance(element.tag, str) and element.getparent().tag != "inertial":
                     _check_element(path, element)
         if part.tag == "joint":
             for end in _ENDS:

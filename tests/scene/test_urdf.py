@@ -209,6 +209,18 @@ def test_a_robot_in_another_size(tmp_path: Path) -> None:
             composed(urdf, tmp_path, scale=wrong)
 
 
+def test_what_exporters_leave_empty_and_nobody_draws_is_no_fault(tmp_path: Path) -> None:
+    """As SolidWorks' exporter does: a texture without a file, a centre of mass of what has none."""
+    urdf = tmp_path / "part.urdf"
+    urdf.write_text(
+        '<robot name="part"><link name="base"><inertial><origin xyz="nan nan nan" rpy="0 0 0"/><mass value="0"/>'
+        '</inertial><visual><geometry><box size="1 2 3"/></geometry><material name=""><color rgba="1 0 0 1"/>'
+        '<texture filename=""/></material></visual></link></robot>'
+    )
+    (shown,) = composed(urdf, tmp_path).spec.visuals
+    assert shown.rgba == (1.0, 0.0, 0.0, 1.0)
+
+
 def test_a_robot_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     urdf.write_text(urdf.read_text().replace('<robot name="arm">', "<robot>"))
