@@ -15,7 +15,9 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.parts import MAX_FILE_BYTES, MAX_NODES, MAX_TRIANGLES
 
 #: Encodings in which what is looked for here has the bytes of ASCII.
-_PLAIN: Final = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1", "iso-8859-15", "latin-1", "windows-1252"})
+_PLAIN: Final = frozenset(
+    {"utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso-8859-15", "latin-1", "windows-1252"}
+)
 _ENCODING: Final = re.compile(rb"""^<\?xml[^>]{0,200}?encoding\s*=\s*["']([^"']{1,40})["']""")
 _BOM: Final = b"\xef\xbb\xbf"
 #: Most levels of things within things.

@@ -53,6 +53,13 @@ def components(*ids: int) -> str:
     return "<components>" + "".join(f'<component objectid="{k}"/>' for k in ids) + "</components>"
 
 
+@pytest.mark.parametrize("spelled", ["utf-8", "UTF-8", "utf8"])  # the last one by Python's own writer
+def test_utf_8_in_every_spelling_is_read(tmp_path: Path, spelled: str) -> None:
+    text = dae("", '<node><instance_geometry url="#g"/></node>').replace('"utf-8"', f'"{spelled}"')
+    (tmp_path / "a.dae").write_text(text)
+    assert len(load_file(tmp_path / "a.dae").nodes) == 1
+
+
 def test_what_is_placed_a_few_times_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.dae").write_text(dae(doubling(3), '<node id="top"><instance_node url="#n0"/></node>'))
     assert len(load_file(tmp_path / "a.dae").nodes) == 8
