@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from types import MappingProxyType, TracebackType
 from typing import Final, NamedTuple, Protocol
 
 import msgspec
@@ -150,6 +150,7 @@ class Stepper:
         self._newest_step = 0
         self.last: StepOutcome | None = None
         self._ended: Exception | None = None
+        self._ended_at: TracebackType | None = None
         self._host: deque[EntryMessage] = deque()
         self._scenes: deque[NextScene | NextPatch] = deque()
         #: Called with another scene before the step that loads it.
@@ -208,11 +209,11 @@ class Stepper:
         in no journal, and what followed would not fit it. What ended the first is raised again (`ended_by`).
         """
         if self._ended is not None:
-            raise self._ended
+            raise self._ended.with_traceback(self._ended_at)  # which would grow with every time that it is raised
         try:
             return self._step(n_ticks, plant, publish)
         except BaseException as error:
-            self._ended = ended_by(error)
+            self._ended, self._ended_at = ended_by(error), error.__traceback__
             raise
 
     def _step(self, n_ticks: int, plant: bytes, publish: bool) -> StepOutcome:

@@ -17,6 +17,7 @@ ticks of the round before, so that robots keep their speed. At the end robots ar
 from __future__ import annotations
 
 import threading
+from types import TracebackType
 from typing import Final
 
 import mujoco
@@ -70,6 +71,7 @@ class UserLoop:
         self._was_reset = False
         self._wrote = False
         self._helper_error: BaseException | None = None
+        self._helper_traceback: TracebackType | None = None
         self._helper = threading.Thread(target=self._idle, name="iris-session-idle", daemon=True)
         self._helper.start()
 
@@ -134,7 +136,7 @@ class UserLoop:
         if self._closed.is_set():
             raise OwnershipError("the session is closed: no tick can be taken any more")
         if self._helper_error is not None:
-            raise self._helper_error
+            raise self._helper_error.with_traceback(self._helper_traceback)  # as of `Stepper.step`
 
     def _end(self) -> bool:
         """True when the state that was taken is one after time went back."""
@@ -201,4 +203,4 @@ class UserLoop:
                         self._stepper.step(0, self._plant)
                         self._processes.watch(self._stepper)
         except BaseException as error:  # shown at the user's next tick, where it can be seen
-            self._helper_error = error
+            self._helper_error, self._helper_traceback = error, error.__traceback__

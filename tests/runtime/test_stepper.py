@@ -176,9 +176,12 @@ def test_a_step_that_an_interrupt_broke_off_is_the_last(rig: Rig) -> None:
     with pytest.raises(KeyboardInterrupt):
         rig.steps(1)
     del rig.front.send_decision
-    for _ in range(2):
-        with pytest.raises(OwnershipError, match="broken off by an interrupt"):
+    depths = set()
+    for _ in range(3):
+        with pytest.raises(OwnershipError, match="broken off by an interrupt") as caught:
             rig.steps(1)
+        depths.add(len(caught.traceback))
+    assert len(depths) == 1, "who tries again and again does not fill the memory"
     assert len(rig.recorder.rows) == 3
 
 

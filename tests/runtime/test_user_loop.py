@@ -273,3 +273,19 @@ def test_a_callback_of_somebody_else_stays() -> None:
     finally:
         mujoco.set_mjcb_control(None)
         session.close()
+
+
+def test_what_stopped_the_helper_is_raised_at_every_tick_and_does_not_fill_the_memory(rig: Rig) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise KeyError("the core is broken")
+
+    rig.rounds(1)
+    rig.stepper.core.step = broken  # type: ignore[method-assign,assignment]
+    rig.now_ns += 40 * MS
+    rig.loop._helper.join(10.0)
+    depths = set()
+    for _ in range(3):
+        with pytest.raises(KeyError, match="broken") as caught:
+            rig.rounds(1)
+        depths.add(len(caught.traceback))
+    assert len(depths) == 1
