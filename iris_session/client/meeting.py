@@ -129,7 +129,11 @@ class Meeting:
             self.note = f"what introduces itself at {address} cannot be understood: {error}"
             return None
         except OSError as error:
-            self.note = f"no introduction at {address} (TCP port {address.port - 1}: {error.strerror or error})"
+            why = error.strerror or error
+            self.note = (
+                f"no introduction at {address}, which is on TCP port {address.port - 1}: {why}; "
+                "`serve --port-base N` is joined at port N + 1"
+            )
             return None
         if introduction.beacon.control != address.port:
             self.note = f"the session below {address} is another one, on port {introduction.beacon.control}"
