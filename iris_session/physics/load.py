@@ -30,8 +30,8 @@ def load_model(path: str | Path) -> mujoco.MjModel:
     suffix = path.suffix.lower()
     if suffix not in (*TEXT_SUFFIXES, ".mjb"):
         raise ModelNotFoundError(
-            f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}; other files are shown, "
-            "not simulated: ScenePublisher with SceneBuilder.add_file"
+            f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}; other files are "
+            "shown, not simulated: ScenePublisher with SceneBuilder.add_file"
         )
     read = mujoco.MjModel.from_binary_path if suffix == ".mjb" else mujoco.MjModel.from_xml_path
     try:
