@@ -8,7 +8,7 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 from typing import Any, Final
@@ -150,13 +150,15 @@ class FrontControl:
     PEERS: Final = 8
     #: Inputs of one peer before a new one takes its place.
     LIFE: Final = 400
+    #: Further ones of the front.
+    SETTINGS: Final[Mapping[str, Any]] = {}
 
     def __init__(self, rng: Random) -> None:
         from tests.transport.harness import FrontSession
 
         self._rng = rng
         limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6)
-        self.session = FrontSession(limits=limits, silence_ns=10**12)
+        self.session = FrontSession(limits=limits, silence_ns=10**12, **self.SETTINGS)
         self.process = psutil.Process(self.session.process.pid)
         self._corpus = Corpus(rng, client_messages())
         self._peers: list[zmq.Socket[bytes]] = []
