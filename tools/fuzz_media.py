@@ -47,7 +47,7 @@ class FrontMedia(FrontControl):
 
     BARRIER: Final = 1000
     LIFE: Final = 300
-    #: Frames are handed in faster than any source does it: whoever is sent so many is sent fewer for seconds, by design.
+    #: Frames are handed in faster than by any source: whoever is sent so many is sent fewer for seconds, by design.
     SETTINGS: Final = {"adapt_media": False}
 
     def __init__(self, rng: Random) -> None:
