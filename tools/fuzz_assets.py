@@ -154,6 +154,8 @@ class FrontAssets(FrontControl):
                 break
             except zmq.Again:  # it is being cut off, or the front is busy
                 assert time.monotonic() < deadline, "the front takes nothing"
+                while peer.poll(0):  # libzmq connects again only after somebody has made room for what came
+                    peer.recv_multipart()
                 self._turn()
         if self._sent % 50 == 0:
             self._turn()
