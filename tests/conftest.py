@@ -27,7 +27,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS", "same"))
 MARK = "IRIS_TEST_RUN"
 #: What ends by itself may take this long, on a machine that others keep busy.
 ENDING_S = 30.0
-
+#: Exit status where something was left behind: a second judgement of single tests (status 1) would not see it.
+LEFT_BEHIND = 7
+SAID = "processes were left behind"
+_left_behind: list[str] = []
 
 #: Rooms whose tests have processes, sockets or threads, and so a machine that may be taken away for a second.
 LIVE = {
@@ -41,6 +44,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.relative_to(here).parts[0] in LIVE or item.get_closest_marker("e2e"):
             item.add_marker("live")
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """In the process that all workers report to."""
+    if report.when == "teardown" and report.failed and SAID in report.longreprtext:
+        _left_behind.append(report.nodeid)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if _left_behind:
+        session.exitstatus = LEFT_BEHIND
 
 
 def _ours() -> list[psutil.Process]:
@@ -65,7 +79,7 @@ def _no_process_stays() -> Iterator[None]:
         with contextlib.suppress(psutil.Error):
             left.append(f"{process.pid} {' '.join(process.cmdline())}")
             process.kill()
-    assert not left, f"left behind: {left}"
+    assert not left, f"{SAID}: {left}"
 
 
 @pytest.fixture(scope="session", autouse=True)

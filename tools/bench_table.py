@@ -3,7 +3,8 @@
 python tools/bench_table.py --seconds 20 > table.md
 python tools/bench_table.py --profiles lan,busy-wifi --seconds 5 --json
 
-Ctrl-C (or SIGTERM) ends it with the table of what was measured till then; exit status 130.
+Exit status 1 when a benchmark failed. Ctrl-C (or SIGTERM) ends it with the table of what was measured till then, and
+"-" for the rest; exit status 130.
 """
 
 from __future__ import annotations
@@ -40,9 +41,6 @@ BENCHES: Final = (
 )
 
 
-NOTHING: Final[dict[str, Any]] = {"results": {}}
-
-
 def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> dict[str, Any]:
     """One benchmark in processes of its own; its JSON object, without results when it failed (its error is on
     standard error)."""
@@ -50,11 +48,17 @@ def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> 
     if "slow-client" not in arguments:
         command += ["--seconds", str(seconds)]
     command += ["--profile", profile] if profile else []
-    done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
-    if done.returncode != 0:
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as bench:
+        try:
+            out, _ = bench.communicate()
+        except KeyboardInterrupt:
+            bench.send_signal(signal.SIGINT)  # it ends its own processes; killed, it would leave them behind
+            bench.communicate()
+            raise
+    if bench.returncode != 0:
         print(f"failed: {' '.join(command)}", file=sys.stderr, flush=True)
-        return NOTHING
-    result: dict[str, Any] = json.loads(done.stdout)
+        return {"results": {}}
+    result: dict[str, Any] = json.loads(out)
     return result
 
 
@@ -65,9 +69,14 @@ def rows(reports: dict[str, dict[str, dict[str, Any]]]) -> str:
     lines.append("|---" * (2 + len(profiles)) + "|")
     for label, _, keys in BENCHES:
         for key, name in keys if label in reports else ():
-            values = [reports[label].get(profile, NOTHING)["results"].get(key, math.nan) for profile in profiles]
-            lines.append(f"| {label} | {name} | {' | '.join(map(number, values))} |")
+            cells = [cell(reports[label].get(profile), key) for profile in profiles]
+            lines.append(f"| {label} | {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def cell(report: dict[str, Any] | None, key: str) -> str:
+    """Of a benchmark that was not run: "-"."""
+    return "-" if report is None else number(report["results"].get(key, math.nan))
 
 
 def number(value: float | None) -> str:
@@ -89,9 +98,9 @@ def main() -> int:
     chosen = options.benches.split(",")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     reports: dict[str, dict[str, dict[str, Any]]] = {}
-    status = 0
     try:
         measure(reports, chosen, options)
+        status = int(any(not one["results"] for by_profile in reports.values() for one in by_profile.values()))
     except KeyboardInterrupt:
         print("ended before everything was measured", file=sys.stderr)
         status = 130
@@ -112,8 +121,8 @@ def measure(reports: dict[str, dict[str, dict[str, Any]]], chosen: list[str], op
             continue
         for profile in options.profiles.split(","):
             print(f"{label}, {profile or 'no link'}", file=sys.stderr, flush=True)
-            report = run(arguments, profile, options.seconds, options.seed)
-            reports.setdefault(label, {})[profile] = report
+            found = run(arguments, profile, options.seconds, options.seed)
+            reports.setdefault(label, {})[profile] = found
 
 
 if __name__ == "__main__":
