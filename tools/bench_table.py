@@ -62,9 +62,8 @@ def run(arguments: tuple[str, ...], profile: str, seconds: float, seed: int) -> 
     return result
 
 
-def rows(reports: dict[str, dict[str, dict[str, Any]]]) -> str:
+def rows(reports: dict[str, dict[str, dict[str, Any]]], profiles: list[str]) -> str:
     """The Markdown table of `reports`: by label of the benchmark, by profile."""
-    profiles = list(next(iter(reports.values())))
     lines = [f"| bench | ms unless Hz | {' | '.join(name or 'no link' for name in profiles)} |"]
     lines.append("|---" * (2 + len(profiles)) + "|")
     for label, _, keys in BENCHES:
@@ -107,7 +106,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(reports))
     elif reports:
-        print(rows(reports))
+        print(rows(reports, options.profiles.split(",")))
         machine = contract.machine()
         versions = f"Python {machine['python']}, MuJoCo {machine['mujoco']}"
         print(f"\n{machine['cpus']} cores, {versions}; {options.seconds:g} s each, seed {options.seed}.")

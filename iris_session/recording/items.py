@@ -21,7 +21,7 @@ from iris_session.recording.journal import JournalRow, Keyframe, open_blob
 from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
 from iris_session.recording.rrd_file import Mark
 
-#: What decoding of bytes that mean something else may raise.
+#: What decoding of bytes that mean something else may raise; the last one is Arrow's, for types that it cannot turn.
 UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
 _T = TypeVar("_T")
 
