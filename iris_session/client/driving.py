@@ -184,8 +184,11 @@ class Driving(SceneView, Media, Assets, Joining):
         messages = self._sockets.drain_state()
         local_ns = time.monotonic_ns()
         state = self.connection.stream.drain(messages, self.connection.clock.session_ns(local_ns), local_ns)
+        local_ns = time.monotonic_ns()
+        if state is not None and not self.connection.stream.still_fresh(local_ns):
+            state = None
         if state is not None:
-            now_ns = self.session_now_ns()  # decoding is part of the age
+            now_ns = self.connection.clock.session_ns(local_ns)  # decoding is part of the age
             state = SceneState(state.header, state.poses, now_ns, now_ns - state.header.session_time)
             self._state = state
             self._arrivals.delivered(state)

@@ -98,6 +98,7 @@ class StateStream:
         self._came_ns = -1  # when a frame came last; on the client's own clock, as the next one
         self._flush_until = 0  # old frames are thrown away until then
         self._usual_age = 0
+        self._was_late = False
 
     def load_keyframe(self, state_seq: int, poses: Poses) -> None:
         """Takes the poses (n, 7) of a snapshot; poses that came in newer frames are kept."""
@@ -134,6 +135,20 @@ class StateStream:
         if len(self._presence_waiting) >= PRESENCE_WAITING:
             self._take_presence()
         return state
+
+    def still_fresh(self, local_ns: int) -> bool:
+        """Whether what was drained last is still to be handed out, at `local_ns` on the client's clock.
+
+        Not when the client stood still since then: fresh frames are right behind. Only the first time in a row, for who
+        always takes so long to decode would never be handed anything.
+        """
+        late = local_ns - self._came_ns > STALLED_NS
+        held_back = late and not self._was_late
+        self._was_late = late
+        if held_back:
+            self.counters.delivered -= 1
+            self.counters.queued_old += 1
+        return not held_back
 
     @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:

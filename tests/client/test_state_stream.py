@@ -167,6 +167,32 @@ def test_a_stall_is_noticed_whoever_stood_still(server: Server, looks: bool) -> 
     assert stream.counters.queued_old == 2
 
 
+def test_a_frame_in_hand_when_the_client_stood_still_is_not_handed_out(server: Server) -> None:
+    """It was taken from the socket, then the process was stopped for three seconds."""
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    assert drain(stream, [server.frame(MS)], MS) is not None
+    assert stream.still_fresh(2 * MS + LOCAL)
+    assert drain(stream, [server.frame(17 * MS)], 17 * MS) is not None
+    assert not stream.still_fresh(3000 * MS + LOCAL)
+    assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor what waited meanwhile
+    assert drain(stream, [server.frame(3002 * MS)], 3003 * MS) is not None
+    assert stream.still_fresh(3004 * MS + LOCAL)
+    assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
+
+
+def test_who_is_slow_with_every_frame_is_handed_them_all_but_the_first(server: Server) -> None:
+    stream = StateStream()
+    server.frame(0)
+    server.join(stream)
+    kept = []
+    for t in range(100 * MS, 1100 * MS, 100 * MS):
+        assert drain(stream, [server.frame(t - MS)], t) is not None
+        kept.append(stream.still_fresh(t + 80 * MS + LOCAL))
+    assert kept == [False] + [True] * 9
+
+
 def test_a_link_that_became_slow_shows_what_there_is(server: Server) -> None:
     """Frames a second old, four a second: nothing for a moment, then all of them."""
     stream = StateStream()
