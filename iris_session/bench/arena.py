@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from iris_session.protocol.server_messages import StateHeader
 from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.links import link_address, links_before
 from iris_session.runtime.session import Session
+from iris_session.system import children
 
 #: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
@@ -82,7 +82,9 @@ class ClientProcess:
 
     def __init__(self, job: Job, module: str = CLIENTS) -> None:
         self.job = job
-        self._process = subprocess.Popen([sys.executable, "-m", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = subprocess.Popen(
+            children.command(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=children.environment()
+        )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(msgspec.json.encode(job) + b"\n")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from iris_session.bench.contract import BenchError
 from iris_session.runtime.scheduling import quiet_collector, tick_priority
+from iris_session.system import children
 
 PERIOD_NS: Final = 2_000_000
 FRAME_NS: Final = round(1e9 / 60.0)
@@ -64,8 +65,8 @@ def bare(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
 
 
 def _receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "iris_session.bench.bare", address, str(sockets)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE)
+    command = children.command("iris_session.bench.bare", address, str(sockets))
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=children.environment())
 
 
 def _ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:

@@ -4,7 +4,6 @@ cache. Others watch the moving scene meanwhile: what they notice is measured too
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from iris_session.bench.join_clients import Joined, JoinJob
 from iris_session.bench.join_scene import Ready, join_model
 from iris_session.runtime.session import Session
 from iris_session.scene.store import AssetStore
+from iris_session.system import children
 
 #: From the beginning of the window: what the others are used to is measured first.
 BEGIN_S: Final = 4.0
@@ -107,8 +107,8 @@ def _bars(results: dict[str, Any], sent: int) -> list[Any]:
 
 
 def _made_ready(model: Path, store: Path) -> Ready:
-    command = [sys.executable, "-m", "iris_session.bench.join_scene", str(model), str(store)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
+    command = children.command("iris_session.bench.join_scene", str(model), str(store))
+    done = subprocess.run(command, stdout=subprocess.PIPE, env=children.environment(), check=False)
     if done.returncode:
         raise BenchError(f"the scene could not be made ready: status {done.returncode}")
     return msgspec.json.decode(done.stdout, type=Ready)
@@ -147,7 +147,10 @@ class _Joiner:
             return
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "iris_session.bench.join_clients"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            children.command("iris_session.bench.join_clients"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=children.environment(),
         )
         self._say(msgspec.json.encode(job))
 

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import msgspec
 
+from iris_session.system import children
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -107,7 +109,10 @@ class LiveView:
         """Starts the display, gives `update`, ends it after the last line."""
         self._out.flush()
         child = subprocess.Popen(
-            [sys.executable, "-m", "iris_session.cli.live", self._title], stdin=subprocess.PIPE, stdout=self._out
+            children.command("iris_session.cli.live", self._title),
+            stdin=subprocess.PIPE,
+            stdout=self._out,
+            env=children.environment(),
         )
         assert child.stdin is not None
         self._pipe = child.stdin.fileno()

@@ -27,6 +27,7 @@ from typing import Any, Final, Self
 
 from iris_session.emulator.impairment import Link
 from iris_session.emulator.weather import Profile, ProfileError, load_profile
+from iris_session.system import children
 
 ANSWER_S: Final = 10.0
 #: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
@@ -51,13 +52,18 @@ class ImpairmentProcess:
         self, links: Mapping[str, str], ports: Sequence[int], *, target: str = "127.0.0.1", seed: int = 0,
         udp: Sequence[int] = (),
     ) -> None:  # fmt: skip
-        command = [sys.executable, "-m", __name__, "--target", target, "--seed", str(seed), "--until-eof"]
+        command = children.command(__name__, "--target", target, "--seed", str(seed), "--until-eof")
         command += ["--ports", ",".join(map(str, ports))]
         command += ["--udp", ",".join(map(str, udp))] if udp else []
         for address, profile in links.items():
             command += ["--link", f"{address}={profile}"]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=children.environment(),
+            start_new_session=True,
         )
         self._rest = b""
         self._unanswered = 1

@@ -15,6 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from iris_session.system import children
+
 READABLE: Final = "readable"
 RECORDINGS: Final = "recordings"
 
@@ -35,10 +37,11 @@ class Prober:
 
     def _asked(self, what: str, path: str | Path) -> int:
         child = self._child or subprocess.Popen(
-            [sys.executable, "-m", "iris_session.recording.probe"],
+            children.command("iris_session.recording.probe"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            env=children.environment(),
             text=True,
         )
         self._child = child

@@ -6,7 +6,6 @@ import os
 import select
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 import uuid
@@ -19,6 +18,7 @@ import msgspec
 from iris_session.recording.errors import RecorderError
 from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
+from iris_session.system import children
 
 #: Half a second, on a machine with time to spare.
 START_S: Final = 60.0
@@ -123,10 +123,10 @@ class RecorderProcess:
             self.vertices_endpoint,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
-        environment = {**os.environ, "RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}
+        environment = children.environment(RERUN="on", RUST_LOG="error", MUJOCO_GL="disable")
         with open(self._log, "ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "iris_session.recording.process"],
+                children.command("iris_session.recording.process"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,

@@ -11,7 +11,6 @@ import dataclasses
 import math
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -29,6 +28,7 @@ from iris_session.runtime.plays import Play
 from iris_session.runtime.session import Session
 from iris_session.runtime.status import HandoverStatus, SessionStatus
 from iris_session.runtime.verification import verify_recording
+from iris_session.system import children
 
 #: How often the reports of the emulated people are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
@@ -45,12 +45,13 @@ class EmulatorProcess:
     """Emulated people in a process of their own. `poll()` reads what they report, without waiting."""
 
     def __init__(self, address: str, specs: Sequence[HeadsetSpec], seconds: float) -> None:
-        command = [sys.executable, "-m", "iris_session.emulator", "--address", address, "--specs", "-", "--json"]
+        command = children.command("iris_session.emulator", "--address", address, "--specs", "-", "--json")
         command += ["--join-timeout", str(JOIN_TIMEOUT_S)]
         self._process = subprocess.Popen(
             [*command, "--seconds", str(seconds)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            env=children.environment(),
             start_new_session=True,
         )
         assert self._process.stdin is not None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -20,6 +19,7 @@ import msgspec
 import zmq
 
 from iris_session.protocol.common import Pose
+from iris_session.system import children
 from iris_session.transport.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
 from iris_session.transport.link import FrontLink
 from iris_session.transport.media_source import MediaSource
@@ -193,7 +193,10 @@ class FrontProcess:
             with path.open("rb") as stdin:
                 path.unlink()
                 return subprocess.Popen(
-                    [sys.executable, "-m", "iris_session.transport.front"], stdin=stdin, start_new_session=True
+                    children.command("iris_session.transport.front"),
+                    stdin=stdin,
+                    env=children.environment(),
+                    start_new_session=True,
                 )
         except OSError as error:
             raise _not_started(error) from error
