@@ -1,17 +1,22 @@
 """`python -m iris_session.recording.probe`: says for each question on standard input what Rerun can read of a file.
 
 In a process of its own because Rerun's decoder may abort on damaged bytes. `Prober` is the other side. A question is
-a line of JSON, since names of files may hold anything: what is asked, and the path.
+a line of JSON, since names of files may hold anything: what is asked, and the path. To import Rerun takes longer than
+to read most files: a process that has answered well stays for the next `Prober`, for seconds.
 """
 
 from __future__ import annotations
 
+import atexit
 import json
+import os
+import select
 import subprocess
 import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from types import TracebackType
 from typing import Final, Self
 
@@ -19,13 +24,82 @@ from iris_session.system import children
 
 READABLE: Final = "readable"
 RECORDINGS: Final = "recordings"
+#: A child that nobody asks anything for so long ends.
+IDLE_S: Final = 5.0
+
+
+class _Child:
+    """The process that is asked."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            children.command("iris_session.recording.probe"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=children.environment(),
+            text=True,
+        )
+
+    def ask(self, what: str, path: str | Path) -> str:
+        """Its answer; empty when it has died, over this question or before."""
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with suppress(BrokenPipeError):
+            process.stdin.write(json.dumps([what, str(Path(path).absolute())]) + "\n")
+            process.stdin.flush()
+            return process.stdout.readline().strip()
+        return ""
+
+    def end(self) -> None:
+        process = self._process
+        process.kill()
+        process.wait()
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                with suppress(BrokenPipeError):  # a question that it did not take
+                    stream.close()
+
+
+class _Spare:
+    """At most one child that waits for the next `Prober` of this process."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._child: _Child | None = None
+
+    def take(self) -> _Child | None:
+        with self._lock:
+            child, self._child = self._child, None
+        return child
+
+    def give(self, child: _Child) -> None:
+        with self._lock:
+            before, self._child = self._child, child
+        if before is not None:
+            before.end()
+
+    def end(self) -> None:
+        child = self.take()
+        if child is not None:
+            child.end()
+
+    def forget(self) -> None:
+        """In a fork of this process: a child answers only the process that started it."""
+        self._lock, self._child = Lock(), None
+
+
+_spare: Final = _Spare()
+atexit.register(_spare.end)
+os.register_at_fork(after_in_child=_spare.forget)
 
 
 class Prober:
     """Asks a child process about files; a child that dies over one means that the file is not readable."""
 
     def __init__(self) -> None:
-        self._child: subprocess.Popen[str] | None = None
+        self._child: _Child | None = None
 
     def readable(self, path: str | Path) -> bool:
         """True when every message of the first recording in `path` decodes."""
@@ -36,24 +110,17 @@ class Prober:
         return self._asked(RECORDINGS, path)
 
     def _asked(self, what: str, path: str | Path) -> int:
-        child = self._child or subprocess.Popen(
-            children.command("iris_session.recording.probe"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=children.environment(),
-            text=True,
-        )
-        self._child = child
-        assert child.stdin is not None
-        assert child.stdout is not None
-        answer = ""
-        with suppress(BrokenPipeError):  # it has died since the last question
-            child.stdin.write(json.dumps([what, str(Path(path).absolute())]) + "\n")
-            child.stdin.flush()
-            answer = child.stdout.readline().strip()
+        if self._child is None and (spare := _spare.take()) is not None:
+            answer = spare.ask(what, path)
+            if answer:
+                self._child = spare
+                return int(answer)
+            spare.end()  # over this file or before, as nobody asked: a fresh one tells
+        self._child = self._child or _Child()
+        answer = self._child.ask(what, path)
         if not answer:
-            self._end()
+            self._child.end()
+            self._child = None
         return int(answer or 0)
 
     def __enter__(self) -> Self:
@@ -62,18 +129,11 @@ class Prober:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end()
-
-    def _end(self) -> None:
         child, self._child = self._child, None
-        if child is None:
-            return
-        child.kill()
-        child.wait()
-        for stream in (child.stdin, child.stdout):
-            if stream is not None:
-                with suppress(BrokenPipeError):  # a question that it did not take
-                    stream.close()
+        if child is not None and error is None:
+            _spare.give(child)
+        elif child is not None:  # it may still be at an answer that nobody has read
+            child.end()
 
 
 def _answer(what: str, path: str) -> int:
@@ -92,8 +152,10 @@ def _answer(what: str, path: str) -> int:
 
 
 def main() -> None:
-    """Answers with a number, a line per question, until the input ends."""
-    for line in sys.stdin:
+    """Answers with a number, a line per question, until the input ends or nobody asks any more."""
+    asked = select.poll()
+    asked.register(sys.stdin, select.POLLIN)
+    while asked.poll(IDLE_S * 1e3) and (line := sys.stdin.readline()):
         print(_answer(*json.loads(line)), flush=True)
 
 
