@@ -86,7 +86,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
-    from iris_session.scene.extent import size_text
+    from iris_session.scene.extent import coordinates, size_text
     from iris_session.scene.report import tree
 
     for line in tree(spec):
@@ -97,8 +97,9 @@ def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
         f"{len(spec.lights)} lights, {len(spec.deformables)} deformables"
     )
     if found.extent is not None:
-        low, high = (", ".join(f"{v:.3g}" for v in corner) for corner in (found.extent.low, found.extent.high))
-        print(f"extent: {size_text(found.extent)} along x, y, z, from ({low}) to ({high}), planes not counted")
+        box = found.extent
+        low, high = (", ".join(coordinates(box, corner)) for corner in (box.low, box.high))
+        print(f"extent: {size_text(box)} along x, y, z, from ({low}) to ({high}), planes not counted")
     if advice:
         print(f"size: {advice}")
     print(
@@ -122,6 +123,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     """Writes the file and says how large it is, and what is not in it."""
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
+    from iris_session.scene.references import files_read
     from iris_session.scene.report import not_in_glb
 
     out = path_of(arguments.out)
@@ -129,7 +131,10 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} does not end in .glb: GLB is the only format of `scene export`")
     if _same_file(path_of(arguments.scene), out):
         raise CommandError(f"{out} is the file that is read: name another one to write")
-    parsed, store = _parse(arguments)
+    with files_read() as files:
+        parsed, store = _parse(arguments)
+    if any(_same_file(path, out) for path in (*files, *_files_of_model(arguments.scene))):
+        raise CommandError(f"{out} is a file that {arguments.scene} is made of: name another one to write")
     try:
         size = write_glb(parsed.spec, store, out)
     except SceneBuildError as error:
@@ -147,6 +152,16 @@ def run_export(arguments: argparse.Namespace) -> int:
         print(f"in the GLB: {text}", file=sys.stderr)
     print(f"{out}: {_size(size)}")
     return 0
+
+
+def _files_of_model(scene: str) -> list[Path]:
+    """What an MJCF file refers to."""
+    path = path_of(scene)
+    if path.suffix.lower() not in (".xml", ".mjcf") or not path.is_file():
+        return []
+    import mujoco
+
+    return [Path(name) for name in mujoco.mju_getXMLDependencies(str(path))]
 
 
 def _same_file(a: Path, b: Path) -> bool:

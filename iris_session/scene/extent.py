@@ -106,8 +106,13 @@ def unit_hint(side_m: float, remedy: str) -> str:
 
 def size_text(extent: Extent) -> str:
     """Its sides for people."""
-    x, y, z = (f"{side:.3g}" for side in extent.size)
-    return f"{x} x {y} x {z} m"
+    return " x ".join(coordinates(extent, extent.size)) + " m"
+
+
+def coordinates(extent: Extent, values: Vec3) -> list[str]:
+    """Lengths of a box for people [m]: what is nothing beside its sides is rounding of its places, and 0."""
+    least = 1e-9 * max(map(abs, (*extent.low, *extent.high)))
+    return [f"{0.0 if abs(v) < least else v:.3g}" for v in values]
 
 
 def length(metres: float) -> str:

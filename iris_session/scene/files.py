@@ -22,6 +22,8 @@ MODELS: Final = ("mjb", "mjcf", "xml")
 ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
 #: Most files that an error text lists.
 _LISTED: Final = 8
+#: Errors whose texts say nothing of a file.
+_OF_CODE: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
 
 def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> Loaded:
@@ -61,8 +63,13 @@ def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
         raise
     except MemoryError:
         raise SceneBuildError(f"{path} does not fit into memory: make it smaller") from None
-    except IndexError as error:
+    except (IndexError, KeyError) as error:
         raise SceneBuildError(f"{path} names something that it does not have ({error}): export it again") from error
+    except _OF_CODE as error:  # what they say is about the code of a library, which has not found what it needs
+        raise SceneBuildError(
+            f"{path} is damaged, or no {kind.upper()}: something in it is missing or of another kind; "
+            "export or download it again"
+        ) from error
     except Exception as error:
         text = " ".join(str(error).split())[:200]  # one line
         raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {text}") from error

@@ -1,7 +1,8 @@
 """What trimesh takes without a word, or calls by names of its own: files that are cut, and vertices that are not there.
 
 Of OBJ also corners that count from the end, which mean another vertex in every line and trimesh takes from the end of
-the file. Each check is given the file's name and bytes, and returns the bytes to be read.
+the file, and those with 0 for a texture coordinate or normal that they do not have, as some exporters write. Each check
+is given the file's name and bytes, and returns the bytes to be read.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ _STL_TRIANGLE: Final = 50
 _PLY_HEAD: Final = 1 << 16
 #: A corner of a face, of an OBJ line, that is 0 or negative.
 _ODD_CORNER: Final = re.compile(rb"^[ \t]*f(?=[ \t])[^\n]*?[ \t/](?:-|0+(?:[/ \t\r\n]|$))", re.MULTILINE)
+_NO_NORMAL: Final = re.compile(rb"^[ \t]*f[ \t][^\n]*?/[^ \t\n/]*/0+(?=[ \t\r\n]|$)", re.MULTILINE)
 _OBJ_LISTS: Final = (b"v", b"vt", b"vn")
 _WHAT: Final = ("vertex", "texture coordinate", "normal")
 
@@ -63,26 +65,30 @@ CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply":
 
 def absolute_corners(name: str, data: bytes) -> bytes:
     """An OBJ whose faces name vertices, texture coordinates and normals from 1. Raises `SceneBuildError` for the first
-    that names what is not there."""
+    that names what is not there. A texture coordinate of 0 is none: where the file has some it becomes one at (0, 0),
+    as trimesh takes all or none. A normal of 0 leaves out all of them: they are made."""
     counts = [0, 0, 0]
     total = [len(re.findall(rb"^[ \t]*" + kind + rb"[ \t]", data, re.MULTILINE)) for kind in _OBJ_LISTS]
+    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    parts = 2 if _NO_NORMAL.search(text) else 3
     out = []
-    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").split(b"\n"), start=1):
+    for number, line in enumerate(text.split(b"\n"), start=1):
         words = line.partition(b"#")[0].split()
         if words and words[0] in _OBJ_LISTS:
             counts[_OBJ_LISTS.index(words[0])] += 1
         if words and words[0] == b"f":
-            corners = (_corner(f"{name}, line {number}", word, counts, total) for word in words[1:])
+            corners = (_corner(f"{name}, line {number}", word, counts, total, parts) for word in words[1:])
             out.append(b"f " + b" ".join(corners))
         else:
             out.append(line)
-    return b"\n".join(out)
+    return b"\n".join(out) + (b"\nvt 0 0\n" if total[1] else b"")
 
 
-def _corner(where: str, corner: bytes, counts: list[int], total: list[int]) -> bytes:
-    """`counts`: how many there are so far, by which what is negative counts; `total`: in the whole file."""
+def _corner(where: str, corner: bytes, counts: list[int], total: list[int], parts: int) -> bytes:
+    """`counts`: how many there are so far, by which what is negative counts; `total`: in the whole file; `parts`: how
+    many of the corner's numbers are read."""
     found = []
-    for k, text in enumerate(corner.split(b"/")[:3]):
+    for k, text in enumerate(corner.split(b"/")[:parts]):
         if not text:
             found.append(b"")
             continue
@@ -90,8 +96,11 @@ def _corner(where: str, corner: bytes, counts: list[int], total: list[int]) -> b
             place = int(text)
         except ValueError:
             raise SceneBuildError(f"{where}: {corner.decode(errors='replace')!r} is no corner of a face") from None
+        if place == 0 and k == 1:
+            found.append(b"%d" % (total[1] + 1) if total[1] else b"")
+            continue
         at = place if place > 0 else counts[k] + 1 + place
         if place == 0 or not 0 < at <= total[k]:
             raise SceneBuildError(f"{where}: a face names {_WHAT[k]} {place} of {total[k]}: export it again")
         found.append(b"%d" % at)
-    return b"/".join(found)
+    return b"/".join(found).rstrip(b"/")

@@ -10,7 +10,9 @@ this is judged.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Final
@@ -37,6 +39,18 @@ SIBLINGS: Final = (
     "visuals",
 )
 _PACKAGE: Final = "package.xml"
+_files: ContextVar[list[Path] | None] = ContextVar("files that were read", default=None)
+
+
+@contextmanager
+def files_read() -> Iterator[list[Path]]:
+    """The files that this thread reads meanwhile: those named, and all that these refer to."""
+    found: list[Path] = []
+    token = _files.set(found)
+    try:
+        yield found
+    finally:
+        _files.reset(token)
 
 
 def read_bounded(path: Path) -> bytes:
@@ -49,6 +63,8 @@ def read_bounded(path: Path) -> bytes:
             raise SceneBuildError(
                 f"{path} has {size / 2**20:.0f} MiB, at most {MAX_FILE_BYTES >> 20} MiB are read: make it smaller"
             )
+        if (noted := _files.get()) is not None:
+            noted.append(path)
         return path.read_bytes()
     except OSError as error:
         raise SceneBuildError(f"{path} cannot be read: {error.strerror or error}") from None

@@ -27,8 +27,8 @@ from iris_session.scene.references import References, read_bounded
 from iris_session.scene.urdf_joints import read_joints, root_link
 from iris_session.scene.urdf_xml import parsed
 
-#: Joints that leave their link where it is: nothing sets them.
-_STILL: Final = frozenset({"fixed", "floating", "planar"})
+#: Joints that move in more ways than one, and that nothing sets: their links are bodies of their own, and stay.
+_UNSET: Final = frozenset({"floating", "planar"})
 
 
 @dataclass(frozen=True)
@@ -136,10 +136,14 @@ class _Reader:
             items += self._drawn(links[name], part, T_part_link)
             for joint in reversed(below.get(name, [])):
                 T_part_child = T_part_link @ _matrix(self._path.name, joint)
-                if joint.type in _STILL:
-                    if joint.type != "fixed":
-                        self._skip(f"joint {joint.name} is {joint.type}: its link stays where it is")
+                if joint.type == "fixed":
                     waiting.append((joint.child, part, T_part_child))
+                    continue
+                if joint.type in _UNSET:
+                    self._skip(f"joint {joint.name} is {joint.type}: its link stays where it is")
+                    at = pose_of(T_part_child[:3, :3], T_part_child[:3, 3])
+                    parts.append(Part(f"{self._name}/{joint.child}", part, at))
+                    waiting.append((joint.child, len(parts) - 1, np.eye(4)))
                     continue
                 drive = table.drives[joint.name]
                 parts.append(

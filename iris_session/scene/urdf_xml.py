@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import xacro_advice
+from iris_session.scene.xml_files import no_xml
 
 _SHAPES: Final = frozenset({"box", "cylinder", "sphere", "mesh"})
 #: Attributes without which an element says nothing, by the element and, where that matters, what it stands in.
@@ -77,7 +78,7 @@ def _document(etree: Any, path: Path, data: bytes) -> Any:
         return etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         if any(entry.domain_name != "NAMESPACE" for entry in parser.error_log):
-            raise SceneBuildError(f"{path} is no XML: {' '.join(str(error).split())}") from None
+            raise SceneBuildError(no_xml(str(path), data, "robot", error.lineno, error.msg)) from None
     root = etree.fromstring(data, etree.XMLParser(recover=True, **safe))
     for element in list(root.iter(etree.Element)):
         if element.prefix is None and ":" in element.tag and not element.tag.startswith("{"):

@@ -24,12 +24,17 @@ _BOM: Final = b"\xef\xbb\xbf"
 _MAX_DEPTH: Final = 64
 #: Characters of a DAE that a triangle takes at least: three numbers of one digit, and what is between them.
 _TRIANGLE_CHARACTERS: Final = 6
+#: One of a 3MF, whatever the prefix of its name.
+_TRIANGLE: Final = re.compile(rb"<(?:[\w.-]+:)?triangle[\s/>]")
 
 
 def check_dae(name: str, data: bytes) -> None:
     """Raises `SceneBuildError`. What a geometry of the file costs is copied wherever it is placed."""
     check_xml(name, data)
-    links, weights = _dae_places(data)
+    try:
+        links, weights = _dae_places(data)
+    except SyntaxError as error:  # as lxml has it
+        raise SceneBuildError(no_xml(name, data, "COLLADA", error.lineno or 1, error.msg)) from None
     _check_places(name, links, weights, MAX_TRIANGLES, "triangles")
 
 
@@ -42,14 +47,20 @@ def check_3mf(name: str, data: bytes) -> None:
         if size > MAX_FILE_BYTES:
             raise SceneBuildError(f"{name} unpacks to {size >> 20} MiB, at most {MAX_FILE_BYTES >> 20} are read")
         places: dict[str, list[str]] = {}
+        triangles: dict[str, int] = {}
+        outside: list[str] = []
         for entry in archive.infolist():
             if entry.filename.lower().endswith(".model"):
                 model = archive.read(entry)
                 check_xml(name, model)
+                triangles[entry.filename] = len(_TRIANGLE.findall(model))
                 if "3d/3dmodel.model" in entry.filename.lower():  # the one that says what is where
-                    for thing, parts in _3mf_places(model):
+                    for thing, parts, files in _3mf_places(model):
                         places.setdefault(thing, []).extend(parts)
-    _check_places(name, places, dict.fromkeys(places, 1.0), MAX_NODES, "parts")
+                        outside += files
+    things = {*places, *(part for parts in places.values() for part in parts)}
+    _check_places(name, places, dict.fromkeys(sorted(things), 1.0), MAX_NODES, "parts")
+    _check_outside(name, sum(triangles.get(file, 0) for file in outside))
 
 
 def check_xml(name: str, data: bytes) -> None:
@@ -63,6 +74,15 @@ def check_xml(name: str, data: bytes) -> None:
         raise SceneBuildError(f"{name} has a DOCTYPE: remove it")
 
 
+def no_xml(name: str, data: bytes, root: str, line: int, said: str) -> str:
+    """For people: why a document whose outermost element is `root` does not parse. `said`: the parser, in `line`."""
+    if f"<{root}".encode() in data and f"</{root}".encode() not in data:
+        lines = data.count(b"\n") + 1
+        return f"{name} is cut: it ends in line {lines}, without </{root}>; export or download it again"
+    what = " ".join(said.partition(", line ")[0].split())
+    return f"{name}, line {line}: this is no XML ({what}); mend that line, or export the file again"
+
+
 class _Dae(NamedTuple):
     """`links`: by a thing, those placed in it, as often as they are; `weights`: triangles of each."""
 
@@ -70,14 +90,18 @@ class _Dae(NamedTuple):
     weights: dict[str, float]
 
 
+#: `library_nodes`: what is in it is drawn where it is referred to, and nowhere else.
+_DAE_THINGS: Final = ("node", "geometry", "controller", "library_nodes")
+
+
 def _dae_places(data: bytes) -> _Dae:
     """Nodes by numbers of their own, geometries, controllers and nodes that are referred to by their ids."""
     links: dict[str, list[str]] = {"": []}
     weights: dict[str, float] = {}
     above: list[str] = [""]
-    for event, element in _events(data):
+    for event, element in _events(data, recover=False):  # no more does pycollada
         tag = str(element.tag).rpartition("}")[2] if isinstance(element.tag, str) else ""
-        if tag in ("node", "geometry", "controller"):
+        if tag in _DAE_THINGS:
             if event == "start":
                 own = f"{len(links)}"
                 links[own] = []
@@ -98,24 +122,41 @@ def _dae_places(data: bytes) -> _Dae:
     return _Dae(links, weights)
 
 
-def _3mf_places(model: bytes) -> Iterator[tuple[str, list[str]]]:
-    """Objects, and those that they are put together of; what is built, as one without a name."""
-    for event, element in _events(model):
+def _check_outside(name: str, triangles: int) -> None:
+    """Of other files of the archive (production extension) all meshes are read, each time that one is referred to."""
+    if triangles > MAX_TRIANGLES:
+        raise SceneBuildError(
+            f"{name} refers to its other files so often that {triangles:,} triangles are read, at most "
+            f"{MAX_TRIANGLES:,}: export it as one model, without the production extension"
+        )
+
+
+def _3mf_places(model: bytes) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Objects, those that they are put together of, and the files that these are in, where that is another one; what is
+    built, as one without a name."""
+    for event, element in _events(model, recover=True):
         if event == "end" and isinstance(element.tag, str):
             tag = element.tag.rpartition("}")[2]
             if tag in ("object", "build"):
-                parts = element.iter("{*}component" if tag == "object" else "{*}item")
-                yield element.get("id", "") if tag == "object" else "", [part.get("objectid", "?") for part in parts]
+                parts = [*element.iter("{*}component" if tag == "object" else "{*}item")]
+                files = [value.strip("/") for part in parts for key, value in part.items() if key.endswith("path")]
+                thing = element.get("id", "") if tag == "object" else ""
+                yield thing, [part.get("objectid", "?") for part in parts], files
                 element.clear()
 
 
-def _events(data: bytes) -> Iterator[tuple[str, Any]]:
+def _events(data: bytes, *, recover: bool) -> Iterator[tuple[str, Any]]:
     try:
         from lxml import etree
     except ImportError:
         raise SceneBuildError("DAE and 3MF files need lxml: pip install 'iris-session[files]'") from None
     yield from etree.iterparse(
-        io.BytesIO(data), events=("start", "end"), resolve_entities=False, no_network=True, huge_tree=True, recover=True
+        io.BytesIO(data),
+        events=("start", "end"),
+        resolve_entities=False,
+        no_network=True,
+        huge_tree=True,
+        recover=recover,
     )
 
 

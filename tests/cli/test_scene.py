@@ -41,6 +41,44 @@ def test_export_of_files_and_models(tmp_path: Path, capsys: pytest.CaptureFixtur
             assert extents == pytest.approx([1, 2, 3], abs=1e-6)
 
 
+def test_export_overwrites_nothing_that_it_is_made_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither the mesh of a URDF, nor that of a model by another name of its file."""
+    part = tmp_path / "part.glb"
+    trimesh.creation.box((1, 2, 3)).export(part)
+    urdf, model = tmp_path / "arm.urdf", tmp_path / "model.xml"
+    urdf.write_text(
+        '<robot name="arm"><link name="base"><visual><geometry><mesh filename="part.glb"/></geometry></visual></link>'
+        "</robot>"
+    )
+    trimesh.creation.box().export(tmp_path / "box.obj")
+    (tmp_path / "same.glb").hardlink_to(tmp_path / "box.obj")
+    model.write_text(
+        '<mujoco><asset><mesh name="box" file="box.obj"/></asset>'
+        '<worldbody><geom type="mesh" mesh="box"/></worldbody></mujoco>'
+    )
+    for source, out in ((urdf, part), (model, tmp_path / "same.glb")):
+        before = out.read_bytes()
+        assert run("scene", "export", source, out, "--assets", tmp_path / "assets") == 2
+        assert f"{out} is a file that {source} is made of: name another one" in capsys.readouterr().err
+        assert out.read_bytes() == before
+        assert run("scene", "export", source, tmp_path / "out.glb", "--assets", tmp_path / "assets") == 0
+
+
+def test_an_extent_of_nothing_is_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Turned by a right angle, a sheet is 1e-16 thick in floats."""
+    sheet = tmp_path / "sheet.stl"
+    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 0, 1)], [(0, 1, 2)]).export(sheet)
+    urdf = tmp_path / "sheet.urdf"
+    urdf.write_text(
+        '<robot name="sheet"><link name="base"><visual><origin rpy="1.5707963267948966 0 0"/><geometry>'
+        '<mesh filename="sheet.stl"/></geometry></visual></link></robot>'
+    )
+    assert run("scene", "inspect", urdf, "--assets", tmp_path / "assets") == 0
+    shown = capsys.readouterr().out
+    assert "extent: 1 x 1 x 0 m along x, y, z, from (0, -1, 0) to (1, 0, 0)" in shown
+    assert "e-1" not in shown
+
+
 def test_inspect_says_how_large_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     box = tmp_path / "box.stl"
     mesh = trimesh.creation.box((30, 20, 10))

@@ -180,7 +180,7 @@ def test_what_is_missing_is_told(tmp_path: Path) -> None:
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "cut: its head says 9 lines, and it has 0"),
         ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "outside the range of its vertices"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
-        ("a.dae", b"<COLLADA>", "damaged"),
+        ("a.dae", b"<COLLADA>", "is cut: it ends in line 1, without </COLLADA>"),
         ("a.dae", b"<!DOCTYPE COLLADA [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><COLLADA/>", "has a DOCTYPE"),
         ("a.dae", "<COLLADA/>".encode("utf-16"), "no XML in UTF-8"),
         ("a.dae", b"<?xml version='1.0' encoding='UTF-7'?><COLLADA/>", "no XML in UTF-8"),

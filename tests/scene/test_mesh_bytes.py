@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from iris_session.scene import SceneBuildError
@@ -76,6 +77,26 @@ def test_corners_of_an_obj_count_back_from_their_own_line(tmp_path: Path) -> Non
     mesh = node.surfaces[0].mesh
     heights = sorted(sorted(face) for face in mesh.position[mesh.index][:, :, 2].tolist())
     assert heights == [[0, 0, 0], [0, 0, 5], [5, 5, 5]]
+
+
+def test_a_texture_coordinate_of_0_is_none(tmp_path: Path) -> None:
+    """As some exporters write for what they did not unwrap: the others keep theirs, and no corner is lost."""
+    (node,) = load_file(written(tmp_path, "a.obj", f"{CORNERS}vn 0 0 1\nf 1/0/1 2/0/1 3/0/1\n")).nodes
+    assert node.surfaces[0].mesh.uv is None
+    assert node.surfaces[0].mesh.triangles == 1
+    unwrapped = f"{CORNERS}vt 0.25 0\nvt 1 0\nvt 0 1\nvn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/0/1 2/2/1 3/0/1\n"
+    (node,) = load_file(written(tmp_path, "b.obj", unwrapped)).nodes
+    mesh = node.surfaces[0].mesh
+    assert mesh.uv is not None
+    assert mesh.position[mesh.index][:, :, :2].tolist() == 2 * [[[0, 0], [1, 0], [0, 1]]]
+    assert mesh.uv[mesh.index].tolist() == [[[0.25, 1], [1, 1], [0, 0]], [[0, 1], [1, 1], [0, 1]]]  # v is down
+
+
+def test_a_normal_of_0_leaves_them_out(tmp_path: Path) -> None:
+    (node,) = load_file(written(tmp_path, "a.obj", f"{CORNERS}vn 0 1 0\nf 1//1 2//0 3//1\n")).nodes
+    mesh = node.surfaces[0].mesh
+    assert mesh.position[mesh.index][0].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.normal == pytest.approx(np.array([[0, 0, 1]] * 3))
 
 
 def test_materials_that_are_missing_are_told(tmp_path: Path) -> None:

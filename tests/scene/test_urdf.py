@@ -136,8 +136,8 @@ def test_picture_is_mujocos(tmp_path: Path) -> None:
         ('radius="0.1"', 'radius="-1"', "positive lengths"),
         ('rgba="0.9 0.5', 'rgba="nan 0.5', "4 finite numbers must stand"),
         ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
-        ("</robot>", "", "no XML"),
-        ("</robot>", "\0</robot>", "no XML: .*allowed range"),
+        ("</robot>", "", "is cut: it ends in line"),
+        ("</robot>", "\0</robot>", "no XML .*allowed range"),
         ('<link name="base">', "<link>", r"arm\.urdf, line 1: <link> has no name"),
         ('<joint name="turn" type="revolute">', '<joint name="turn">', "<joint> turn has no type"),
         ('<parent link="base"/>', "", '<joint> turn has no <parent link="...">'),
@@ -165,8 +165,35 @@ def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
     urdf.write_text(changed)
     skipped = composed(urdf, tmp_path).skipped
     assert any("finger_left: shape 'capsule'" in line for line in skipped)
-    assert any("joint twist is floating" in line for line in skipped)
+    assert any("joint twist is floating" in line for line in skipped)  # its link: see the next test
     assert any("material 'lost'" in line for line in skipped)
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_what_is_free_is_a_body_of_its_own(tmp_path: Path, kind: str) -> None:
+    urdf = write_arm(tmp_path)
+    before = composed(urdf, tmp_path)
+    urdf.write_text(urdf.read_text().replace('type="continuous"', f'type="{kind}"'))
+    after = composed(urdf, tmp_path)
+    assert after.moving == before.moving
+    assert after.poses == before.poses
+    assert [(v.body, v.name) for v in after.spec.visuals] == [(v.body, v.name) for v in before.spec.visuals]
+    assert len(after.articulations["arm"].joints) == len(before.articulations["arm"].joints) - 1
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ("</robot>", "", r"arm\.urdf is cut: it ends in line \d+, without </robot>; export or download it again"),
+        ("</link>", "</lynk>", r"arm\.urdf, line \d+: this is no XML \(Opening and ending tag mismatch: link line \d+"),
+    ],
+)
+def test_what_does_not_parse_is_told_with_one_line_number(tmp_path: Path, before: str, after: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace(before, after, 1))
+    with pytest.raises(SceneBuildError, match=text) as raised:
+        SceneBuilder().add_urdf(urdf)
+    assert "<string>" not in str(raised.value)
 
 
 def test_prefixes_that_nobody_declared_are_left_out(tmp_path: Path) -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from iris_session.scene import SceneBuildError
+from iris_session.scene import SceneBuildError, xml_files
 from iris_session.scene.files import load_file
 
 NAMESPACE = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
+PRODUCTION = 'xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06"'
 MESH = (
     '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
     '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
@@ -42,10 +43,13 @@ def doubling(levels: int) -> str:
     return f'<node id="n{levels}"><instance_geometry url="#g"/></node>{"".join(nodes)}'
 
 
-def archive(path: Path, objects: str, build: str) -> Path:
+def archive(path: Path, objects: str, build: str, part: str = "") -> Path:
+    """`part`: objects of another file in it, `3D/part.model`."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        model = f'<?xml version="1.0"?><model unit="meter" {NAMESPACE}><resources>{objects}</resources>'
-        file.writestr("3D/3dmodel.model", f"{model}<build>{build}</build></model>")
+        head = f'<?xml version="1.0"?><model unit="meter" {NAMESPACE} {PRODUCTION}><resources>'
+        file.writestr("3D/3dmodel.model", f"{head}{objects}</resources><build>{build}</build></model>")
+        if part:
+            file.writestr("3D/part.model", f"{head}{part}</resources><build/></model>")
     return path
 
 
@@ -70,7 +74,7 @@ def test_what_is_placed_a_few_times_is_read(tmp_path: Path) -> None:
 
 def test_what_doubles_and_doubles_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.dae").write_text(dae(doubling(40), '<node id="top"><instance_node url="#n0"/></node>'))
-    with pytest.raises(SceneBuildError, match="so often within one another that it draws"):
+    with pytest.raises(SceneBuildError, match=r"so often within one another that it draws"):
         load_file(tmp_path / "a.dae")
     objects = f'<object id="0">{MESH}</object>' + "".join(
         f'<object id="{k}">{components(k - 1, k - 1)}</object>' for k in range(1, 40)
@@ -119,3 +123,57 @@ def test_entities_are_refused_in_an_archive_too(tmp_path: Path) -> None:
             file.writestr("3D/3dmodel.model", model)
         with pytest.raises(SceneBuildError, match=text):
             load_file(path)
+
+
+@pytest.mark.parametrize(("times", "least", "text"), [(400, 1, "refers to its other files so often that"), (20, 0, "")])
+def test_a_3mf_of_several_files_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: int, least: int, text: str
+) -> None:
+    """All meshes of a file are read whenever it is referred to: a million times would be small in the archive."""
+    monkeypatch.setattr(xml_files, "MAX_TRIANGLES", 3_000)
+    part = "".join(f'<object id="{k}">{MESH}</object>' for k in range(10, 20))
+    refers = '<component p:path="/3D/part.model" objectid="10"/>' * times
+    path = archive(
+        tmp_path / "a.3mf", f'<object id="1"><components>{refers}</components></object>', '<item objectid="1"/>', part
+    )
+    if least:
+        with pytest.raises(SceneBuildError, match=f"{text} 4,000 triangles are read"):
+            load_file(path)
+    else:
+        assert load_file(path).nodes
+
+
+def test_parts_in_other_files_of_a_3mf_are_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(xml_files, "MAX_NODES", 30)
+    refers = '<component p:path="/3D/part.model" objectid="10"/>' * 40
+    objects = f'<object id="1"><components>{refers}</components></object>'
+    path = archive(tmp_path / "a.3mf", objects, '<item objectid="1"/>', f'<object id="10">{MESH}</object>')
+    with pytest.raises(SceneBuildError, match=r"so often within one another that it draws 4\d parts"):
+        load_file(path)
+
+
+def test_nodes_of_a_library_count_where_they_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = '<node id="n"><instance_geometry url="#g"/></node>'
+    (tmp_path / "a.dae").write_text(dae(node, '<node id="top"><instance_node url="#n"/></node>'))
+    monkeypatch.setattr(xml_files, "MAX_TRIANGLES", 3)  # one triangle, of a character more than it takes at least
+    assert len(load_file(tmp_path / "a.dae").nodes) == 1
+    (tmp_path / "b.dae").write_text(dae(node, '<node id="top"><instance_node url="#n"/></node>' * 2))
+    with pytest.raises(SceneBuildError, match="draws 4 triangles"):
+        load_file(tmp_path / "b.dae")
+
+
+def test_a_broken_dae_is_refused_in_words(tmp_path: Path) -> None:
+    """Never in those of a library: no name of a class, no attribute that `None` does not have."""
+    text = dae("", '<node><instance_geometry url="#g"/></node>')
+    path = tmp_path / "a.dae"
+    for before, after, said in (
+        (text[200:], "", "a.dae is cut: it ends in line 1, without </COLLADA>"),
+        ("</mesh>", "</mess>", r"a.dae, line 1: this is no XML \(Opening and ending tag mismatch"),
+        ('source="#p"', 'source="#q"', "is damaged, or no DAE: something in it is missing or of another kind"),
+        ('<scene><instance_visual_scene url="#s"/></scene>', "", "something in it is missing"),
+    ):
+        assert before in text
+        path.write_text(text.replace(before, after, 1))
+        with pytest.raises(SceneBuildError, match=said) as raised:
+            load_file(path)
+        assert not any(word in str(raised.value) for word in ("Error", "NoneType", "attribute '", "<string>", "\n"))
