@@ -64,7 +64,8 @@ class LateView:
         self._rng, self._noise, self._stalls = rng, noise, stalls
         self._frames: deque[tuple[float, dict[str, PoseTuple]]] = deque(maxlen=16)
         self._stalled_until_s = 0.0
-        self._shown: dict[str, PoseTuple] = {}
+        self._frame: dict[str, PoseTuple] = {}
+        self._shown: dict[str, PoseTuple] = {}  # of the frame, with noise: only what this person looked at
 
     def publish(self, now_s: float, poses: dict[str, PoseTuple]) -> None:
         self._frames.append((now_s + self._rng.uniform(0.030, 0.060), poses))
@@ -79,16 +80,22 @@ class LateView:
         self.session_time_ns = round(now_s * 1e9)
         arrived = [poses for arrives_s, poses in self._frames if arrives_s <= now_s]
         if arrived:
-            self._shown = {name: shaken(pose, self._rng, self._noise) for name, pose in arrived[-1].items()}
+            self._frame, self._shown = arrived[-1], {}
 
-    def body_pose(self, name: str) -> PoseTuple | None:
+    def _seen(self, name: str) -> PoseTuple | None:
+        """As often as it is looked at in a picture, it is at the same place."""
+        if name not in self._shown and name in self._frame:
+            self._shown[name] = shaken(self._frame[name], self._rng, self._noise)
         return self._shown.get(name)
 
+    def body_pose(self, name: str) -> PoseTuple | None:
+        return self._seen(name)
+
     def tip_pose(self, robot: str) -> PoseTuple | None:
-        return self._shown.get(f"tip:{robot}")
+        return self._seen(f"tip:{robot}")
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
-        seen = self._shown.get(f"vertex:{deformable}:{index}")
+        seen = self._seen(f"vertex:{deformable}:{index}")
         return None if seen is None else seen[0]
 
     def lease_version(self, robot: str) -> int | None:
