@@ -6,14 +6,14 @@ for the real one. A child looks only where Python is installed, in the user's PY
 
 from __future__ import annotations
 
-import json
 import os
-import site
 import sys
 from functools import cache
-from importlib import metadata
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
 
 #: The folder that `iris_session` and `anchors` lie in.
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -42,13 +42,18 @@ def environment(**others: str) -> dict[str, str]:
 @cache
 def _is_installed() -> bool:
     """Whether every process of this interpreter finds this very package."""
+    import site
+    from importlib import metadata  # only who starts a process needs it: it takes as long as all else here
+
     folders = [*site.getsitepackages(), site.getusersitepackages()]
     if any(Path(folder).resolve() == ROOT for folder in folders):
         return True
     return any(_links_here(found) for found in metadata.distributions(name=_DISTRIBUTION))
 
 
-def _links_here(found: metadata.Distribution) -> bool:
+def _links_here(found: Distribution) -> bool:
     """Whether this is an editable installation of the checkout that runs (PEP 610)."""
+    import json
+
     origin = json.loads(found.read_text("direct_url.json") or "{}")
     return bool(origin.get("dir_info", {}).get("editable")) and origin.get("url") == ROOT.as_uri()
