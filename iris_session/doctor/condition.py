@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from iris_session.doctor import headsets
+from iris_session.doctor.dropped import told
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role
@@ -102,7 +103,11 @@ def session(report: StatusReport) -> Finding:
         return failed("session", "somebody stopped everything (e-stop)", "", "look, then let a director clear it")
     if report.paused:
         return warning("session", "physics is paused", "", "a director resumes it")
-    return ok("session", f"steps: tick {report.tick}, {1e9 / max(1, report.tick_period_ns):.0f} Hz")
+    if report.lateness is not None:
+        return ok("session", f"steps: tick {report.tick}, {1e9 / max(1, report.tick_period_ns):.0f} Hz")
+    if not report.tick:
+        return ok("session", "steps, and nothing has moved so far: no tick was taken, no pose published")
+    return ok("session", f"steps: tick {report.tick}, at the pace of the program that owns it")
 
 
 def alignment(people: tuple[ParticipantReport, ...], sheets: str = "") -> Finding:
@@ -292,8 +297,7 @@ def disk(report: StatusReport) -> Finding:
 def drops(report: StatusReport) -> Finding:
     """What was thrown away, and front or recorder that had to be started again."""
     restarts = ", ".join(f"{name} {n} times" for name, n in sorted(report.restarts.items()) if n)
-    most = sorted(((n, reason) for reason, n in report.drops.items() if n), reverse=True)[:6]
-    text = ", ".join(f"{reason} {n}" for n, reason in most)
+    text = told(report.drops)
     if restarts:
         return warning(
             "drops", f"started again: {restarts}; dropped: {text or 'nothing'}", "", "see the session's terminal"

@@ -128,6 +128,11 @@ def _way(target: Address, findings: Findings, heard: list[FoundSession]) -> bool
 def _door(result: Examination, target: Address, typed: str, code: str, role: str, told: Callable[[str], None]) -> None:
     findings = result.findings
     introduced, version, said = reach.introduction(target)
+    base = reach.base_of_ports(target) if said is None else None
+    if base is not None:
+        findings.add(base)
+        findings.skip("version", *DOOR, *ARRIVAL, *CONDITION)
+        return
     findings.add(introduced, version)
     if version.failed:
         findings.skip(*DOOR, *ARRIVAL, *CONDITION)

@@ -21,6 +21,8 @@ from iris_session.protocol.names import PROTOCOL_VERSION
 #: The system takes 3 s to find that a network has no machine of an address; a firewall is silent for longer.
 CONNECT_S: Final = 4.0
 LISTEN_S: Final = 1.2
+#: For what a port that takes connections says at once, if it is the base of a block.
+BASE_S: Final = 1.0
 _UNREACHABLE: Final = frozenset({errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN})
 
 
@@ -169,14 +171,7 @@ def introduction(address: Address) -> tuple[Finding, Finding, Introduction | Non
     """What the session says of itself, and whether it speaks our version: checks `introduction` and `version`."""
     unknown = Finding("version", "skipped", "not known: there was no introduction")
     try:
-        steps = ask_introduction(address.host, address.port, CONNECT_S)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as done:
-                said: Introduction = done.value
-                break
-            time.sleep(0.005)
+        said = _asked(address, CONNECT_S)
     except VersionError as error:
         return ok("introduction", f"a session of protocol version {error.version}"), version(error.version), None
     except ProtocolError as error:
@@ -190,6 +185,36 @@ def introduction(address: Address) -> tuple[Finding, Finding, Introduction | Non
     here = f"{said.participants} participants" + (", a join code is open" if said.pairing else "")
     text = f"session {one.session_name!r} ({one.kind}), {here}"
     return ok("introduction", text), version(one.protocol), said
+
+
+def base_of_ports(address: Address) -> Finding | None:
+    """That `address` is the first of a session's block of ports, where it introduces itself, not the one to join."""
+    joined = Address(address.host, address.port + 1)
+    said = _introduced(joined, BASE_S)
+    if said is None or said.beacon.control != joined.port:
+        return None
+    name = f"session {said.beacon.session_name!r}"
+    text = f"port {address.port} is the base of the ports of {name}, which is joined at {joined}"
+    return failed("introduction", text, "`serve --port-base N` is joined at port N + 1", f"use {joined}")
+
+
+def _introduced(address: Address, patience_s: float) -> Introduction | None:
+    try:
+        return _asked(address, patience_s)
+    except (OSError, ProtocolError):
+        return None
+
+
+def _asked(address: Address, patience_s: float) -> Introduction:
+    """Raises what `ask_introduction` raises."""
+    steps = ask_introduction(address.host, address.port, patience_s)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            said: Introduction = done.value
+            return said
+        time.sleep(0.005)
 
 
 def version(theirs: int) -> Finding:

@@ -80,8 +80,8 @@ class AssetDesk:
     def _give_way(self, now_ns: int) -> None:
         """When state was late since the last turn, or this turn is."""
         late = 0 < self._turned_ns < now_ns - LATE_TURN_NS
-        if self._publisher.frames != self._frames and self._publisher.delays_ns:
-            late |= self._publisher.delays_ns[-1] > LATE_NS
+        if self._publisher.frames != self._frames:
+            late |= self._publisher.newest_delay_ns > LATE_NS
         self._frames, self._turned_ns = self._publisher.frames, now_ns
         if late:
             self._server.late_until_ns = now_ns + YIELD_NS

@@ -345,7 +345,7 @@ class Front:
 
     def _telling(self) -> Telling:
         return Telling(
-            self._publisher.delays_ns,
+            self._publisher.delays_ns(),
             self._downlink.heard_ns,
             self._downlink.report,
             self._uplink.stalled,

@@ -14,6 +14,8 @@ from iris_session.streams.rigid import RigidEncoder
 from iris_session.transport.config import SceneInfo
 
 POSE_BYTES = 56  # seven float64
+#: How far back delays are told: what was late longer ago says nothing about now.
+RECENT_NS = 5_000_000_000
 _encoder = msgspec.msgpack.Encoder()
 _decode_header = msgspec.msgpack.Decoder(StateHeader).decode
 
@@ -36,11 +38,21 @@ class StatePublisher:
         self._now_ns = now_ns
         self._next_seq = first_seq
         self.frames = 0
-        #: End of the tick until it was handed to the socket, of the newest frames (about five seconds), without those
-        #: that are sent again while their source is silent.
-        self.delays_ns: deque[int] = deque(maxlen=300)
+        #: When each of the newest frames was handed to the socket, and how long after the end of its tick; without
+        #: those that are sent again while their source is silent.
+        self._delays: deque[tuple[int, int]] = deque(maxlen=300)
         self._shown_ns = -1
         self.set_scene(scene)
+
+    @property
+    def newest_delay_ns(self) -> int:
+        """End of the tick of the newest frame until it was handed to the socket, 0 before the first."""
+        return self._delays[-1][1] if self._delays else 0
+
+    def delays_ns(self) -> list[int]:
+        """The same of all frames of the last seconds, oldest first."""
+        since_ns = self._now_ns() - RECENT_NS
+        return [delay for at_ns, delay in self._delays if at_ns > since_ns]
 
     def use_socket(self, state: zmq.Socket[bytes] | None) -> None:
         """Sends on another socket from now on, and closes the one before. `None`: nothing is sent for a while."""
@@ -74,7 +86,7 @@ class StatePublisher:
         self._next_seq = frame.state_seq + 1
         published_ns = self._now_ns()
         if head.session_time != self._shown_ns:
-            self.delays_ns.append(published_ns - head.session_time)
+            self._delays.append((published_ns, published_ns - head.session_time))
         self._shown_ns = head.session_time
         stamped = StateHeader(
             head.scene_epoch,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -34,6 +34,9 @@ DELAYS: Final = 512
 ROLL_NS: Final = 1_000_000_000
 #: A report of a client that is older says nothing about now.
 STALE_REPORT_NS: Final = 3_000_000_000
+#: Of fewer frames of state than this in some seconds no 99th percentile is told: it would be the latest one, and of a
+#: scene that stands still, whose state is sent again four times a second, one that was late would be blamed for long.
+ENOUGH: Final = 25
 #: A report is made at most this often, however many ask.
 REUSE_NS: Final = 200_000_000
 
@@ -60,11 +63,11 @@ class _Line:
 class Telling(NamedTuple):
     """What the rest of the front tells the desk: numbers that live elsewhere, asked for when somebody asks us.
 
-    `publish_delays_ns`: end of tick to the state socket, of the newest frames. `heard_ns`: session time of the
-    authority's last word, 0 before it. `authority`: its newest half of the report, encoded; empty before it.
+    `publish_delays_ns`: end of tick to the state socket, of the frames of the last seconds. `heard_ns`: session time of
+    the authority's last word, 0 before it. `authority`: its newest half of the report, encoded; empty before it.
     """
 
-    publish_delays_ns: Iterable[int] = ()
+    publish_delays_ns: Sequence[int] = ()
     heard_ns: int = 0
     authority: bytes = b""
     stalled: bool = False
@@ -165,7 +168,7 @@ class StatusDesk:
         telling = self._tell()
         config = self._config
         half = _decode_report(telling.authority) if telling.authority else StatusReport(0, "", "", 0)
-        drops = dict(half.drops)
+        drops, delays = dict(half.drops), telling.publish_delays_ns
         for reason, count in self._drops.by_reason.items():
             drops[reason] = drops.get(reason, 0) + count
         by_participant = {c.participant_id: c for c in self._clients.by_number.values() if c.participant_id}
@@ -174,7 +177,7 @@ class StatusDesk:
             session_id=config.session_id,
             session_name=config.session_name,
             stalled=telling.stalled,
-            step_to_publish=quantiles(telling.publish_delays_ns),
+            step_to_publish=quantiles(delays) if len(delays) >= ENOUGH else None,
             participants=tuple(self._row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
             warnings=(*half.warnings, *telling.warnings),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from iris_session.doctor import condition
 from iris_session.doctor.condition import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
+from iris_session.doctor.dropped import _MEANINGS
 from iris_session.doctor.findings import Finding
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
@@ -252,6 +256,35 @@ def test_without_recording() -> None:
 def test_restarts_and_warnings() -> None:
     only(change(WELL, restarts={"front": 2, "recorder": 0}), "drops", "warning", "front 2 times")
     only(change(WELL, warnings=("physics stands still until a reset",)), "warnings", "warning", "physics stands still")
+
+
+def test_what_drops_mean_is_told() -> None:
+    (found,) = (
+        one for one in conditions(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9") if one.check == "drops"
+    )
+    assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
+
+
+def test_every_reason_that_the_front_counts_is_explained() -> None:
+    rooms = Path(condition.__file__).parents[1]
+    counted: set[str] = set()
+    for path in (*(rooms / "transport").glob("*.py"), rooms / "runtime" / "processes.py"):
+        counted |= set(re.findall(r"""drops(?:\.count\(|\[)\s*"([a-z_]+)\"""", path.read_text()))
+    assert {"send_queue_full", "journal_rows", "unknown_key"} <= counted
+    assert not counted - set(_MEANINGS)
+
+
+@pytest.mark.parametrize(
+    ("tick", "text"),
+    [
+        (0, "steps, and nothing has moved so far: no tick was taken, no pose published"),
+        (7, "steps: tick 7, at the pace of the program that owns it"),
+    ],
+)
+def test_a_pace_that_is_not_ours_is_not_told(tick: int, text: str) -> None:
+    """The carrier of a scene without physics has a tick of a millisecond: nobody steps at 1000 Hz."""
+    report = change(WELL, lateness=None, tick=tick, tick_period_ns=1_000_000)
+    assert conditions(report, "p9")[0] == Finding("session", "ok", text)
 
 
 def test_drivers_are_who_may_hold_robots_but_directors() -> None:

@@ -13,6 +13,7 @@ import pytest
 from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
 from iris_session.doctor import reach
+from iris_session.doctor.examination import examine
 from iris_session.doctor.findings import failed, ok
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
@@ -38,6 +39,28 @@ def says(data: bytes) -> Iterator[Address]:
         thread.join(5.0)
 
 
+@contextlib.contextmanager
+def says_of_itself(times: int = 1) -> Iterator[Address]:
+    """A session that introduces itself below its control port, whose address this is."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(4)
+        port = listener.getsockname()[1] + 1
+        beacon = Beacon(PROTOCOL_VERSION, "s1", "lab", "live", "127.0.0.1", port, 7722, 0, 0, 0)
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                for _ in range(times):
+                    visitor, _ = listener.accept()
+                    with visitor:
+                        visitor.sendall(encode_introduction(Introduction(beacon)))
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield Address("127.0.0.1", port)
+        thread.join(5.0)
+
+
 def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
     beacon = Beacon(protocol, "s1", "lab", "live", "127.0.0.1", 7721, 7722, 0, 0, 0)
     return encode_introduction(Introduction(beacon, pairing=True, participants=3))
@@ -59,6 +82,33 @@ def test_another_version(theirs: int, older: str) -> None:
     assert f"version {theirs}" in version.text
     assert version.advice.startswith(f"update {older}")
     assert said is None
+
+
+def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
+    """`serve --port-base N` is joined at N + 1; at N it introduces itself."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nothing = Address("127.0.0.1", free.getsockname()[1])
+    assert reach.base_of_ports(nothing) is None
+    with says(b"SSH-2.0-OpenSSH_9.2\r\n" + bytes(64)) as above:
+        assert reach.base_of_ports(Address("127.0.0.1", above.port - 1)) is None
+    with says_of_itself() as above:
+        base = Address("127.0.0.1", above.port - 1)
+        found = reach.base_of_ports(base)
+    assert found is not None
+    assert found.failed
+    assert f"port {base.port} is the base of the ports of session 'lab', which is joined at {above}" in found.text
+    assert found.advice == f"use {above}"
+
+
+def test_the_examination_ends_at_the_base_of_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reach, "LISTEN_S", 0.01)
+    with says_of_itself(times=2) as above:
+        result = examine(f"127.0.0.1:{above.port - 1}")
+    found = {one.check: one for one in result.findings}
+    assert found["introduction"].advice == f"use {above}"
+    assert found["join"].state == "skipped"
+    assert not result.ok
 
 
 def test_something_else_introduces_itself() -> None:

@@ -172,8 +172,8 @@ def test_a_publisher_that_is_silent_is_as_old_as_its_silence_and_says_so(session
         assert ann.state.header.state_seq > shown.state_seq, "it is sent again, for those who join"
         ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
         report = ann.status(30.0)
-        assert report.step_to_publish is not None
-        assert report.step_to_publish.p99 < 1000.0, "the front is not to blame"
+        way = report.step_to_publish
+        assert way is None or way.p99 < 1000.0, "the front is not to blame"
         row = next(row for row in report.participants if row.name == "ann")
         assert row.state_age is None or row.state_age.p99 < 1000.0, "nor her link"
         session.publish(19.0)

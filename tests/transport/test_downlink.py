@@ -16,7 +16,7 @@ from iris_session.transport.clients import ClientTable
 from iris_session.transport.config import FrontConfig, SceneInfo
 from iris_session.transport.downlink import Downlink
 from iris_session.transport.limiter import Drops
-from iris_session.transport.state_publisher import StatePublisher
+from iris_session.transport.state_publisher import RECENT_NS, StatePublisher
 
 
 class Far:
@@ -131,10 +131,21 @@ def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) ->
     assert [h.tick for h in far.headers()] == [1]
 
 
+def test_delays_are_those_of_the_last_seconds(far: Far) -> None:
+    now = [10]
+    publisher = StatePublisher(far, scene(1), lambda: now[0])  # type: ignore[arg-type]
+    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([], 0)
+    for at_ns, session_time in ((10, 1), (RECENT_NS, RECENT_NS - 20), (RECENT_NS + 20, RECENT_NS + 13)):
+        now[0] = at_ns
+        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
+        assert publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
+    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
+
+
 def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: Far) -> None:
     """Its source is silent, and it is as old as that."""
     for session_time in (7, 7, 7, 9):
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
         assert far.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert list(far.publisher.delays_ns) == [70, 68]
+    assert far.publisher.delays_ns() == [70, 68]
     assert [header.session_time for header in far.headers()] == [7, 7, 7, 9]

@@ -22,7 +22,7 @@ from iris_session.protocol.status import (
     StatusReport,
     quantiles,
 )
-from iris_session.transport.status_desk import REUSE_NS
+from iris_session.transport.status_desk import ENOUGH, REUSE_NS
 from tests.transport.harness import N_BODIES, FrontSession, RawClient
 
 MS = 1_000_000
@@ -33,6 +33,9 @@ def half(*people: ParticipantReport, **fields: object) -> StatusReport:
     return StatusReport(0, "", "", 1, participants=people, **fields)  # type: ignore[arg-type]
 
 
+STILL = np.tile([0.0, 0, 0, 1, 0, 0, 0], (N_BODIES, 1))
+
+
 def row(participant: str, **fields: object) -> ParticipantReport:
     return ParticipantReport(participant, "Ann", "operator", True, **fields)  # type: ignore[arg-type]
 
@@ -41,12 +44,17 @@ def anything(_: StatusReport) -> bool:
     return True
 
 
-def ask(session: FrontSession, client: RawClient, until: Callable[[StatusReport], bool] = anything) -> StatusReport:
-    """Asks, a few times a second, until the answer is as wanted: what was sent to the front takes its way."""
+def ask(
+    session: FrontSession, client: RawClient, until: Callable[[StatusReport], bool] = anything, *, moving: bool = False
+) -> StatusReport:
+    """Asks, a few times a second, until the answer is as wanted: what was sent to the front takes its way. `moving`: a
+    state with every step meanwhile."""
     steps = 0
 
     def wanted() -> bool:
         nonlocal steps
+        if moving:
+            session.send_state(STILL)
         if steps % 300 == 0:
             client.send(GetStatus(1 + steps))
         steps += 1
@@ -69,14 +77,12 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     session.process.link.send_report(
         half(row(welcome.participant_id, holds=("left",)), late_share=0.25, drops={"journal_rows": 3})
     )
-    for _ in range(20):
-        session.send_state(np.tile([0.0, 0, 0, 1, 0, 0, 0], (N_BODIES, 1)))
-        session.once()
     client.send(ClientReport(1.5, 7.0, 30, 10, 2.5, 1000.0))
     report = ask(
         session,
         client,
         lambda r: bool(r.participants) and r.participants[0].reported and r.step_to_publish is not None,
+        moving=True,
     )
     assert (report.session_name, report.late_share, report.connections) == ("test", 0.25, 1)
     assert report.drops["journal_rows"] == 3
@@ -89,6 +95,16 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
     assert ann.heard_ns >= 0
     assert ann.lost == ""
+
+
+def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
+    """A scene that stands still is sent four times a second: one that was late is not the usual way."""
+    client = session.client()
+    client.join()
+    for _ in range(ENOUGH // 2):
+        session.send_state(STILL)
+        session.once()
+    assert ask(session, client).step_to_publish is None
 
 
 def test_an_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
