@@ -201,6 +201,7 @@ def test_a_client_that_takes_nothing_is_cut_off_as_slow(open_session: OpenSessio
 
     def lost() -> bool:
         session.once(Decision((), events=tuple(session.notice(text) for _ in range(4))))
+        honest.wait_for(Event, session.event_seq)  # on a busy machine its thread could be slow, too
         return any(isinstance(e.message, Lost) for e in session.entries)
 
     session.pump(lost, "loss of the slow client")
