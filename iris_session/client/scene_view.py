@@ -80,7 +80,11 @@ class SceneView:
         return self.connection.clock.error_bound_ns(time.monotonic_ns())
 
     def body_pose(self, body: str) -> PoseTuple | None:
-        """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet."""
+        """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet.
+
+        Bodies whose poses come are those in `mirror.bodies`: all of a MuJoCo scene, of a publisher's only those that
+        can move. Where something else stands is in the specification: `fetch_scene(client).spec.bodies`.
+        """
         state, index = self._state, self.connection.mirror.body_index.get(body)
         if state is None or index is None or index >= len(state.poses):
             return None

@@ -5,6 +5,7 @@ Nothing is encoded before `build`; files are read when they are added, so that t
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any, Final, Unpack
@@ -22,7 +23,16 @@ from iris_session.scene.collected import Flexible, Thing, World
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import load_file
-from iris_session.scene.given import Looks, given_mesh, given_vertices, look_of, numbers, path_of, triangles_of
+from iris_session.scene.given import (
+    Looks,
+    check_options,
+    given_mesh,
+    given_vertices,
+    look_of,
+    numbers,
+    path_of,
+    triangles_of,
+)
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
 from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
@@ -32,6 +42,8 @@ from iris_session.scene.urdf import read_urdf
 _FROM_Y_UP: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: As long as names of bodies in the state stream may be.
 _MAX_NAME: Final = 64
+#: Taken by the root of every scene, also in recordings.
+_WORLD: Final = "world"
 
 
 class Options(Looks, total=False):
@@ -191,6 +203,7 @@ class SceneBuilder:
         """A mesh whose vertices are published: a cloth or a surface of `triangles` (m, 3), or ropes of `edges` (m, 2)
         and `radius` [m]. `vertices` (n, 3) [m]: the first ones, world frame. `uvs` (n, 2). `flat`: a normal per face.
         """
+        check_options(looks, Looks.__annotations__)
         self._new_name(name)
         if len(self._world.flexibles) >= MAX_STREAMS:
             raise SceneBuildError(
@@ -282,6 +295,9 @@ class SceneBuilder:
 
     def _place(self, name: str, options: Options, *, named: bool = False) -> tuple[int, Matrix]:
         """The body that something is added to, made for it where it is movable or `named`, and T_body_thing."""
+        check_options(options, Options.__annotations__)
+        if not isinstance(name, str):
+            raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")
         T = checked_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))
         on, movable = options.get("on", ""), options.get("movable", False)
         if on and movable:
@@ -290,6 +306,8 @@ class SceneBuilder:
             return self._body_named(on), matrix_of(T)
         if movable:
             self._new_name(name)
+            if name == _WORLD:
+                raise SceneBuildError(f"name is {name!r}: that is the frame that all is in, give name= another one")
             self._world.names.add(name)
         if movable or named:
             self._world.things.append(Thing(cut(name), -1, T, movable))
@@ -312,7 +330,8 @@ class SceneBuilder:
     def _new_name(self, name: str) -> None:
         if not isinstance(name, str) or not name or len(name) > _MAX_NAME or cut(name) != name:
             raise SceneBuildError(
-                f"{name!r}: what moves needs a name of 1 to {_MAX_NAME} characters, by which it is addressed"
+                f"name is {reprlib.repr(name)}: what moves needs one of 1 to {_MAX_NAME} characters, by which it is "
+                "addressed"
             )
         if name in self._world.names:
             raise SceneBuildError(f"there is a {name!r} already: what moves needs a name of its own")

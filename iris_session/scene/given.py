@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -38,6 +39,16 @@ class Looks(TypedDict, total=False):
     shininess: float
     repeat: Sequence[float]
     uniform: bool
+
+
+def check_options(options: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Raises `SceneBuildError` for one that nobody knows: what it was to do would be left undone."""
+    names = sorted(known)
+    for option in options:
+        if option not in names:
+            near = difflib.get_close_matches(option, names, n=1)
+            right = f"{near[0]} is meant" if near else f"there are {', '.join(names)}"
+            raise SceneBuildError(f"there is no option {option}: {right}")
 
 
 def look_of(options: Mapping[str, Any]) -> Look | None:
