@@ -148,9 +148,14 @@ class FrontSession:
         """Steps until the condition holds."""
         deadline = time.monotonic() + timeout_s
         while not until():
-            assert time.monotonic() < deadline, f"no {what} within {timeout_s} s"
+            assert time.monotonic() < deadline, f"no {what} within {timeout_s} s; {self._seen()}"
             self.once()
             time.sleep(0.001)
+
+    def _seen(self) -> str:
+        """What the front counted, and the newest that the authority and every client were told."""
+        told = [[message for message, _ in client.inbox[-5:]] for client in self.clients]
+        return f"{self.process.link.status}, authority {self.entries[-5:]}, clients {told}"
 
     def wait_entries(self, kind: type, n: int = 1, connection: int | None = None) -> list[Entry]:
         """All entries of a kind, at least `n`."""
