@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording import paths
-from iris_session.recording.joining import entity_of
+from iris_session.recording.joining import ROW_ID, entity_of
 from iris_session.recording.journal import JournalRow, Keyframe, open_blob
 from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
 from iris_session.recording.rrd_file import Mark
 
 #: What decoding of bytes that mean something else may raise; the last one is Arrow's, for types that it cannot turn.
 UNREADABLE: Final = (msgspec.DecodeError, LookupError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+#: Bytes of a row id that are the time of the write.
+_WRITE: Final = 8
 _T = TypeVar("_T")
 
 _decode_presence = msgspec.msgpack.Decoder(tuple[PresenceItem, ...]).decode
@@ -117,12 +119,22 @@ def scalars(batch: Any) -> Iterator[Scalar]:
     return (Scalar(entity_of(batch), *row) for row in zip(*columns, strict=True))
 
 
-def numbered_denials(batch: Any) -> Iterator[tuple[int, DenialRecord]]:
-    """Denials, and how many of the same step come before each: two may be alike."""
-    step, n = -1, 0
-    for record in denials(batch):
-        step, n = record.step, n + 1 if record.step == step else 0
-        yield n, record
+def numbered_denials() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
+    """Reads denials, and how many of the same step come before each: two may be alike. For batches in their order.
+
+    The recorder writes those of a step at once, and the first half of Rerun's row id tells of each write. So a step
+    goes on where Rerun's tools have cut between its denials, and begins anew where another part repeats it.
+    """
+    place, n = (b"", -1), 0
+
+    def numbered(batch: Any) -> Iterator[tuple[int, DenialRecord]]:
+        nonlocal place, n
+        for record, row in zip(denials(batch), batch.column(ROW_ID).to_pylist(), strict=True):
+            at = (row[:_WRITE], record.step)
+            place, n = at, n + 1 if at == place else 0
+            yield n, record
+
+    return numbered
 
 
 def _packed(column: str, kind: type[_T]) -> Callable[[Any], Iterator[_T]]:

@@ -145,7 +145,7 @@ class Recording:
 
     def denials(self) -> Iterator[DenialRecord]:
         """Every typed no, in order."""
-        return (record for _, record in self._unique(paths.DENIALS, items.numbered_denials, lambda pair: pair))
+        return (record for _, record in self._unique(paths.DENIALS, items.numbered_denials(), lambda pair: pair))
 
     def samples(self) -> Iterator[RawSample]:
         """Raw messages of clients, in the order of receipt."""

@@ -18,7 +18,7 @@ from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import CLOSED, OPEN, Recording, reader, rrd_file, verify
 from iris_session.recording.messages import Batch, DenialRecord, MetricRecord, StateFrame
-from iris_session.recording.paths import ROWS, part_path
+from iris_session.recording.paths import DENIALS, ROWS, part_path
 from iris_session.recording.writer import RrdWriter
 from tests.recording.support import SmallCore, journal, write
 
@@ -99,6 +99,26 @@ def test_a_copy_reads_and_verifies_like_the_original(
     report = verify(copy, SmallCore)
     assert report.ok, report.line()
     assert (report.steps, report.keyframes, report.finished) == (STEPS, 5, True)
+
+
+def test_denials_that_are_alike_are_counted_across_chunks(tmp_path: Path) -> None:
+    """A step with many of them, cut between any two, and repeated by the next part, which begins with that step."""
+    header, batch = journal(STEPS, CLOSED)
+    alike = [DenialRecord(7, 70, 3, Denial("held", "it is held"))] * 40
+    for number in (1, 2):
+        writer = RrdWriter(part_path(str(tmp_path / "session.rrd"), number), "id")
+        writer.header(header)
+        writer.add(Batch(rows=batch.rows[:10], denials=[*alike]))
+        writer.close()
+    copy = optimize(
+        tmp_path / "indexed.rrd", "--split-size-ratio", "1", "--max-rows", "7",
+        tmp_path / "session.rrd", tmp_path / "session.part2.rrd",
+    )  # fmt: skip
+    pieces = [chunk.num_rows for chunk in rrd_file.chunks(copy, DENIALS)]
+    assert len(pieces) > 2, "else this shows nothing"
+    for path in (copy, tmp_path / "session.rrd"):
+        with Recording.open(path) as recording:
+            assert list(recording.denials()) == alike
 
 
 def test_columns_do_lie_in_chunks_of_their_own(tmp_path: Path) -> None:
