@@ -325,10 +325,8 @@ def test_a_gateway_speaks_for_others_and_takes_them_along(session: FrontSession)
     assert stranger.wait_for(Refused).code == "gateway_only"
     gateway.join("gateway", "web")
     gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
-    gateway.wait_for(Welcome, 2)
-    welcome, bulk = gateway.inbox[-1]
-    assert isinstance(welcome, Welcome)
-    assert bulk == [b"tab1"]
+    welcome = gateway.wait_for(Welcome, 2)
+    assert [bulk for message, bulk in gateway.inbox if message is welcome] == [[b"tab1"]]  # more may have come since
     join = session.wait_entries(Join, 3)[-1].message
     assert isinstance(join, Join)
     assert join.gateway == 2
