@@ -31,6 +31,9 @@ from iris_session.recording.messages import DenialRecord, decode_header
 from iris_session.recording.probe import Prober
 
 _T = TypeVar("_T")
+#: Lines of `damage` at most: a file may be damaged in any number of places.
+MOST_DAMAGE: Final = 200
+MORE_DAMAGE: Final = "and more of it is damaged than is listed here"
 #: A new part repeats at most what the feed's window held: minutes of rows.
 REPEATED_ITEMS: Final = 200_000
 
@@ -38,10 +41,10 @@ REPEATED_ITEMS: Final = 200_000
 class Recording:
     """An open recording. Use as a context manager, or `close` it: damaged parts have temporary copies.
 
-    `damage`: one line per thing that could not be read. `missing`: one per part that ought to be there. `notes`: parts
-    in which nothing is, or more than one recording. `cuts`: parts that end in the middle of a write, as a kill leaves
-    them. `root`: the chain value before the first row. `end`: as noted when the last part was closed, None when its
-    recorder was killed or when a part is missing at the end.
+    `damage`: one line per thing that could not be read, `MOST_DAMAGE` at most. `missing`: one per part that ought to be
+    there. `notes`: parts in which nothing is, or more than one recording. `cuts`: parts that end in the middle of a
+    write, as a kill leaves them. `root`: the chain value before the first row. `end`: as noted when the last part was
+    closed, None when its recorder was killed or when a part is missing at the end.
     """
 
     def __init__(self, files: list[str]) -> None:
@@ -53,6 +56,7 @@ class Recording:
         self.notes: list[str] = []
         self.cuts: list[str] = []
         self._rewritten: set[str] = set()
+        self._several: list[tuple[str, int]] = []  # files with more than one recording in them
         try:
             with Prober() as prober:
                 for path in files:
@@ -62,6 +66,9 @@ class Recording:
         except BaseException:
             self.close()
             raise
+        one = f"session {self.header.session_name!r} of {self.header.created_utc or 'an unknown day'}"
+        for name, n in self._several:
+            self.notes.append(f"{name} holds {n} recordings: only {one} is read; make a file of each of the others")
         self._find_missing(files)
         self.end = ends.get(len(self.files) - 1)
 
@@ -214,9 +221,7 @@ class Recording:
                 yield from ((i, item) for item in decode(join(pieces)))
             except UNREADABLE as error:
                 place = f"{os.path.basename(self.files[i])}: {entity}"
-                line = f"{place} holds something damaged, which is left out: {_said(error)}"
-                if line not in self.damage:
-                    self.damage.append(line)
+                self._harmed(f"{place} holds something damaged, which is left out: {_said(error)}")
 
     def _count(self, entity: str) -> int:
         return sum(count(pieces) for _, pieces in self._spans(entity))
@@ -239,15 +244,15 @@ class Recording:
             whole = found.good_bytes == found.size and not found.holes and prober.readable(path)
             readable = path if whole else self._salvaged(path, prober)
         except NotARecordingError as error:
-            self.damage.append(str(error))
+            self._harmed(str(error))
             return
         except OSError as error:
-            self.damage.append(f"{path} cannot be read: {error.strerror or error}")
+            self._harmed(f"{path} cannot be read: {error.strerror or error}")
             return
         if found.indexed:
             self._rewritten.add(readable)
             if whole and (n := prober.recordings(path)) > 1:
-                self.notes.append(f"{os.path.basename(path)} holds {n} recordings: only the first one is read")
+                self._several.append((os.path.basename(path), n))
         self._readable.append(readable)
         self.files.append(path)
 
@@ -257,13 +262,19 @@ class Recording:
         name = os.path.basename(path)
         copy = os.path.join(self._folder.name, name)
         try:
-            self.damage += [f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)]
+            self._harmed(*(f"{name}: {line}" for line in rrd_file.salvage(path, copy, prober)))
         except OSError as error:
             said = error.strerror or error
             raise NotARecordingError(
                 f"{name} is damaged, and cannot be copied to {self._folder.name}: {said}"
             ) from error
         return copy
+
+    def _harmed(self, *lines: str) -> None:
+        """Each once, and no more than anybody reads."""
+        for line in lines:
+            if len(self.damage) <= MOST_DAMAGE and line not in self.damage:
+                self.damage.append(line if len(self.damage) < MOST_DAMAGE else MORE_DAMAGE)
 
     def _find_missing(self, files: list[str]) -> None:
         """`files`: what was found, in order. A name may hold any number, so gaps are not counted out."""
@@ -297,7 +308,7 @@ class Recording:
             if intact:
                 self._leave_out_others()
             else:
-                self.damage.append("header: its bytes were changed (checksum)")
+                self._harmed("header: its bytes were changed (checksum)")
             return header
         said = self.damage + self.notes
         why = f" ({said[0]})" if said else ": nothing was recorded, or it is not ours"
@@ -309,7 +320,7 @@ class Recording:
             with suppress(*UNREADABLE):
                 blob, intact = open_blob(items.values(batch, "blob")[0])
                 if intact and root_of(blob) != self.root:
-                    self.damage.append(f"{os.path.basename(self.files[i])} is of another session, and left out")
+                    self._harmed(f"{os.path.basename(self.files[i])} is of another session, and left out")
                     del self.files[i], self._readable[i]
 
 

@@ -122,7 +122,7 @@ class Owner(Publishing, ScenePatches):
     @property
     def notes(self) -> tuple[str, ...]:
         """What people should know about how the session started (another name, other addresses), and what clients do
-        not see of its scenes; one line each."""
+        not see of its present scene; one line each."""
         live = self._processes
         return () if live is None else tuple(dict.fromkeys((*live.notes, *live.scenes.notes)))
 

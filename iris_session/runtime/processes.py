@@ -138,7 +138,6 @@ class SessionProcesses:
                     self.scenes.make(self._core.world, self._core.scene.initial_state, self._core.authority.patches)
                 ),
             )
-            self.notes += self.scenes.notes
             if self._past is not None:
                 self.notes += self._past.notes
                 self.front.link.handback = self._past.handback

@@ -31,15 +31,17 @@ NOTHING_TO_SEE: Final = "clients get no meshes and textures"
 
 
 class Shown(NamedTuple):
-    """What clients get of one scene. `spec`: None where nothing is shared but bodies and poses."""
+    """What clients get of one scene. `spec`: None where nothing is shared but bodies and poses. `notes`: what they do
+    not get, a line each."""
 
     info: SceneInfo
     spec: SceneSpec | None = None
     patches: tuple[PatchOp, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 class SharedScenes:
-    """Makes what clients get of each scene of one session. `notes`: what people should know; one line each.
+    """Makes what clients get of each scene of one session.
 
     `where`: True for the store of this user, a folder for another one, False for none: clients then get bodies and
     poses, nothing to draw them with. `lock`: held while a scene or patch takes its place in the order of both, which is
@@ -47,7 +49,7 @@ class SharedScenes:
     """
 
     def __init__(self, where: bool | str | Path, name: str, composed: ComposedScene | None = None) -> None:
-        self.notes: list[str] = []
+        self._said: list[str] = []  # of the store, whatever the scene
         self.lock = threading.RLock()
         self.newest: Shown | None = None
         self._name = name
@@ -61,6 +63,12 @@ class SharedScenes:
                 self._store = AssetStore(None if where is True else where)
             except OSError as error:
                 self._say(f"{NOTHING_TO_SEE}: {error.filename or where}: {error.strerror or error}")
+
+    @property
+    def notes(self) -> list[str]:
+        """What people should know of the newest scene, and of where its files are kept; one line each."""
+        newest = self.newest
+        return list(dict.fromkeys((*(() if newest is None else newest.notes), *self._said)))
 
     def make(self, world: World, initial_state: bytes = b"", patches: Sequence[PatchOp] = ()) -> Shown:
         """Of the scene as it begins (`initial_state` empty: as the model says) and what has changed in it since: so
@@ -80,10 +88,8 @@ class SharedScenes:
             )
             shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
-            self._say(f"{NOTHING_TO_SEE}: {error}")
-            return Shown(plain)
-        self._say(*(f"clients do not see {what}" for what in parsed.skipped))
-        return shown
+            return Shown(plain, notes=(f"{NOTHING_TO_SEE}: {error}",))
+        return shown._replace(notes=tuple(f"clients do not see {what}" for what in parsed.skipped))
 
     def patch(self, ops: Sequence[PatchOp]) -> Shown:
         """The newest scene with `ops`. Raises `SceneError`, `OSError`. Hold `lock` until `take`."""
@@ -99,7 +105,7 @@ class SharedScenes:
                 f"{len(merging)} operations since the scene was loaded, at most {MAX_PATCHES}, of which those on one "
                 "visual count once: load the scene anew"
             )
-        return _stored(self._store, patched(newest.spec, ops), newest.info, merging)
+        return _stored(self._store, patched(newest.spec, ops), newest.info, merging)._replace(notes=newest.notes)
 
     def take(self, shown: Shown) -> SceneInfo:
         """It is the newest from now on; its files stay, and those of the one before, which the front still serves.
@@ -141,9 +147,10 @@ class SharedScenes:
             look = looks.popleft()
             store.discard(look.address, look.used_at)
 
-    def _say(self, *texts: str) -> None:
-        """Each once: a session may load its scenes, and patch them, for days."""
-        self.notes += [text for text in dict.fromkeys(texts) if text not in self.notes]
+    def _say(self, text: str) -> None:
+        """Once: a session may load its scenes, and patch them, for days."""
+        if text not in self._said:
+            self._said.append(text)
 
 
 class _Look(NamedTuple):

@@ -9,7 +9,16 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.recording import Continues, NotARecordingError, Recording, VerifyReport, paths, rrd_file, verify
+from iris_session.recording import (
+    Continues,
+    NotARecordingError,
+    Recording,
+    VerifyReport,
+    paths,
+    reader,
+    rrd_file,
+    verify,
+)
 from iris_session.recording.columns import blobs, nanoseconds, sequence
 from iris_session.recording.journal import FORMAT
 from iris_session.recording.paths import part_path
@@ -99,6 +108,20 @@ def test_a_damaged_message_is_left_out_and_the_rest_is_read(path: Path) -> None:
     report = verify(path, SmallCore)
     assert not report.ok
     assert any(p.kind == "unreadable" for p in report.problems)
+
+
+def test_damage_is_a_list_that_somebody_can_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "MOST_DAMAGE", 3)
+    data = bytearray(path.read_bytes())
+    for victim in [m for m in rrd_file.scan(path).messages if m.kind == rrd_file.KIND_ARROW][-12:-3]:
+        for i in range(victim.offset + 60, victim.offset + victim.length, 7):
+            data[i] ^= 0xFF
+    path.write_bytes(data)
+    with Recording.open(path, warn=False) as recording:
+        assert len(list(recording.rows())) > 20
+        assert len(recording.damage) == 4
+        assert len(set(recording.damage)) == 4
+        assert recording.damage[-1] == reader.MORE_DAMAGE
 
 
 def test_parts_are_one_recording_and_repeated_rows_count_once(tmp_path: Path) -> None:

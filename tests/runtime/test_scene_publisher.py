@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -22,6 +23,7 @@ from iris_session import (
     Session,
     SessionConfig,
 )
+from iris_session.protocol.scene import Environment
 from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
@@ -222,7 +224,8 @@ def test_nothing_is_set_before_the_start_or_published_after_the_end() -> None:
 
 def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
     broken = SceneBuilder("broken")
-    broken.add_box("world", half_size=(1.0, 1.0, 1.0), movable=True)
+    broken.add_box("box", half_size=(1.0, 1.0, 1.0), movable=True)
+    broken.environment = Environment(extent=math.nan)
     for builder, config, says in (
         ("scene.xml", CONFIG, "a SceneBuilder is expected"),
         (scene(), "config", "a SessionConfig is expected"),

@@ -86,9 +86,11 @@ def test_a_scene_that_cannot_be_shared_leaves_the_next_one_its_picture(
         scenes.take(scenes.make(world))
     with pytest.raises(SceneError, match=r"no specification of its scene: clients get no meshes .*No space left"):
         scenes.patch([SetVisual(0, rgba=(0.0, 0.0, 0.0, 1.0))])
+    assert "clients get no meshes" in scenes.notes[-1]
     scenes.take(scenes.make(world))
     assert scenes.newest is not None
     assert scenes.newest.spec is not None
+    assert scenes.notes == [], "what was so of the scene before"
     scenes.close()
     with pytest.raises(SceneError, match="`assets` of SessionConfig is False"):
         SharedScenes(False, "test").patch([SetVisual(0)])
