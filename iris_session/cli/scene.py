@@ -46,7 +46,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     export = actions.add_parser(
         "export",
         help="write the scene as a GLB file",
-        description="Writes the scene as it stands at first as GLB (glTF 2.0): meshes, 2d textures and colours, y up.",
+        description="Writes the scene as it stands at first as GLB (glTF 2.0): meshes, textures and colours, y up.",
     )
     _add_scene(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")

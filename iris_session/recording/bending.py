@@ -34,7 +34,6 @@ class Bending:
         deformable: Deformable,
         arrays: dict[str, NDArray[Any]],
         texture: Pixels | None = None,
-        tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
         corners = 2 if deformable.dim == 1 else 3
         self.entity = entity
@@ -50,7 +49,7 @@ class Bending:
             raise AssetError(f"deformable {deformable.name!r}: {topology.n_vertices} vertices are streamed")
         self._decoder = DeformableDecoder(topology)
         self._last: Floats = self._rest
-        self._radius, self._colour = deformable.radius, colour(deformable.rgba, tint)
+        self._radius, self._colour = deformable.radius, colour(deformable.rgba)
         self._form: _Lines | _Surface
         if deformable.dim == 1:
             self._form = _Lines(elements)

@@ -138,9 +138,8 @@ class ScenePicture:
             if reader.shown(deformable):
                 entity = self._entity(scene.WORLD, deformable.name or deformable.stream)
                 try:
-                    bending = Bending(
-                        entity, deformable, reader.arrays(deformable), *reader.surface(deformable.material)
-                    )
+                    texture = reader.texture(deformable.material)
+                    bending = Bending(entity, deformable, reader.arrays(deformable), texture)
                 except _NOT_DRAWN as error:
                     self._failed.append(f"{entity} ({error})")
                     continue

@@ -24,14 +24,18 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
-from iris_session.scene.shapes import generated_uv, height_field, primitive
+from iris_session.scene.coordinates import on_deformable, with_coordinates
+from iris_session.scene.cubes import Cubes, baked, direction_scale
+from iris_session.scene.shapes import height_field, primitive
 
 WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
 INFINITE_PLANE_M: Final = 10.0
 PLANE_HALF_THICKNESS_M: Final = 0.0005
-#: Textures come with the largest level within this side: each is in the file as often as it is worn.
+#: Textures come with the largest level within this side: each is in the file as often as it is worn. Of cubes it is the
+#: side of a face: six lie in one picture, which is then no larger.
 TEXTURE_SIDE: Final = 512
+CUBE_SIDE: Final = 128
 
 BOX: Final = "box"
 ELLIPSOID: Final = "ellipsoid"
@@ -54,7 +58,7 @@ Pixels = NDArray[np.uint8]
 
 class Form(NamedTuple):
     """How a visual is drawn. `size`: half sizes (box, ellipsoid), or radius twice and half length along z (capsule,
-    cylinder) [m]; unused for meshes. `tint`: to multiply its colour with, where a texture has no place."""
+    cylinder) [m]; unused for meshes. `tint`: to multiply its colour with, in place of a texture of one colour."""
 
     kind: str
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -107,7 +111,7 @@ class SceneReader:
         self._places = places(spec, bodies)
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
-        self._tints: dict[int, tuple[float, float, float]] = {}
+        self._cubes = Cubes(spec, store, CUBE_SIDE)
 
     def shown(self, thing: Visual | Deformable) -> bool:
         """Whether it is drawn at all."""
@@ -121,7 +125,9 @@ class SceneReader:
     def form(self, visual: Visual) -> Form:
         """Shape and surface."""
         geometry = visual.geometry
-        texture, tint = self.surface(visual.material)
+        cube = self._cubes.worn(visual.material, geometry)
+        atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
+        texture = self.texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
         if mesh is None and texture is not None:
             mesh = primitive(_ended(geometry))
@@ -129,23 +135,27 @@ class SceneReader:
             return Form(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
         if texture is None:
             return Form(MESH, mesh=mesh, tint=tint)
-        uv = mesh.uv
-        if uv is None:
-            uv = generated_uv(mesh.position, geometry, self._spec.materials[visual.material])
-        return Form(MESH, mesh=mesh, uv=uv, texture=texture)
+        if atlas is not None:
+            mesh = baked(mesh, geometry, direction_scale(self._spec, geometry, visual.material), atlas)
+        else:
+            mesh = with_coordinates(mesh, geometry, self._spec.materials[visual.material])
+        return Form(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
 
-    def surface(self, material: int) -> tuple[Pixels | None, tuple[float, float, float]]:
-        """The 2d texture of a material, red, green, blue and perhaps alpha; else what it tints with."""
+    def texture(self, material: int) -> Pixels | None:
+        """The 2d texture of a material, red, green, blue and perhaps alpha."""
         index = -1 if material < 0 else self._spec.materials[material].texture()
         if index < 0:
-            return None, _WHITE
+            return None
         if index not in self._textures:
-            self._textures[index], self._tints[index] = self._texture(index)
-        return self._textures[index], self._tints[index]
+            self._textures[index] = self._texture(index)
+        return self._textures[index]
 
     def arrays(self, deformable: Deformable) -> dict[str, NDArray[Any]]:
-        """The asset of a deformable."""
-        return decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
+        """The asset of a deformable, with texture coordinates as its material repeats them."""
+        arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
+        worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
+        uv = on_deformable(arrays.get("uv"), worn)
+        return arrays if uv is None else {**arrays, "uv": uv}
 
     def _mesh(self, geometry: Geometry) -> MeshArrays | None:
         key = (geometry.mesh, geometry.hfield)
@@ -161,22 +171,18 @@ class SceneReader:
         field = self._spec.hfields[hfield]
         return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
 
-    def _texture(self, index: int) -> tuple[Pixels | None, tuple[float, float, float]]:
+    def _texture(self, index: int) -> Pixels | None:
         texture = self._spec.textures[index]
-        drawn = texture.kind == TextureKind.IMAGE
         levels = [level for level in texture.levels if level.encoding != AssetEncoding.OPAQUE]
-        if not levels:
-            return None, _WHITE
-        # A cube has no form in Rerun and gives its mean colour, for which the coarsest level will do.
-        fitting = [level for level in levels if max(level.width, level.height) <= TEXTURE_SIDE] if drawn else []
-        level = (fitting or levels[-1:])[0]
-        pixels = decode_image(self._store.get(level.address), level.encoding)
-        if pixels.shape[2] < 3:
-            pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
-        if drawn:
-            return pixels, _WHITE
-        red, green, blue = (pixels[:, :, :3].reshape(-1, 3).mean(axis=0) / 255.0).tolist()
-        return None, (red, green, blue)
+        if not levels or texture.kind != TextureKind.IMAGE:
+            return None
+        level = next((lev for lev in levels if max(lev.width, lev.height) <= TEXTURE_SIDE), levels[-1])
+        return _with_colours(decode_image(self._store.get(level.address), level.encoding))
+
+
+def _with_colours(pixels: Pixels) -> Pixels:
+    """Red, green, blue of what is grey."""
+    return pixels if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
 
 
 def places(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, Place]:

@@ -1,13 +1,14 @@
 """A scene as a GLB file (glTF 2.0, one binary file), which viewers and editors open anywhere.
 
 Y is up there, so a root node turns the scene. Every mesh and texture is in the file once, however many bodies wear
-it. 2d textures are kept, with normals, roughness and the like; cubes have no form in glTF and leave their mean colour,
-skies nothing. Groups that are hidden stay out. Cameras come along, and lights that are lit. `report.not_in_glb` says
-what of a scene is not in the file.
+it. 2d textures are kept, with normals, roughness and the like; cubes, which glTF does not have, become one picture each
+(`cubes`); skies leave nothing. Groups that are hidden stay out. Cameras come along, and lights that are lit.
+`report.not_in_glb` says what of a scene is not in the file.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import struct
@@ -24,11 +25,13 @@ from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.collected import composed
+from iris_session.scene.coordinates import on_deformable, with_coordinates
+from iris_session.scene.cubes import Cube, Cubes, baked, direction_scale
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.glb_views import add_viewpoints
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
-from iris_session.scene.shapes import generated_uv, height_field, primitive
+from iris_session.scene.shapes import height_field, primitive
 from iris_session.scene.simplify import unit
 from iris_session.scene.store import AssetStore
 
@@ -38,6 +41,8 @@ _REPEAT, _LINEAR, _MIPMAPS = 10497, 9729, 9987
 _LINES: Final = 1
 #: Lengths in a GLB have 32 bits; some are left for the heads of its parts.
 _MAX_BYTES: Final = (1 << 32) - 64
+#: Longest side of a cube's face [pixels]: all six in one picture are then no more than headsets take.
+CUBE_SIDE: Final = 2_048
 #: Turns z up into y up: -90 degrees around x, `[x, y, z, w]` as glTF has quaternions.
 _Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 
@@ -75,8 +80,9 @@ class _Glb:
         }
         self._meshes: dict[tuple[object, ...], int | None] = {}
         self._materials: dict[tuple[object, ...], int] = {}
-        self._textures: dict[int, int] = {}
-        self._tints: dict[int, list[float]] = {}
+        self._textures: dict[str, int] = {}  # by the address of the asset
+        self._cubes = Cubes(spec, store, CUBE_SIDE)
+        self._views: dict[tuple[bytes, int], int] = {}
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
         self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
@@ -150,31 +156,36 @@ class _Glb:
 
     def _primitive(self, visual: Visual) -> dict[str, Any] | None:
         geometry = visual.geometry
-        mapped = self._mapping(visual)
+        cube = self._cubes.worn(visual.material, geometry)
+        mapped = self._mapping(visual, cube)
         key = (geometry, mapped)
         if key not in self._shared:
             arrays = self._arrays(visual)
             if arrays is None or not arrays.triangles:
                 return None
-            uv = arrays.uv
-            if uv is None and mapped is not None:
-                uv = generated_uv(arrays.position, geometry, self._spec.materials[visual.material])
-            self._shared[key] = self._attributes(arrays, uv)
+            if cube is not None and cube.atlas is not None:
+                scale = direction_scale(self._spec, geometry, visual.material)
+                arrays = baked(arrays, geometry, scale, cube.atlas)
+            elif mapped is not None:
+                arrays = with_coordinates(arrays, geometry, self._spec.materials[visual.material])
+            self._shared[key] = self._attributes(arrays, arrays.uv)
             if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
                 self._see_through.add(key)
-        material = self._material(visual.material, visual.rgba, blended=key in self._see_through)
+        material = self._material(visual.material, visual.rgba, blended=key in self._see_through, cube=cube)
         return {**self._shared[key], "material": material}
 
-    def _mapping(self, visual: Visual) -> tuple[object, ...] | None:
-        """What generated texture coordinates depend on, `None` where there is no 2d texture, or a mesh has its own."""
+    def _mapping(self, visual: Visual, cube: Cube | None) -> tuple[object, ...] | None:
+        """What texture coordinates depend on, `None` where there is no texture, or those of a mesh are as they are."""
+        if cube is not None:
+            scale = direction_scale(self._spec, visual.geometry, visual.material)
+            return None if cube.atlas is None else ("cube", scale, cube.atlas.side, cube.atlas.plain)
+        material = None if visual.material < 0 else self._spec.materials[visual.material]
+        worn = -1 if material is None else material.texture()
+        if material is None or worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
+            return None
         mesh = visual.geometry.mesh
-        if visual.material < 0 or (mesh >= 0 and self._spec.meshes[mesh].textured):
-            return None
-        material = self._spec.materials[visual.material]
-        worn = material.texture()
-        if worn < 0 or self._spec.textures[worn].kind != TextureKind.IMAGE:
-            return None
-        return (material.repeat, material.uniform)
+        as_it_is = mesh >= 0 and self._spec.meshes[mesh].textured and material.repeat == (1.0, 1.0)
+        return None if as_it_is and not material.uniform else (material.repeat, material.uniform)
 
     def _arrays(self, visual: Visual) -> MeshArrays | None:
         geometry = visual.geometry
@@ -196,7 +207,8 @@ class _Glb:
             return self._add("meshes", {"primitives": [{**rope, "material": material}]})
         corners = arrays["position"][arrays["elements"]]
         normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-        mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), arrays.get("uv"))
+        worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
+        mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), on_deformable(arrays.get("uv"), worn))
         return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": material}]})
 
     def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
@@ -234,28 +246,41 @@ class _Glb:
         return self._add("accessors", accessor)
 
     def _view(self, data: bytes, target: int = 0) -> int:
+        """Where `data` lies: once, however often it is asked for."""
         self._blob += b"\0" * (-len(self._blob) % 4)
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
-        if target:
-            view["target"] = target
-        self._blob += data
-        return self._add("bufferViews", view)
+        key = (hashlib.sha256(data).digest(), target)
+        if key not in self._views:
+            view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
+            if target:
+                view["target"] = target
+            self._blob += data
+            self._views[key] = self._add("bufferViews", view)
+        return self._views[key]
 
     # --- looks --------------------------------------------------------------------------------------------------------
 
-    def _material(self, index: int, rgba: Sequence[float], *, both_sides: bool = False, blended: bool = False) -> int:
-        """`blended`: something that wears it is not opaque, besides its own colour and textures."""
-        key = (index, tuple(rgba), both_sides, blended)
+    def _material(
+        self,
+        index: int,
+        rgba: Sequence[float],
+        *,
+        both_sides: bool = False,
+        blended: bool = False,
+        cube: Cube | None = None,
+    ) -> int:
+        """`blended`: something that wears it is not opaque, besides its own colour and textures. `cube`: worn by it;
+        without one a material's cube is not drawn."""
+        key = (index, tuple(rgba), both_sides, blended, cube is not None)
         if key not in self._materials:
-            look = self._look(index, rgba, both_sides=both_sides)
+            look = self._look(index, rgba, both_sides=both_sides, cube=cube)
             if blended:
                 look["alphaMode"] = "BLEND"
             self._materials[key] = self._add("materials", look)
         return self._materials[key]
 
-    def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool) -> dict[str, Any]:
-        tint = [1.0] * 3 if index < 0 else self._tint(self._spec.materials[index].texture())
-        colour = [_linear(v * part) for v, part in zip(rgba, tint, strict=False)]
+    def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool, cube: Cube | None) -> dict[str, Any]:
+        tint = (1.0, 1.0, 1.0) if cube is None else cube.tint
+        colour = [float(v) * part for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
         found: dict[str, Any] = {"pbrMetallicRoughness": look, "doubleSided": both_sides}
         if index >= 0:
@@ -263,37 +288,27 @@ class _Glb:
             look["metallicFactor"] = min(max(material.metallic, 0.0), 1.0)
             shine = 1.0 - material.shininess if material.roughness < 0 else material.roughness
             look["roughnessFactor"] = min(max(shine, 0.05), 1.0)
-            if material.emission > 0:
-                found["emissiveFactor"] = [min(1.0, material.emission * v) for v in colour]
             found["name"] = material.name or f"material_{index}"
             worn = material.texture()
             if worn >= 0 and self._spec.textures[worn].channels == 4:
                 found["alphaMode"] = "BLEND"
-            for where, key, roles in (
-                (look, "baseColorTexture", ()),
-                (look, "metallicRoughnessTexture", (TextureRole.ORM,)),
-                (found, "occlusionTexture", (TextureRole.ORM, TextureRole.OCCLUSION)),
-                (found, "normalTexture", (TextureRole.NORMAL,)),
-                (found, "emissiveTexture", (TextureRole.EMISSIVE,)),
+            for where, key, texture in (
+                (look, "baseColorTexture", self._texture(worn) if cube is None else self._atlas(cube)),
+                (look, "metallicRoughnessTexture", self._texture(material.texture(TextureRole.ORM))),
+                (found, "occlusionTexture", self._texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION))),
+                (found, "normalTexture", self._texture(material.texture(TextureRole.NORMAL))),
+                (found, "emissiveTexture", self._texture(material.texture(TextureRole.EMISSIVE))),
             ):
-                texture = self._texture(material.texture(*roles))
                 if texture is not None:
                     where[key] = {"index": texture}
-        look["baseColorFactor"] = [*colour, min(max(float(rgba[3]), 0.0), 1.0)]
+            if material.emission > 0:  # of what is seen, texture and all
+                found["emissiveFactor"] = [_linear(material.emission * v) for v in colour]
+                if "baseColorTexture" in look:
+                    found.setdefault("emissiveTexture", look["baseColorTexture"])
+        look["baseColorFactor"] = [*map(_linear, colour), min(max(float(rgba[3]), 0.0), 1.0)]
         if rgba[3] < 1:
             found["alphaMode"] = "BLEND"
         return found
-
-    def _tint(self, texture: int) -> list[float]:
-        """The mean colour of a cube, for which its coarsest level will do; white where there is none."""
-        if texture < 0 or self._spec.textures[texture].kind == TextureKind.IMAGE:
-            return [1.0] * 3
-        level = self._spec.textures[texture].levels[-1]
-        if texture not in self._tints and level.encoding != AssetEncoding.OPAQUE:
-            pixels = decode_image(self._store.get(level.address), level.encoding)
-            colours = np.broadcast_to(pixels[:, :, : 3 if pixels.shape[2] >= 3 else 1], (*pixels.shape[:2], 3))
-            self._tints[texture] = (colours.reshape(-1, 3).mean(axis=0) / 255.0).tolist()
-        return self._tints.get(texture, [1.0] * 3)
 
     def _texture(self, index: int) -> int | None:
         if index < 0 or self._spec.textures[index].kind != TextureKind.IMAGE:
@@ -301,13 +316,24 @@ class _Glb:
         level = self._spec.textures[index].levels[0]
         if level.encoding == AssetEncoding.OPAQUE:
             return None
-        if index not in self._textures:
+        if level.address not in self._textures:
             data, encoding = self._store.get(level.address), level.encoding
             if encoding == AssetEncoding.ARRAYS:
                 data, encoding, _ = encode_image(decode_image(data, encoding), AssetEncoding.PNG)
-            image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
-            self._textures[index] = self._add("textures", {"source": image, "sampler": 0})
-        return self._textures[index]
+            self._textures[level.address] = self._picture(data, encoding)
+        return self._textures[level.address]
+
+    def _atlas(self, cube: Cube) -> int | None:
+        if cube.atlas is None:
+            return None
+        if cube.address not in self._textures:
+            data, encoding, _ = encode_image(cube.atlas.pixels, cube.encoding)
+            self._textures[cube.address] = self._picture(data, encoding)
+        return self._textures[cube.address]
+
+    def _picture(self, data: bytes, encoding: str) -> int:
+        image = self._add("images", {"bufferView": self._view(data), "mimeType": f"image/{encoding}"})
+        return self._add("textures", {"source": image, "sampler": 0})
 
 
 def _normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -86,13 +86,13 @@ class GltfLooks:
     def _emission(self, entry: dict[str, Any], rgba: Rgba) -> tuple[Rgba, float]:
         """The specification has light of a material's own colour: how much, and the colour where it has none else."""
         strength = _map(_map(entry.get("extensions")).get("KHR_materials_emissive_strength"))
-        factor = np.array(self.numbers(entry.get("emissiveFactor", (0, 0, 0)), 3))
+        factor = np.array([seen(v) for v in self.numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)])
         glow = factor * self.number(strength.get("emissiveStrength", 1.0))
         if not glow.any():
             return rgba, 0.0
-        own = np.array([linear(v) for v in rgba[:3]])
-        if own.max() < 1e-3:  # black that glows: the glow is its colour
-            red, green, blue = (seen(v) for v in (glow / max(1.0, glow.max())).tolist())
+        own = np.array(rgba[:3])
+        if own.max() < 0.01:  # black that glows: the glow is its colour
+            red, green, blue = (glow / max(1.0, glow.max())).tolist()
             return (red, green, blue, rgba[3]), float(max(1.0, glow.max()))
         emission = float(glow @ own / (own @ own))
         if np.abs(glow - emission * own).max() > 0.02 * glow.max():
@@ -202,9 +202,3 @@ def seen(value: float) -> float:
     if v >= 1.0:
         return 1.0  # which the formula misses by a bit
     return v * 12.92 if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055
-
-
-def linear(value: float) -> float:
-    """Inverse of `seen`."""
-    v = min(max(float(value), 0.0), 1.0)
-    return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4

@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.scene import Body, SceneSpec, Totals
-from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, LightKind, TextureKind
+from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, LightKind
 from iris_session.scene.budget import QUEST_3, Choice, choose_levels
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
@@ -80,11 +80,9 @@ def report(
 
 def simplified(spec: SceneSpec) -> tuple[str, ...]:
     """What clients draw, and pictures of recordings and GLB files do not, or otherwise; a line each."""
-    worn = {use.texture for material in spec.materials for use in material.textures}
-    cubes = sum(texture.kind != TextureKind.IMAGE for k, texture in enumerate(spec.textures) if k in worn)
-    found = [f"{cubes} cube textures: their mean colour is drawn"] if cubes else []
+    found = []
     if spec.environment.skybox >= 0:
-        found.append("the skybox: nothing is drawn around the scene")
+        found.append("the skybox: neither has a form for it, nothing is drawn around the scene")
     if any(light.kind == LightKind.IMAGE for light in spec.lights):
         found.append("lights from all around (kind image): they do not shine")
     return tuple(found)

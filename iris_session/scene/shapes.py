@@ -1,4 +1,4 @@
-"""Triangles of every geometry of a specification, with normals and generated texture coordinates.
+"""Triangles of every geometry of a specification, with normals.
 
 The reference for clients: docs/scene.md has the same formulas. MuJoCo draws round shapes with 28 slices and 16 stacks
 by default; so does this.
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Geometry
-from iris_session.protocol.scene_looks import HeightField, Material
+from iris_session.protocol.scene_looks import HeightField
 from iris_session.protocol.scene_names import GeometryKind
 from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.simplify import unit
@@ -65,15 +65,6 @@ def height_field(field: HeightField, elevation: NDArray[np.float32]) -> MeshArra
     corner = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * [half_x, half_y]
     parts.append(_quads(np.column_stack([corner, np.full(4, -base)])[None]))
     return _flat(np.concatenate(parts))
-
-
-def generated_uv(position: NDArray[np.float32], geometry: Geometry, material: Material) -> NDArray[np.float32]:
-    """Texture coordinates of a 2d texture on a shape without its own: laid over it from above, along its z."""
-    uv = np.empty((len(position), 2), np.float32)
-    for k, (sign, repeat, size) in enumerate(zip((1, -1), material.repeat, geometry.size[:2], strict=True)):
-        per_metre = repeat if material.uniform or size <= 0 else repeat / size
-        uv[:, k] = 0.5 * sign * per_metre * position[:, k] - 0.5
-    return uv
 
 
 _BOX: Final = np.array(

@@ -126,14 +126,13 @@ def test_export_says_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture
     found = json.loads(capsys.readouterr().out)
     assert (found["file"], found["bytes"], found["skipped"]) == (str(out), out.stat().st_size, [])
     assert [text.partition(":")[0] for text in found["simplified"]] == [
-        "1 cube textures",
         "the skybox",
         "planes without end",
     ]
     assert run("scene", "export", model, out, *assets) == 0
     assert "in the GLB: the skybox" in capsys.readouterr().err
     assert run("scene", "inspect", model, *assets) == 0
-    assert "in recordings and GLB: 1 cube textures: their mean colour is drawn" in capsys.readouterr().out
+    assert "in recordings and GLB: the skybox: neither has a form for it" in capsys.readouterr().out
 
 
 def test_export_does_not_write_over_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import pack_model, scene
 from iris_session.recording.messages import SceneAssets
 from iris_session.recording.pictures import drawing
-from iris_session.scene import AssetMissingError, AssetStore
+from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
 from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, make_header
@@ -83,7 +83,7 @@ def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: P
         assert apply(T_world_visual, (0.1, 0.2, 0.3)) == pytest.approx(point, abs=1e-9)
 
 
-def test_every_shape_wears_its_texture_or_the_mean_of_it(tmp_path: Path) -> None:
+def test_every_shape_wears_its_texture(tmp_path: Path) -> None:
     model, store = every_shape(), AssetStore(tmp_path)
     spec = parse_mujoco(model, store).spec
     reader = scene.SceneReader(spec, store, infos(model))
@@ -92,7 +92,10 @@ def test_every_shape_wears_its_texture_or_the_mean_of_it(tmp_path: Path) -> None
         look = spec.materials[visual.material].name if visual.material >= 0 else ""
         looks.add((visual.geometry.kind, visual.geometry.mesh, look))
         form = reader.form(visual)
-        if look in ("image", "uniform"):
+        coordinates = visual.geometry.mesh >= 0 and spec.meshes[visual.geometry.mesh].textured
+        worn = look in ("image", "uniform") or ("cube" in look and not coordinates)
+        assert form.tint == (1.0, 1.0, 1.0)
+        if worn:
             assert form.kind == scene.MESH
             assert form.texture is not None
             assert form.texture.shape[2] in (3, 4)
@@ -103,10 +106,30 @@ def test_every_shape_wears_its_texture_or_the_mean_of_it(tmp_path: Path) -> None
             assert np.ptp(form.uv, axis=0).min() > 0
         else:
             assert (form.texture, form.uv) == (None, None)
-            assert (form.tint == (1.0, 1.0, 1.0)) == (look not in ("cube", "cubeuniform"))
         is_mesh = visual.geometry.mesh >= 0 or visual.geometry.hfield >= 0
-        assert (form.kind == scene.MESH) == (is_mesh or look in ("image", "uniform"))
+        assert (form.kind == scene.MESH) == (is_mesh or worn)
     assert len(looks) >= len(SHAPES) * len(LOOKS)
+
+
+def test_a_cube_of_one_colour_tints_and_a_large_one_is_small(tmp_path: Path) -> None:
+    """A shape that wears one colour stays the viewer's own; what is worn is in the file every time."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset>
+        <texture name="f" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="1 .5 0" width="64" height="64"/>
+        <texture name="c" type="cube" builtin="checker" rgb1="1 0 0" rgb2="0 0 1" width="600" height="600"/>
+        <material name="f" texture="f"/><material name="c" texture="c"/></asset>
+        <worldbody><geom size="1" material="f"/><geom size="1" material="c"/></worldbody></mujoco>"""
+    )
+    store = AssetStore(tmp_path)
+    for options in (None, EncodeOptions(levels=False)):
+        spec = parse_mujoco(model, store, options=options).spec
+        reader = scene.SceneReader(spec, store, [])
+        plain, checked = (reader.form(visual) for visual in spec.visuals)
+        assert (plain.kind, plain.texture) == (scene.ELLIPSOID, None)
+        assert plain.tint == pytest.approx((1.0, 0.5, 0.0), abs=0.003)
+        assert checked.kind == scene.MESH
+        assert checked.texture is not None
+        assert scene.CUBE_SIDE < max(checked.texture.shape) <= scene.TEXTURE_SIDE
 
 
 def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:

@@ -106,31 +106,54 @@ def test_ropes_are_lines_and_what_is_hidden_is_not_there(tmp_path: Path, store: 
     assert path.length == pytest.approx(1.0)
 
 
-def test_a_cube_leaves_its_mean_colour(tmp_path: Path, store: AssetStore) -> None:
+def test_a_sky_has_no_form(tmp_path: Path, store: AssetStore) -> None:
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><asset><texture name="c" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="1 .5 0" width="8" height="8"/>'
+        '<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 .5 0" width="8" height="8"/>'
         '<texture name="s" type="skybox" builtin="flat" rgb1="1 1 1" width="8" height="8"/>'
-        '<material name="m" texture="c" rgba=".5 1 1 1"/></asset>'
-        '<worldbody><geom size="1" material="m"/></worldbody></mujoco>'
+        '<material name="m" texture="c"/></asset><worldbody><geom size="1" material="m"/></worldbody></mujoco>'
     )
     spec = parse_mujoco(model, store).spec
-    (material,) = exported(spec, store, tmp_path)["materials"]
-    seen = np.array([0.5, 128 / 255, 0.0])
-    linear = np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(material["pbrMetallicRoughness"]["baseColorFactor"], [*linear, 1.0], atol=5e-3)
-    assert not_in_glb(spec) == (
-        "1 cube textures: their mean colour is drawn",
-        "the skybox: nothing is drawn around the scene",
-    )
+    assert len(exported(spec, store, tmp_path)["images"]) == 1
+    assert not_in_glb(spec) == ("the skybox: neither has a form for it, nothing is drawn around the scene",)
 
 
 def test_a_mesh_with_coordinates_of_its_own_is_there_once(tmp_path: Path, store: AssetStore) -> None:
-    """However its materials repeat their texture on other shapes."""
+    """However its materials repeat their texture: only the coordinates differ."""
     scene = SceneBuilder()
     pixels = np.zeros((4, 4, 3), np.uint8)
     corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
     for repeat in ((1, 1), (2, 2)):
         scene.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=pixels, repeat=repeat)
     found = exported(scene.build(store).spec, store, tmp_path)
-    assert len({mesh["primitives"][0]["attributes"]["POSITION"] for mesh in found["meshes"]}) == 1
+    attributes = [mesh["primitives"][0]["attributes"] for mesh in found["meshes"]]
+    views = [{name: found["accessors"][k]["bufferView"] for name, k in one.items()} for one in attributes]
+    assert views[0]["POSITION"] == views[1]["POSITION"]
+    assert views[0]["TEXCOORD_0"] != views[1]["TEXCOORD_0"]
     assert len(found["materials"]) == 2
+
+
+def test_what_glows_comes_back_as_it_was(tmp_path: Path, store: AssetStore) -> None:
+    """And no brighter: colours are linear in the file, and as they are seen in the specification."""
+    scene = SceneBuilder()
+    scene.add_sphere(radius=0.1, rgba=(0.9, 0.5, 0.1), emission=0.4)
+    write_glb(scene.build(store).spec, store, tmp_path / "a.glb")
+    again = SceneBuilder()
+    again.add_file(tmp_path / "a.glb")
+    (material,) = again.build(store).spec.materials
+    assert material.emission == pytest.approx(0.4, abs=1e-3)
+    assert material.rgba == pytest.approx((0.9, 0.5, 0.1, 1.0), abs=1e-3)
+
+
+def test_a_file_in_millimetres_keeps_its_texture(tmp_path: Path, store: AssetStore) -> None:
+    pixels = np.random.default_rng(2).integers(0, 255, (8, 8, 3), np.uint8)
+    corners, uvs = [[0, 0, 0], [300, 0, 0], [0, 200, 0]], [[0, 0], [1, 0], [0, 1]]
+    drawn = SceneBuilder()
+    drawn.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=pixels)
+    write_glb(drawn.build(store).spec, store, tmp_path / "large.glb")
+    small = SceneBuilder()
+    small.add_file(tmp_path / "large.glb", scale=0.001)
+    write_glb(small.build(store).spec, store, tmp_path / "small.glb")
+    (large,), (scaled,) = (trimesh.load_scene(tmp_path / f"{name}.glb").dump() for name in ("large", "small"))
+    np.testing.assert_allclose(scaled.vertices, large.vertices / 1000, atol=1e-7)
+    np.testing.assert_array_equal(scaled.visual.uv, large.visual.uv)
+    np.testing.assert_array_equal(np.asarray(scaled.visual.material.baseColorTexture), pixels)
