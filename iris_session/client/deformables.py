@@ -63,7 +63,8 @@ class _Mesh:
 
 class Deformables:
     """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. One without a
-    name, or with that of another, goes by its stream (`keys`).
+    name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at which they were there,
+    by the same names. What is at rest comes once a second: older than that is not known, but what was there then.
 
     `scene_hash`: of the scene they are of. `fault`: why nothing can be seen of it, empty while all is well. Everything
     happens in `tend`, which never waits.
@@ -74,6 +75,7 @@ class Deformables:
         self.scene_hash = ""
         self.fault = ""
         self.vertices: dict[str, NDArray[np.float32]] = {}
+        self.capture_ns: dict[str, int] = {}
         self._meshes: list[_Mesh] = []
         self._parts: tuple[Deformable, ...] = ()
         self._fetch: AssetFetch | None = None
@@ -104,6 +106,7 @@ class Deformables:
             self._client.drop_media(mesh.stream)
         self._meshes, self._parts, self._fetch = [], (), None
         self.vertices.clear()
+        self.capture_ns.clear()
 
     def _take(self, fetch: AssetFetch) -> None:
         """The specification, then the meshes that it names."""
@@ -135,6 +138,7 @@ class Deformables:
         except StreamError as error:
             self.fault = str(error)
             return False
+        self.capture_ns[mesh.key] = frame.header.capture_ns
         return True
 
 
