@@ -44,8 +44,8 @@ check: install-dev
 # What decides; the rest talks to sockets, disks and people.
 CORE := iris_session/authority/*,iris_session/protocol/*,iris_session/control/*
 
-# Tests at once, and which; the suite is made for two.
-JOBS ?= 2
+# Tests at once, and which. Two leave a third of two cores unused: tests wait for processes, and for sessions in real time.
+JOBS ?= 3
 T ?= tests
 
 UNIT = $(BIN)/python -m pytest -q -m "not e2e" -n $(JOBS) --dist worksteal --cov --cov-report=

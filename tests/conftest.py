@@ -1,6 +1,8 @@
 """Settings of every test: hypothesis draws the same examples every time, and no process may stay behind.
 
-`HYPOTHESIS=random` draws others (`make test-random`): they find more, but what blocks a change must repeat.
+`HYPOTHESIS=random` draws others (`make test-random`): they find more, but what blocks a change must repeat. A twentieth
+of the values are constants that hypothesis finds in those of our modules that are loaded: these differ where a process
+has run other tests before. What failed is kept with `@example`.
 """
 
 from __future__ import annotations

@@ -40,10 +40,12 @@ COMMAND = [sys.executable, "-m", "iris_session.cli.main"]
 #: Before a command: it is told to end when the tests die, too (servers of a killed run slowed down the next one).
 ENDS_WITH_US: Final = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
 #: Files that begin first: one of them at the end would keep one worker busy while the others have nothing left.
+#: Those that compute most lie between those that wait most.
 LONGEST: Final = (
-    "test_demos_paper.py", "test_demo_link.py", "test_soak.py", "test_handover.py", "test_people.py",
-    "test_anchors_live.py", "test_recovery.py", "test_resume.py", "test_user_loop.py", "test_docs.py",
-    "test_joining.py", "test_process.py", "test_doctor.py",
+    "test_demos_paper.py", "test_resume.py", "test_joining.py", "test_demos_soft.py", "test_docs.py",
+    "test_recovery.py", "test_anchors_live.py", "test_contract.py", "test_people.py", "test_handover.py",
+    "test_doctor.py", "test_user_loop.py", "test_soak.py", "test_process.py", "test_processes.py",
+    "test_demo_link.py", "test_links.py", "test_security.py", "test_scene_change.py",
 )  # fmt: skip
 
 
