@@ -21,6 +21,8 @@ from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.simplify import unit
 from iris_session.scene.store import AssetStore
 
+#: Longest side of a face in an exported file [pixels]: six in one picture are then no more than headsets take.
+CUBE_SIDE: Final = 2_048
 #: How far a coordinate may be from the exact one, in sides of a face.
 TOLERANCE: Final = 1 / 128
 #: How often an edge is halved at most: where a surface passes the centre, its directions have no end of detail.

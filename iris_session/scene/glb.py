@@ -26,7 +26,7 @@ from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureK
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.collected import composed
 from iris_session.scene.coordinates import on_deformable, with_coordinates
-from iris_session.scene.cubes import Cube, Cubes, baked, direction_scale
+from iris_session.scene.cubes import CUBE_SIDE, Cube, Cubes, baked, direction_scale
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.glb_views import add_viewpoints
 from iris_session.scene.images import decode_image, encode_image
@@ -41,8 +41,6 @@ _REPEAT, _LINEAR, _MIPMAPS = 10497, 9729, 9987
 _LINES: Final = 1
 #: Lengths in a GLB have 32 bits; some are left for the heads of its parts.
 _MAX_BYTES: Final = (1 << 32) - 64
-#: Longest side of a cube's face [pixels]: all six in one picture are then no more than headsets take.
-CUBE_SIDE: Final = 2_048
 #: Turns z up into y up: -90 degrees around x, `[x, y, z, w]` as glTF has quaternions.
 _Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 
@@ -82,7 +80,7 @@ class _Glb:
         self._materials: dict[tuple[object, ...], int] = {}
         self._textures: dict[str, int] = {}  # by the address of the asset
         self._cubes = Cubes(spec, store, CUBE_SIDE)
-        self._views: dict[tuple[bytes, int], int] = {}
+        self._accessors: dict[tuple[object, ...], int] = {}
         self._shared: dict[tuple[object, ...], dict[str, Any]] = {}
         self._see_through: set[tuple[object, ...]] = set()  # of those, by the alpha of their vertices
 
@@ -224,38 +222,28 @@ class _Glb:
 
     def _indices(self, index: NDArray[Any]) -> int:
         data = np.ascontiguousarray(index, "<u4")
-        return self._add(
-            "accessors",
-            {
-                "bufferView": self._view(data.tobytes(), _INDICES),
-                "componentType": _UINT,
-                "count": data.size,
-                "type": "SCALAR",
-            },
-        )
+        return self._once(data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"})
 
     def _accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
-        accessor: dict[str, Any] = {
-            "bufferView": self._view(values.astype("<f4").tobytes(), _VERTICES),
-            "componentType": _FLOAT,
-            "count": len(values),
-            "type": kind,
-        }
+        accessor: dict[str, Any] = {"componentType": _FLOAT, "count": len(values), "type": kind}
         if bounds:
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self._add("accessors", accessor)
+        return self._once(values.astype("<f4").tobytes(), _VERTICES, accessor)
+
+    def _once(self, data: bytes, target: int, accessor: dict[str, Any]) -> int:
+        """An accessor of its own for `data`, however often it is asked for: two may not share a view."""
+        key = (hashlib.sha256(data).digest(), target, accessor["type"], "min" in accessor)
+        if key not in self._accessors:
+            self._accessors[key] = self._add("accessors", {"bufferView": self._view(data, target), **accessor})
+        return self._accessors[key]
 
     def _view(self, data: bytes, target: int = 0) -> int:
-        """Where `data` lies: once, however often it is asked for."""
         self._blob += b"\0" * (-len(self._blob) % 4)
-        key = (hashlib.sha256(data).digest(), target)
-        if key not in self._views:
-            view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
-            if target:
-                view["target"] = target
-            self._blob += data
-            self._views[key] = self._add("bufferViews", view)
-        return self._views[key]
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
+        if target:
+            view["target"] = target
+        self._blob += data
+        return self._add("bufferViews", view)
 
     # --- looks --------------------------------------------------------------------------------------------------------
 

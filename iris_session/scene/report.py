@@ -11,6 +11,7 @@ import msgspec
 from iris_session.protocol.scene import Body, SceneSpec, Totals
 from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, LightKind
 from iris_session.scene.budget import QUEST_3, Choice, choose_levels
+from iris_session.scene.cubes import CUBE_SIDE, cube_texture
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
 from iris_session.scene.totals import texture_memory, triangles
@@ -92,6 +93,10 @@ def not_in_glb(spec: SceneSpec) -> tuple[str, ...]:
     """What is not in the GLB file of a scene, or otherwise; a line each."""
     opaque = sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures)
     found = [f"{opaque} textures in a form of their own (KTX): left out"] if opaque else []
+    worn = {cube_texture(spec, k) for k in range(len(spec.materials))} - {-1}
+    fine = sum(spec.textures[k].width > CUBE_SIDE for k in worn)
+    if fine:
+        found.append(f"{fine} cube textures of more than {CUBE_SIDE} pixels a face: they are there in a smaller size")
     if any(part.dim == 1 for part in spec.deformables):
         found.append("ropes: lines without thickness")
     if any(v.geometry.kind == GeometryKind.PLANE and 0.0 in v.geometry.size[:2] for v in spec.visuals):

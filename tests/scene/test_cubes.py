@@ -20,6 +20,7 @@ from iris_session.scene.cubes import Cubes, baked
 from iris_session.scene.glb import write_glb
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.report import not_in_glb
 from iris_session.scene.shapes import primitive
 from tests.scene.models import QUAD, SHAPES, WEDGE
 from tests.scene.pictures import Artist, graphics
@@ -179,11 +180,13 @@ def test_large_cubes_are_made_smaller_and_jpeg_stays(
     tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch, *, levels: bool
 ) -> None:
     monkeypatch.setattr("iris_session.scene.glb.CUBE_SIDE", 32)
+    monkeypatch.setattr("iris_session.scene.report.CUBE_SIDE", 32)
     options = EncodeOptions(texture_encoding="jpeg", levels=levels)
     spec = parse_mujoco(painted(SHAPES["box"], "cube", side=64), store, options=options).spec
     write_glb(spec, store, tmp_path / "a.glb")
     (picture,) = images(tmp_path / "a.glb")
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
+    assert not_in_glb(spec) == ("1 cube textures of more than 32 pixels a face: they are there in a smaller size",)
 
 
 def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:
