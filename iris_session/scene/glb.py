@@ -169,7 +169,9 @@ class _Glb:
             self._shared[key] = self._attributes(arrays, arrays.uv)
             if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
                 self._see_through.add(key)
-        material = self._material(visual.material, visual.rgba, blended=key in self._see_through, cube=cube)
+        uv = "TEXCOORD_0" in self._shared[key]["attributes"]
+        see_through = key in self._see_through
+        material = self._material(visual.material, visual.rgba, mapped=uv, blended=see_through, cube=cube)
         return {**self._shared[key], "material": material}
 
     def _mapping(self, visual: Visual, cube: Cube | None) -> tuple[object, ...] | None:
@@ -198,16 +200,17 @@ class _Glb:
         """The rest shape: surfaces, of cloths from both sides; ropes as lines."""
         deformable = self._spec.deformables[index]
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
-        material = self._material(deformable.material, deformable.rgba, both_sides=deformable.dim == 2)
+        both_sides, mapped = deformable.dim == 2, deformable.dim > 1 and "uv" in arrays
+        look = self._material(deformable.material, deformable.rgba, mapped=mapped, both_sides=both_sides)
         if deformable.dim == 1:
             attributes = {"POSITION": self._accessor(arrays["position"], "VEC3", bounds=True)}
             rope = {"attributes": attributes, "indices": self._indices(arrays["elements"]), "mode": _LINES}
-            return self._add("meshes", {"primitives": [{**rope, "material": material}]})
+            return self._add("meshes", {"primitives": [{**rope, "material": look}]})
         corners = arrays["position"][arrays["elements"]]
         normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
         mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), on_deformable(arrays.get("uv"), worn))
-        return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": material}]})
+        return self._add("meshes", {"primitives": [{**self._attributes(mesh, mesh.uv), "material": look}]})
 
     def _attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
         attributes = {
@@ -252,25 +255,27 @@ class _Glb:
         index: int,
         rgba: Sequence[float],
         *,
+        mapped: bool,
         both_sides: bool = False,
         blended: bool = False,
         cube: Cube | None = None,
     ) -> int:
-        """`blended`: something that wears it is not opaque, besides its own colour and textures. `cube`: worn by it;
-        without one a material's cube is not drawn."""
-        key = (index, tuple(rgba), both_sides, blended, cube is not None)
+        """`mapped`: what wears it has texture coordinates, without which it wears no texture. `blended`: it is not
+        opaque, besides its own colour and textures. `cube`: worn by it; without one a material's cube is not drawn."""
+        key = (index, tuple(rgba), mapped, both_sides, blended, cube is not None)
         if key not in self._materials:
-            look = self._look(index, rgba, both_sides=both_sides, cube=cube)
+            look = self._look(index, rgba, mapped=mapped, cube=cube)
+            look["doubleSided"] = both_sides
             if blended:
                 look["alphaMode"] = "BLEND"
             self._materials[key] = self._add("materials", look)
         return self._materials[key]
 
-    def _look(self, index: int, rgba: Sequence[float], *, both_sides: bool, cube: Cube | None) -> dict[str, Any]:
+    def _look(self, index: int, rgba: Sequence[float], *, mapped: bool, cube: Cube | None) -> dict[str, Any]:
         tint = (1.0, 1.0, 1.0) if cube is None else cube.tint
         colour = [float(v) * part for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
-        found: dict[str, Any] = {"pbrMetallicRoughness": look, "doubleSided": both_sides}
+        found: dict[str, Any] = {"pbrMetallicRoughness": look}
         if index >= 0:
             material = self._spec.materials[index]
             look["metallicFactor"] = min(max(material.metallic, 0.0), 1.0)
@@ -287,7 +292,7 @@ class _Glb:
                 (found, "normalTexture", self._texture(material.texture(TextureRole.NORMAL))),
                 (found, "emissiveTexture", self._texture(material.texture(TextureRole.EMISSIVE))),
             ):
-                if texture is not None:
+                if mapped and texture is not None:
                     where[key] = {"index": texture}
             if material.emission > 0:  # of what is seen, texture and all
                 found["emissiveFactor"] = [_linear(material.emission * v) for v in colour]

@@ -45,14 +45,20 @@ def deformables(model: mujoco.MjModel, data: Any, builder: Builder) -> tuple[Def
             elements=len(parts[i].elements),
             radius=float(model.flex_radius[i]),
             flat=bool(model.flex_flatskin[i]),
-            material=int(model.flex_matid[i]),
-            rgba=drawn_rgba(model, model.flex_rgba[i], int(model.flex_matid[i])),
+            material=_material(model, i),
+            rgba=drawn_rgba(model, model.flex_rgba[i], _material(model, i)),
             stream=stream_name(i),
             address=note.address,
             bytes=note.bytes,
         )
         for i, note in enumerate(notes)
     )
+
+
+def _material(model: mujoco.MjModel, index: int) -> int:
+    """Since MuJoCo 4 every element has one: that of the first, as models give it to a flex."""
+    by_element = len(model.flex_matid) == model.nflexelem
+    return int(model.flex_matid[int(model.flex_elemadr[index]) if by_element else index])
 
 
 @dataclass(frozen=True)

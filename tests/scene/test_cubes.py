@@ -112,6 +112,23 @@ def test_a_cloth_repeats_its_picture(tmp_path: Path, store: AssetStore) -> None:
     check(model, store, tmp_path / "a.glb")
 
 
+def test_what_has_no_coordinates_wears_no_picture(tmp_path: Path, store: AssetStore) -> None:
+    flex = """<deformable><flex name="f" dim="2" body="b" radius=".001" material="m" element="0 1 2"
+        vertex="-.3 -.3 0  .3 -.3 .1  .3 .3 .2"/></deformable>"""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><texture name="t" type="2d" builtin="checker" width="8" height="8" rgb1="1 0 0"/>
+        <material name="m" texture="t"/></asset>
+        <worldbody><body name="b"><geom size=".1" material="m"/></body></worldbody>{flex}</mujoco>"""
+    )
+    write_glb(parse_mujoco(model, store).spec, store, tmp_path / "a.glb")
+    found = document(tmp_path / "a.glb")
+    for mesh in found["meshes"]:
+        (one,) = mesh["primitives"]
+        picture = "baseColorTexture" in found["materials"][one["material"]]["pbrMetallicRoughness"]
+        assert picture == ("TEXCOORD_0" in one["attributes"])
+    assert len(found["materials"]) == 2
+
+
 @pytest.mark.parametrize("texture", ["cube", "2d"])
 def test_what_glows_glows_in_its_texture(tmp_path: Path, store: AssetStore, texture: str) -> None:
     model = painted(SHAPES["box"], texture, 'rgba="1 .9 .8 1"')

@@ -163,6 +163,7 @@ def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
         ("rope", 1, 6, "flex-1"),
         ("soft", 3, 56, "flex-2"),
     ]
+    assert [deformable.material for deformable in spec.deformables] == [0, -1, -1]
     assert {info.id for info in World(model, (), ()).bodies} | {0} == {body.id for body in spec.bodies}
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
