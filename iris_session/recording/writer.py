@@ -71,6 +71,7 @@ class RrdWriter:
         self._vertices: deque[VertexFrame] = deque()
         self.vertices_refused = 0
         self._known: deque[Moment] = deque(maxlen=KNOWN_MOMENTS)  # of the newest states
+        self._last_step = -2  # whose state is still of the scene before; the initial state has step -1
         self._bodies: tuple[BodyInfo, ...] = ()
         self._moving: NDArray[np.intp] = np.empty(0, np.intp)
         self._frames: list[str] = []
@@ -204,6 +205,7 @@ class RrdWriter:
             self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
         for loaded in scenes:
             self._use(loaded.bodies)
+            self._last_step = loaded.step if loaded.session_time else self._last_step
             source = Source(loaded.model, loaded.bodies, *assets[-1:])
             self._picture.change(source, (loaded.step, *self._clock, loaded.session_time))
         for patch in () if scenes else assets:
@@ -248,7 +250,8 @@ class RrdWriter:
             if bending is None:  # hidden, or said to be not drawn
                 continue
             try:
-                late = at < 0 or frame.session_time < self._picture.since_ns
+                # The state of that step is later than its row, by the time that the step took: times do not tell.
+                late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at][0] <= self._last_step
                 vertices = None if late else bending.taken(frame.frame)
             except StreamError:
                 late, vertices = True, None

@@ -153,6 +153,23 @@ def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
     assert world.writer.vertices_refused == 1
 
 
+def test_vertices_of_the_last_state_before_a_scene_are_refused(world: World) -> None:
+    """That state is later than the row before the scene, by the time that its step took."""
+    vertices = world.vertices(0)
+    world.state(0)
+    world.state(8)
+    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    scene = SceneModel(8, 16_000_000, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))  # 7 ns before the state
+    world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
+    world.publish(8, 0, vertices + 0.1)
+    world.publish(9, 0, vertices + 0.2)
+    world.state(9)
+    moved = told(world.read()[CLOTH.replace("/1/", "/2/")], "Mesh3D:vertex_positions")
+    assert sorted(moved) == [8, 9]
+    assert np.array(moved[9]) == pytest.approx(vertices + 0.2, abs=1e-3)
+    assert world.writer.vertices_refused == 1
+
+
 def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
     world.state(0)
     for data in (b"", b"\1" * 200):
