@@ -25,12 +25,12 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import load_file
 from iris_session.scene.given import (
     Looks,
-    check_options,
     given_mesh,
     given_vertices,
     look_of,
     numbers,
     path_of,
+    takes,
     triangles_of,
 )
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
@@ -65,7 +65,8 @@ class SceneBuilder:
     lights that shine along the view, no fog, and distances taken from what is there.
 
     Methods return the name of what they added. Movable things, articulations and deformables need one of their own;
-    things that stand still may have any or none. Every refusal is a `SceneBuildError` that says what would be right.
+    things that stand still may have any or none. Every refusal is a `SceneBuildError` that says what would be right;
+    a keyword that a method does not have is a `TypeError`.
     """
 
     def __init__(self, name: str = "scene") -> None:
@@ -74,28 +75,34 @@ class SceneBuilder:
 
     # --- shapes -------------------------------------------------------------------------------------------------------
 
+    @takes(Options)
     def add_box(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[Options]) -> str:
         """A box of half lengths x, y, z."""
         return self._shape(GeometryKind.BOX, name, numbers("half_size", half_size, 3, above=0.0), options)
 
+    @takes(Options)
     def add_sphere(self, name: str = "", *, radius: float, **options: Unpack[Options]) -> str:
         """A sphere."""
         return self._shape(GeometryKind.SPHERE, name, numbers("radius", [radius] * 3, 3, above=0.0), options)
 
+    @takes(Options)
     def add_ellipsoid(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[Options]) -> str:
         """An ellipsoid of half axes x, y, z."""
         return self._shape(GeometryKind.ELLIPSOID, name, numbers("half_size", half_size, 3, above=0.0), options)
 
+    @takes(Options)
     def add_capsule(self, name: str = "", *, radius: float, half_length: float, **options: Unpack[Options]) -> str:
         """A capsule along z: two half spheres beyond the half length."""
         size = numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
         return self._shape(GeometryKind.CAPSULE, name, size, options)
 
+    @takes(Options)
     def add_cylinder(self, name: str = "", *, radius: float, half_length: float, **options: Unpack[Options]) -> str:
         """A cylinder along z."""
         size = numbers("radius and half_length", [radius, radius, half_length], 3, above=0.0)
         return self._shape(GeometryKind.CYLINDER, name, size, options)
 
+    @takes(Options)
     def add_plane(self, name: str = "", *, half_size: Sequence[float] = (0.0, 0.0), **options: Unpack[Options]) -> str:
         """A rectangle in z = 0 that is seen from +z; a half length of 0 is without end."""
         x, y = numbers("half_size", half_size, 2)
@@ -103,6 +110,7 @@ class SceneBuilder:
             raise SceneBuildError(f"half_size of a plane is {tuple(half_size)}: lengths, or 0 for no end")
         return self._shape(GeometryKind.PLANE, name, (x, y, 1.0), options)
 
+    @takes(Options)
     def add_mesh(
         self,
         name: str = "",
@@ -125,6 +133,7 @@ class SceneBuilder:
 
     # --- files --------------------------------------------------------------------------------------------------------
 
+    @takes(Options)
     def add_file(
         self,
         path: str | PathLike[str],
@@ -188,6 +197,7 @@ class SceneBuilder:
 
     # --- what bends, shines and looks ---------------------------------------------------------------------------------
 
+    @takes(Looks)
     def add_deformable(
         self,
         name: str,
@@ -203,7 +213,6 @@ class SceneBuilder:
         """A mesh whose vertices are published: a cloth or a surface of `triangles` (m, 3), or ropes of `edges` (m, 2)
         and `radius` [m]. `vertices` (n, 3) [m]: the first ones, world frame. `uvs` (n, 2). `flat`: a normal per face.
         """
-        check_options(looks, Looks.__annotations__)
         self._new_name(name)
         if len(self._world.flexibles) >= MAX_STREAMS:
             raise SceneBuildError(
@@ -295,7 +304,6 @@ class SceneBuilder:
 
     def _place(self, name: str, options: Options, *, named: bool = False) -> tuple[int, Matrix]:
         """The body that something is added to, made for it where it is movable or `named`, and T_body_thing."""
-        check_options(options, Options.__annotations__)
         if not isinstance(name, str):
             raise SceneBuildError(f"name is {name!r}: text is expected, '' for no name")
         T = checked_pose(options.get("position", IDENTITY.p), options.get("quaternion", IDENTITY.q))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import inspect
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypedDict
+from typing import Any, Final, TypedDict, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +43,54 @@ class Looks(TypedDict, total=False):
     uniform: bool
 
 
-def check_options(options: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Raises `SceneBuildError` for one that nobody knows: what it was to do would be left undone."""
-    names = sorted(known)
-    for option in options:
-        if option not in names:
-            near = difflib.get_close_matches(option, names, n=1)
-            right = f"{near[0]} is meant" if near else f"there are {', '.join(names)}"
-            raise SceneBuildError(f"there is no option {option}: {right}")
+#: What other libraries call an option.
+_ELSEWHERE: Final = {
+    "color": "rgba",
+    "colour": "rgba",
+    "pos": "position",
+    "translation": "position",
+    "xyz": "position",
+    "quat": "quaternion",
+    "orientation": "quaternion",
+    "rotation": "quaternion",
+    "parent": "on",
+    "size": "half_size",
+}
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def takes(options: type[Any]) -> Callable[[Method], Method]:
+    """Of a method with `**options`: any that is not in the dictionary type `options` is a `TypeError` which names the
+    nearest one, as Python's own; what it was to do would be left undone. `help` and editors show them one by one."""
+
+    def wrap(method: Method) -> Method:
+        signature = inspect.signature(method)
+        own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        given = [
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=..., annotation=getattr(kind, "__forward_arg__", kind)
+            )
+            for name, kind in options.__annotations__.items()
+        ]
+        known = [one.name for one in (*own, *given) if one.name != "self"]
+
+        @functools.wraps(method)
+        def checked(*values: Any, **named: Any) -> Any:
+            for name in named:
+                if name not in known:
+                    raise TypeError(f"{method.__name__}() has no keyword {name}: {_meant(name, known)}")
+            return method(*values, **named)
+
+        checked.__signature__ = signature.replace(parameters=[*own, *given])  # type: ignore[attr-defined]
+        return cast(Method, checked)
+
+    return wrap
+
+
+def _meant(name: str, known: Sequence[str]) -> str:
+    same = _ELSEWHERE.get(name)
+    near = [same] if same in known else difflib.get_close_matches(name, known, n=1)
+    return f"{near[0]} is meant" if near else f"there are {', '.join(sorted(known))}"
 
 
 def look_of(options: Mapping[str, Any]) -> Look | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
@@ -210,13 +211,6 @@ BOX = {"half_size": (1, 1, 1)}
         ("add_box", {**BOX, "movable": True}, "name is '': what moves needs one of 1 to 64 characters"),
         ("add_box", {**BOX, "name": "world", "movable": True}, "the frame that all is in, give name= another one"),
         ("add_box", {**BOX, "name": None}, "name is None: text is expected, '' for no name"),
-        ("add_box", {**BOX, "moveable": True}, "there is no option moveable: movable is meant"),
-        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "option pose: "),
-        (
-            "add_deformable",
-            {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "colour": (1, 0, 0)},
-            "no option colour: ",
-        ),
         ("add_box", {**BOX, "name": "x" * 65, "movable": True}, "1 to 64 characters"),
         ("add_box", {**BOX, "name": "b", "movable": True, "on": "cup"}, "one of both"),
         ("add_box", {**BOX, "on": "cap"}, "Movable: cup"),
@@ -278,6 +272,39 @@ def test_refusals_say_what_would_be_right(
     with pytest.raises(SceneBuildError, match=text):
         getattr(scene, method)(**arguments)
     assert scene.build(store).scene_hash == before  # what was refused left nothing behind
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "text"),
+    [
+        ("add_box", {**BOX, "color": (1, 0, 0)}, r"add_box\(\) has no keyword color: rgba is meant"),
+        ("add_box", {**BOX, "moveable": True}, "no keyword moveable: movable is meant"),
+        ("add_box", {**BOX, "pos": (0, 0, 1)}, "no keyword pos: position is meant"),
+        ("add_box", {**BOX, "quat": (1, 0, 0, 0)}, "no keyword quat: quaternion is meant"),
+        ("add_box", {**BOX, "frobnicate": 1}, "there are emission, half_size, .*, uniform"),
+        ("add_sphere", {"radius": 0.1, "metalic": 1.0}, "metallic is meant"),
+        ("add_sphere", {"radius": 0.1, "size": 1.0}, "there are emission, "),
+        ("add_file", {"path": "/lost.stl", "translation": (1, 0, 0)}, "position is meant"),
+        ("add_file", {"path": "/lost.stl", "package_dir": "x"}, "package_dirs is meant"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "no keyword pose: "),
+        (
+            "add_deformable",
+            {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "position": (0, 0, 1)},
+            r"add_deformable\(\) has no keyword position: there are edges, ",
+        ),
+        ("add_urdf", {"path": "/lost.urdf", "movable": True}, "movable"),
+    ],
+)
+def test_keywords_that_a_method_does_not_have_are_refused(method: str, arguments: dict[str, object], text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        getattr(SceneBuilder(), method)(**arguments)
+
+
+def test_keywords_are_listed_for_help() -> None:
+    named = inspect.signature(SceneBuilder.add_box).parameters
+    assert list(named)[:3] == ["self", "name", "half_size"]
+    assert {"rgba", "texture", "position", "quaternion", "movable", "on"} < set(named)
+    assert "movable" not in inspect.signature(SceneBuilder.add_deformable).parameters
 
 
 def test_what_clients_would_not_read_is_refused(store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
