@@ -93,7 +93,7 @@ def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
         print(line)
     totals = found.totals
     print(
-        f"\n{found.bodies} bodies ({found.moving} move), {totals.objects} objects, {totals.triangles:,} triangles, "
+        f"\n{found.bodies} bodies ({found.moving} can move), {totals.objects} objects, {totals.triangles:,} triangles, "
         f"{len(spec.lights)} lights, {len(spec.deformables)} deformables"
     )
     if found.extent is not None:

@@ -22,7 +22,7 @@ def test_inspect_of_an_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert run("scene", "inspect", urdf, "--assets", tmp_path / "assets") == 0
     shown = capsys.readouterr().out
     assert "arm/link5: 2 mesh" in shown  # the hand is fixed to it
-    assert "9 bodies (9 move), 11 objects" in shown
+    assert "9 bodies (9 can move), 11 objects" in shown
     assert run("scene", "inspect", urdf, "--assets", tmp_path / "assets", "--json") == 0
     assert json.loads(capsys.readouterr().out)["moving"] == 9
 
