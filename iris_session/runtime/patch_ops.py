@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from iris_session.protocol.scene import SceneError
+from iris_session.protocol.scene_names import GeometryKind
 from iris_session.protocol.scene_patch import MAX_OPS, AddVisual, PatchOp, SetVisual
 
 #: How far a quaternion may be from unit length: it was rounded.
@@ -61,6 +62,9 @@ def _checked(op: PatchOp) -> PatchOp:
     shown = taken if isinstance(taken, SetVisual) else taken.visual if isinstance(taken, AddVisual) else None
     if shown is not None and shown.rgba is not None and not all(0.0 <= v <= 1.0 for v in shown.rgba):
         raise ValueError(f"rgba is {shown.rgba}: each from 0 to 1 is expected")
+    if isinstance(taken, AddVisual) and taken.visual.geometry.kind not in GeometryKind.ALL:
+        there_are = ", ".join(sorted(GeometryKind.ALL))
+        raise ValueError(f"a geometry of kind {reprlib.repr(taken.visual.geometry.kind)}: there are {there_are}")
     if shown is not None and shown.T_body_visual is not None:
         length = math.hypot(*shown.T_body_visual.q)
         if abs(length - 1.0) > UNIT:

@@ -37,6 +37,7 @@ from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, chec
 from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
 from iris_session.scene.urdf import read_urdf
+from iris_session.streams.deformable_topology import MAX_VERTICES
 
 #: Turns what has y up: 90 degrees around x.
 _FROM_Y_UP: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -221,6 +222,10 @@ class SceneBuilder:
         if (triangles is None) == (edges is None):
             raise SceneBuildError(f"deformable {name!r} needs triangles (m, 3) or edges (m, 2): one of them")
         points = given_vertices(vertices)
+        if len(points) > MAX_VERTICES:
+            raise SceneBuildError(
+                f"deformable {name!r} has {len(points):,} vertices, at most {MAX_VERTICES:,}: make it coarser, or several"
+            )
         elements = triangles_of(triangles if edges is None else edges, len(points), 3 if edges is None else 2)
         (half,) = numbers("radius", [radius], 1, above=0.0)
         look = look_of(looks) or Look()

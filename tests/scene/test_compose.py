@@ -338,6 +338,14 @@ def test_no_more_deformables_than_there_are_streams(store: AssetStore) -> None:
     assert len(scene.build(store).deformables) == MAX_STREAMS
 
 
+def test_a_deformable_that_no_stream_takes_is_refused_where_it_is_added() -> None:
+    many = np.zeros((2**18 + 1, 3), np.float32)
+    scene = SceneBuilder()
+    with pytest.raises(SceneBuildError, match="deformable 'cloth' has 262,145 vertices, at most 262,144: make it"):
+        scene.add_deformable("cloth", many, TRIANGLES)
+    scene.add_deformable("cloth", many[1:], TRIANGLES)  # the name is free
+
+
 def test_public_names() -> None:
     assert iris_session.SceneBuilder is SceneBuilder
     assert iris_session.SceneBuildError is SceneBuildError
