@@ -152,8 +152,10 @@ class SceneBuilder:
         stands still are bodies of the scene; what is movable is one. `package_dirs`: folders it may refer into.
         """
         where = path_of(path)
-        loaded = load_file(where, package_dirs)
+        if not isinstance(name, str):
+            raise SceneBuildError(f"name is {name!r}: text is expected, '' for that of the file")
         name = name or where.stem[:_MAX_NAME]
+        loaded = load_file(where, package_dirs, name)
         turn = up or loaded.up
         if turn not in ("y", "z"):
             said = f"{where.name} says that {turn} is up" if up is None else f"up is {up!r}"
@@ -224,7 +226,7 @@ class SceneBuilder:
         points = given_vertices(vertices)
         if len(points) > MAX_VERTICES:
             raise SceneBuildError(
-                f"deformable {name!r} has {len(points):,} vertices, at most {MAX_VERTICES:,}: make it coarser, or several"
+                f"deformable {name!r} has {len(points):,} vertices, at most {MAX_VERTICES:,}: make it coarser"
             )
         elements = triangles_of(triangles if edges is None else edges, len(points), 3 if edges is None else 2)
         (half,) = numbers("radius", [radius], 1, above=0.0)

@@ -26,14 +26,16 @@ _LISTED: Final = 8
 _OF_CODE: Final = (AttributeError, TypeError, NameError, AssertionError, NotImplementedError, RecursionError)
 
 
-def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = ()) -> Loaded:
-    """The geometry of a file. Raises `SceneBuildError` for one that is missing, damaged, or of another form."""
+def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name: str = "") -> Loaded:
+    """The geometry of a file. `name`: of what the file itself calls nothing, as STL, PLY and OFF do; else as the file.
+
+    Raises `SceneBuildError` for one that is missing, damaged, or of another form."""
     kind = ending(path)
     present(path)
     if kind not in (*_GLTF, *MESHES):
         raise SceneBuildError(f"{path.name}: {_other_reader(path, kind)}")
     references = References(path, package_dirs)
-    found: Loaded = guarded(path, kind, lambda: _read(path, kind, references))
+    found: Loaded = guarded(path, kind, lambda: _read(path, kind, references, name or path.stem))
     if not any(node.surfaces or node.lights or node.cameras for node in found.nodes):
         raise SceneBuildError(
             f"{path} has nothing that can be drawn" + "".join(f"; {text}" for text in found.skipped[:3])
@@ -110,11 +112,11 @@ def xacro_advice(path: Path) -> str:
     return f"xacro must be expanded first: xacro {path.name} > {stem}.urdf (ROS has it; else pip install xacro)"
 
 
-def _read(path: Path, kind: str, references: References) -> Loaded:
+def _read(path: Path, kind: str, references: References, name: str) -> Loaded:
     if kind in _GLTF:
         from iris_session.scene.gltf import read_gltf
 
         return read_gltf(path, references)
     from iris_session.scene.trimesh_files import read_with_trimesh
 
-    return read_with_trimesh(path, references)
+    return read_with_trimesh(path, references, name)

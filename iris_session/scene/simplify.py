@@ -30,8 +30,9 @@ def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | N
     """
     if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
         return None
-    points, inverse = np.unique(mesh.position.astype(np.float64), axis=0, return_inverse=True)
-    index = inverse.reshape(-1)[mesh.index].astype(np.int64)
+    first, inverse = sorted_rows(mesh.position)
+    points = mesh.position[first].astype(np.float64)
+    index = inverse[mesh.index]
     area = float(np.linalg.norm(_across(points[index]), axis=1).sum())
     cell = np.sqrt(max(area, 1e-18) / triangles)  # a cell of surface is about two triangles; `area` is twice the area
     best: tuple[Doubles, Ints, float] | None = None
@@ -48,8 +49,7 @@ def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | N
 def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
     """Points that stay, triangles between them, and the longest way that a point moved."""
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, cluster = np.unique(cells, axis=0, return_inverse=True)
-    cluster = cluster.reshape(-1)
+    _, cluster = sorted_rows(cells)
     count = np.bincount(cluster)
     mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
     off = np.linalg.norm(points - mean[cluster], axis=1)
@@ -61,10 +61,23 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
     turned_over = np.einsum("fc,fc->f", _across(points[index[whole]]), _across(points[keep][faces])) < 0
     faces[turned_over] = faces[turned_over][:, ::-1]
     turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
-    faces = np.unique(np.take_along_axis(faces, turned % 3, axis=1), axis=0) if len(faces) else faces
+    faces = np.take_along_axis(faces, turned % 3, axis=1)
+    faces = faces[sorted_rows(faces)[0]]
     used, faces = np.unique(faces, return_inverse=True)
     moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
     return points[keep[used]], faces.reshape(-1, 3), moved
+
+
+def sorted_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
+    """Of the different rows (n, 3), ordered by their columns: where each stands first; and for every row which of them
+    it is. As `np.unique` over an axis, which takes several times as long on large meshes."""
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    new = np.ones(len(rows), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    which = np.empty(len(rows), np.int64)
+    which[order] = np.cumsum(new) - 1
+    return order[new], which
 
 
 def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
@@ -76,9 +89,8 @@ def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
 def creased_normals(points: Doubles, faces: Ints) -> Doubles:
     """Normals at the corners of faces, (m, 3, 3): area-weighted, those of the face itself across a crease."""
     face_normal = _across(points[faces])
-    vertex_normal = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(vertex_normal, faces[:, k], face_normal)
+    around, each = faces.T.reshape(-1), np.tile(face_normal, (3, 1))
+    vertex_normal = np.stack([np.bincount(around, each[:, k], len(points)) for k in range(3)], axis=1)
     face_normal = unit(face_normal)
     normal = unit(vertex_normal)[faces]
     creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE

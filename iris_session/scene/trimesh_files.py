@@ -41,18 +41,20 @@ _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
 _USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 _DEFINED: Final = re.compile(rb"^[ \t]*newmtl[ \t]+(\S[^\r\n]*)", re.MULTILINE | re.IGNORECASE)
 _LIBRARIES: Final = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+#: What trimesh calls geometries that have no name in their file.
+_MADE_UP: Final = re.compile(r"geometry(_\d+)?")
 #: What an MTL file may map on a surface besides its colour; the picture of `map_ka` is that of the colour.
 _MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
 
 
-def read_with_trimesh(path: Path, references: References) -> Loaded:
-    """The file. Raises `SceneBuildError`, and whatever trimesh raises for damaged ones."""
+def read_with_trimesh(path: Path, references: References, name: str) -> Loaded:
+    """The file; `name`: of what has none in it. Raises `SceneBuildError`, and what trimesh raises for damaged ones."""
     trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
     data = _checked(path.name, kind, read_bounded(path))
     resolver = _resolver(trimesh, references)
     try:
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
-        reader = _Reader(trimesh, path.name)
+        reader = _Reader(trimesh, path.name, name)
         nodes = reader.nodes(scene)
     except IndexError:
         if kind == "obj":
@@ -98,9 +100,10 @@ def _unit(trimesh: Any, scene: Any) -> float:
 
 
 class _Reader:
-    def __init__(self, trimesh: Any, name: str) -> None:
+    def __init__(self, trimesh: Any, name: str, unnamed: str) -> None:
         self._trimesh = trimesh
         self._name = name
+        self._unnamed = unnamed
         self._looks: dict[int, Look | None] = {}
         self._pictures: dict[int, Picture] = {}
         self._budget = PixelBudget(name)
@@ -109,11 +112,12 @@ class _Reader:
     def nodes(self, scene: Any) -> tuple[Node, ...]:
         """Flat, in the order of the file's geometries: trimesh keeps no other."""
         surfaces: dict[str, Surface] = {}
+        names = self._names(list(scene.geometry))
         for name, geometry in scene.geometry.items():
             if not isinstance(geometry, self._trimesh.Trimesh):
                 self.skipped.append(f"{self._name}: {name}, which is {type(geometry).__name__} and no triangles")
             elif len(geometry.faces):
-                surfaces[name] = self._surface(geometry, cut(name))
+                surfaces[name] = self._surface(geometry, names[name])
         if sum(surface.mesh.triangles for surface in surfaces.values()) > MAX_TRIANGLES:
             raise SceneBuildError(f"{self._name} has more than {MAX_TRIANGLES:,} triangles: make it coarser")
         order = {name: place for place, name in enumerate(surfaces)}
@@ -125,8 +129,15 @@ class _Reader:
         if len(placed) > MAX_NODES:
             raise SceneBuildError(f"{self._name} has {len(placed)} parts, at most {MAX_NODES} are read")
         placed.sort(key=lambda entry: (entry[0], entry[1].tolist()))  # names of nodes may be made up by the library
-        names = list(surfaces)
-        return tuple(Node(cut(names[k]), -1, matrix, [surfaces[names[k]]]) for k, matrix in placed)
+        listed = list(surfaces.values())
+        return tuple(Node(listed[k].name, -1, matrix, [listed[k]]) for k, matrix in placed)
+
+    def _names(self, given: list[str]) -> dict[str, str]:
+        """What the geometries are called: as in the file, or, where trimesh made their names up, as the file is."""
+        made_up = [name for name in given if _MADE_UP.fullmatch(name)]
+        several = len(made_up) > 1
+        ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
+        return {name: cut(ours.get(name, name)) for name in given}
 
     def _surface(self, geometry: Any, name: str) -> Surface:
         points = np.ascontiguousarray(geometry.vertices, np.float64)

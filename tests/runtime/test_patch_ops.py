@@ -15,11 +15,9 @@ from iris_session.runtime.patch_ops import checked_ops
 NAN = float("nan")
 
 
-def ball(**changes: Any) -> Visual:
+def ball(kind: str = "sphere", **changes: Any) -> Visual:
     fields = {"T_body_visual": IDENTITY, "rgba": (1.0, 0.0, 0.0, 1.0)} | changes
-    return Visual(
-        id=9, body=0, name="ball", group=0, geometry=Geometry("sphere", (0.1, 0.1, 0.1)), material=-1, **fields
-    )
+    return Visual(id=9, body=0, name="ball", group=0, geometry=Geometry(kind, (0.1, 0.1, 0.1)), material=-1, **fields)
 
 
 def test_what_is_computed_becomes_what_is_sent() -> None:
@@ -55,6 +53,8 @@ def test_what_is_computed_becomes_what_is_sent() -> None:
         ([SetVisual(0), SetVisual(0, rgba="red")], r"operation 2, SetVisual: .*rgba"),
         ([SetVisual(0, rgba={1.0, 0.0})], r"operation 1, SetVisual: .*rgba"),
         ([SetVisual(0, rgba=(1.0, 0.0, NAN, 1.0))], r"SetVisual: numbers of rgba\[2\] must be finite"),
+        ([AddVisual(ball("teapot"))], "a geometry of kind 'teapot': there are box, capsule, .*, sphere"),
+        ([AddVisual(ball("x" * 64))], "there are box"),
         ([AddVisual(ball(T_body_visual=Pose((0.0, NAN, 0.0), IDENTITY.q)))], "AddVisual: numbers of .*finite"),
         ([SetVisual(0, rgba=(255, 0, 0, 255))], "each from 0 to 1"),
         ([AddVisual(ball(rgba=(1.0, 0.0, 0.0, 2.0)))], "each from 0 to 1"),

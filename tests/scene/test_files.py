@@ -85,6 +85,33 @@ def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
     assert again.volume == pytest.approx(unit**3 * mesh.volume, rel=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj"])
+def test_what_has_no_name_in_its_file_has_that_it_is_added_with(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"ring.{kind}"
+    bare = trimesh.exchange.export.export_mesh(trimesh.creation.box(), path, file_type=kind)
+    if kind == "obj":  # without the `o` of its exporter
+        path.write_text("".join(line for line in bare.splitlines(keepends=True) if not line.startswith("o ")))
+    scene = SceneBuilder()
+    scene.add_file(path)
+    scene.add_file(path, name="left", movable=True)
+    scene.add_file(path, name="right", movable=True)
+    spec = scene.build(AssetStore(tmp_path / "store")).spec
+    bodies = {body.id: body.name for body in spec.bodies}
+    assert [(visual.name, bodies[visual.body]) for visual in spec.visuals] == [
+        (name, name) for name in ("ring", "left", "right")
+    ]
+    assert spec.meshes[0].name == "ring"
+
+
+def test_several_without_a_name_are_numbered(tmp_path: Path) -> None:
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 {z}\nvertex 1 0 {z}\nvertex 0 1 {z}\nendloop\nendfacet\n"
+    solids = [f"solid{name}\n{facet.format(z=z)}endsolid{name}\n" for z, name in enumerate(("", " lid", ""))]
+    (tmp_path / "a.stl").write_text("".join(solids))
+    spec = built(tmp_path / "a.stl", tmp_path, name="case")[0].spec
+    assert [visual.name for visual in spec.visuals] == ["case_1", "lid", "case_2"]
+    assert [body.name for body in spec.bodies] == ["world", "case", "case_1", "lid", "case_2"]
+
+
 def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "a.stl")
     for up, size in ((None, (1, 2, 3)), ("z", (1, 2, 3)), ("y", (1, 3, 2))):

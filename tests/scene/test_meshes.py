@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from iris_session.scene import AssetError, MeshArrays, decode_mesh, encode_arrays, encode_mesh, encode_mesh_quantised
 from iris_session.scene.arrays import Stored
 from iris_session.scene.meshes import index_corners
-from iris_session.scene.simplify import simplified, smooth_mesh
+from iris_session.scene.simplify import simplified, smooth_mesh, sorted_rows
 
 
 def soup(seed: int, faces: int, *, uv: bool) -> MeshArrays:
@@ -109,3 +109,15 @@ def test_what_is_no_mesh_is_refused(arrays: list[Stored], text: str) -> None:
         del whole["normal"]
     with pytest.raises(AssetError, match=text):
         decode_mesh(encode_arrays("mesh", [Stored(name, values) for name, values in whole.items()]))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int64])
+def test_rows_are_those_of_numpy_in_their_order(kind: type) -> None:
+    rows = np.random.default_rng(5).integers(-3, 3, (2000, 3)).astype(kind)
+    first, which = sorted_rows(rows)
+    unique, place, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    np.testing.assert_array_equal(rows[first], unique)
+    np.testing.assert_array_equal(first, place)
+    np.testing.assert_array_equal(which, inverse.reshape(-1))
+    none, nowhere = sorted_rows(rows[:0])
+    assert len(none) == len(nowhere) == 0
