@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -24,6 +25,9 @@ _ROBOT: Final = ".urdf"
 #: How what is drawn too large or too small is mended: of a file as a whole, or of the meshes in a model.
 _OF_FILE: Final = "--scale {factor}"
 _OF_MESHES: Final = 'scale="{factor} {factor} {factor}" at its <mesh>'
+#: From when on it is told that something takes its time: about a second.
+_LARGE_BYTES: Final = 5_000_000
+_MANY_TRIANGLES: Final = 100_000
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:
@@ -114,6 +118,8 @@ def builder_of(path: Path, name: str, arguments: argparse.Namespace) -> SceneBui
     from iris_session.scene.compose import SceneBuilder
 
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
+    if (size := path.stat().st_size) > _LARGE_BYTES:
+        _tell(f"reading {path.name} ({size / 1e6:.1f} MB)")
     try:
         if path.suffix.lower() == _ROBOT:
             builder.add_urdf(path, package_dirs=arguments.package_dir, scale=scale)
@@ -122,7 +128,14 @@ def builder_of(path: Path, name: str, arguments: argparse.Namespace) -> SceneBui
     except SceneBuildError as error:
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
+    if builder.triangles > _MANY_TRIANGLES:
+        _tell(f"preparing meshes of {path.name} ({builder.triangles:,} triangles; the next time they are there)")
     return builder
+
+
+def _tell(text: str) -> None:
+    """What keeps people waiting, at once, and not among what is read by programs."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def unit_advice(spec: SceneSpec, extent: Extent | None, path: Path | None) -> str:

@@ -197,15 +197,22 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _showing(session: Session | ScenePublisher, path: Path) -> str:
     """What is shown, and what is likely wrong with its size."""
-    from iris_session.scene.extent import box_extent, size_text
+    from iris_session.scene import AssetStore, SceneBuildError
+    from iris_session.scene.extent import extent_of, size_text
+    from iris_session.scene.report import large_meshes
 
-    spec = session.scene
-    extent = None if spec is None else box_extent(spec)
-    if spec is None or extent is None:
-        return f"showing {path.name}, which nobody drives"
+    spec, what = session.scene, f"showing {path.name}, which nobody drives"
+    if spec is None:
+        return what
+    where = session.config.assets
+    try:
+        extent = extent_of(spec, AssetStore(None if isinstance(where, bool) else where))
+    except (OSError, SceneBuildError):  # the session tells of a store that loses its files
+        extent = None
+    if extent is not None:
+        what += f"; its extent is {size_text(extent)}"
     advice = unit_advice(spec, extent, path)
-    what = f"showing {path.name}, which nobody drives; its extent is {size_text(extent)}"
-    return f"{what}\nsize: {advice}" if advice else what
+    return "\n".join((what, *([f"size: {advice}"] if advice else []), *large_meshes(spec)))
 
 
 def _serve(

@@ -74,6 +74,11 @@ class SceneBuilder:
         self.environment: Environment | None = None
         self._world = World(cut(name))
 
+    @property
+    def triangles(self) -> int:
+        """Of all meshes that were added: preparing them takes some seconds for each million, once."""
+        return sum(item.mesh.triangles for item in self._world.items if item.mesh is not None)
+
     # --- shapes -------------------------------------------------------------------------------------------------------
 
     @takes(Options)

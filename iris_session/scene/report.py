@@ -18,6 +18,8 @@ from iris_session.scene.totals import texture_memory, triangles
 
 #: How many heavy things are listed.
 HEAVIEST: Final = 8
+#: A mesh of more triangles is better simplified before it is shared: a third of what a Quest 3 draws of all.
+LARGE_MESH: Final = 250_000
 _MIB: Final = 1 << 20
 
 
@@ -76,6 +78,16 @@ def report(
         },
         skipped=skipped,
         simplified=simplified(spec),
+    )
+
+
+def large_meshes(spec: SceneSpec) -> tuple[str, ...]:
+    """Advice on meshes that are better simplified before they are shared; a line each."""
+    return tuple(
+        f"mesh {mesh.name} has {mesh.levels[0].triangles:,} triangles: over {LARGE_MESH:,}, simplify it in a program "
+        "for meshes (Blender: Decimate), or it takes long to prepare and to fetch"
+        for mesh in spec.meshes
+        if mesh.levels and mesh.levels[0].triangles > LARGE_MESH
     )
 
 
@@ -153,6 +165,7 @@ def _textures(spec: SceneSpec) -> Iterator[Heavy]:
 
 def _struggles(spec: SceneSpec, choice: Choice) -> Iterator[str]:
     totals = spec.totals
+    yield from large_meshes(spec)
     if totals.objects > QUEST_3.objects:
         yield (
             f"{totals.objects} objects, about {QUEST_3.objects} is what a Quest 3 draws: join static shapes into one "

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from pathlib import Path
 
 import pytest
+import trimesh
 
+from iris_session.cli import scene_files
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
 from iris_session.cli.scene_files import file_of
+from iris_session.scene import report
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -152,3 +157,44 @@ def test_a_file_that_cannot_be_read_is_one_line(
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
+
+
+def test_serve_and_inspect_tell_one_extent(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A ball on a node that is turned is as large as before; the box around it is not."""
+    ball = trimesh.Scene()
+    turned = trimesh.transformations.rotation_matrix(math.radians(45), (1, 1, 0))
+    ball.add_geometry(trimesh.creation.icosphere(radius=0.5), transform=turned)
+    path = tmp_path / "ball.glb"
+    ball.export(path)
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    served = re.search(r"extent is (.+) m$", capfd.readouterr().out, re.MULTILINE)
+    assert main(["scene", "inspect", str(path)]) == 0
+    inspected = re.search(r"extent: (.+) m along", capfd.readouterr().out)
+    assert served
+    assert inspected
+    assert served[1] == inspected[1]
+    assert max(map(float, served[1].split(" x "))) < 1.05
+
+
+def test_what_takes_long_is_told_before(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_files, "_LARGE_BYTES", 1000)
+    monkeypatch.setattr(scene_files, "_MANY_TRIANGLES", 1000)
+    monkeypatch.setattr(report, "LARGE_MESH", 1000)
+    path = tmp_path / "scan.stl"
+    trimesh.creation.icosphere(subdivisions=3).export(path)
+    assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
+    out, errors = capfd.readouterr()
+    assert errors.splitlines()[:2] == [
+        "reading scan.stl (0.1 MB)",
+        "preparing meshes of scan.stl (1,280 triangles; the next time they are there)",
+    ]
+    advice = "mesh scan has 1,280 triangles: over 1,000, simplify it"
+    assert advice in out
+    assert main(["scene", "inspect", str(path)]) == 0
+    assert f"headset: {advice}" in capfd.readouterr().out
+    small = tmp_path / "small.off"
+    small.write_text(TRIANGLE)
+    assert main(["scene", "inspect", str(small)]) == 0
+    assert capfd.readouterr().err == ""
