@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
 from iris_session.protocol.status import AssetsReport
-from iris_session.transport.asset_server import AssetServer, Table
+from iris_session.transport.asset_server import AssetServer, Store, Table
 from iris_session.transport.clients import ClientTable, Connection
 from iris_session.transport.config import MILLISECOND, SceneInfo
 from iris_session.transport.keyring import Keyring
@@ -20,10 +21,15 @@ LATE_NS: Final = 2 * MILLISECOND
 LATE_TURN_NS: Final = 25 * MILLISECOND
 #: How long assets hold back then.
 YIELD_NS: Final = 20 * MILLISECOND
+#: Specifications of scenes before those two are served for so long after they were replaced, so that whoever hears of
+#: them over a slow network gets one, however often the scene is patched; and so many of them.
+REPLACED_NS: Final = 5_000 * MILLISECOND
+MAX_REPLACED: Final = 64
 
 
 class AssetDesk:
-    """A `Service`. What the publisher's scene and the one before it name is served. `revoked(key)`: may do nothing."""
+    """A `Service`. Served is what the publisher's scene and the one before it name, and specifications that were
+    replaced lately. `revoked(key)`: may do nothing."""
 
     def __init__(
         self,
@@ -40,8 +46,10 @@ class AssetDesk:
         self._drops = drops
         self._publisher = publisher
         self._revoked = revoked
+        self._before: SceneInfo | None = None
         self._present: SceneInfo | None = None
-        self._stores: tuple[tuple[str, tuple[str, ...]], ...] = ()
+        self._stores: tuple[Store, ...] = ()  # the present one is the last
+        self._replaced: deque[tuple[int, Store]] = deque(maxlen=MAX_REPLACED)  # until when
         self._told = Table()
         self._counted: dict[str, int] = {}
         self._next_ns = self._turned_ns = self._frames = 0
@@ -50,10 +58,12 @@ class AssetDesk:
     def turn(self, now_ns: int) -> None:
         """Lets in who came and out who left, at once; gives the state its way."""
         self._give_way(now_ns)
-        self.look(keys=now_ns >= self._next_ns)
-        if now_ns >= self._next_ns:
+        due = now_ns >= self._next_ns
+        if due:
             self._next_ns = now_ns + LOOK_NS
+            self._forget(now_ns)
             self._count()
+        self.look(keys=due)
 
     def look(self, *, keys: bool = False) -> None:
         """Tells the thread who is there, and which scene. `keys`: also when only the allow-list may have changed."""
@@ -87,10 +97,24 @@ class AssetDesk:
             self._server.late_until_ns = now_ns + YIELD_NS
 
     def _change(self, scene: SceneInfo) -> None:
-        """Another scene: what only the one before the last named is served no more."""
-        before = self._stores[-1:] if self._present is not None else ()
-        self._present = scene
-        self._stores = (*before, (scene.asset_root, scene.assets))
+        """Another scene: what only the one before the last named is served no more, but for its specification."""
+        before, present = self._before, self._present
+        if before is not None and before.scene_hash in before.assets:
+            self._replaced.append((self._turned_ns + REPLACED_NS, (before.asset_root, (before.scene_hash,))))
+        self._before, self._present = present, scene
+        self._serve()
+
+    def _forget(self, now_ns: int) -> None:
+        """Specifications that were replaced long enough ago."""
+        n = len(self._replaced)
+        while self._replaced and self._replaced[0][0] < now_ns:
+            self._replaced.popleft()
+        if len(self._replaced) < n:
+            self._serve()
+
+    def _serve(self) -> None:
+        named = [(one.asset_root, one.assets) for one in (self._before, self._present) if one is not None]
+        self._stores = (*(store for _, store in self._replaced), *named)
 
     def _tell(self, listeners: dict[int, str]) -> None:
         keyring = self._keyring

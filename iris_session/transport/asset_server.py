@@ -44,13 +44,17 @@ _MORE: Final = int(zmq.DONTWAIT | zmq.SNDMORE)
 REQUEST_BYTES: Final = 65_536
 
 
+#: A folder, with the addresses of what is served from it.
+Store = tuple[str, tuple[str, ...]]
+
+
 class Table(NamedTuple):
     """What the thread has to know, replaced as a whole. `listeners`: connections that may ask, with the key by which
-    they come (empty without encryption); `marks`: keys that may connect; `stores`: folders, with what is served."""
+    they come (empty without encryption); `marks`: keys that may connect; `stores`: what is served."""
 
     listeners: Mapping[int, str] = {}
     marks: frozenset[str] = frozenset()
-    stores: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    stores: tuple[Store, ...] = ()
 
 
 class Tallied(NamedTuple):
@@ -113,7 +117,7 @@ class AssetServer:
         self._thread.start()
 
     def publish(self, table: Table) -> None:
-        """Who may ask for what, from the next look on."""
+        """Who may ask for what: whoever hears of it after this call, and asks then, is answered by it."""
         self._table = table
 
     def tallied(self) -> Tallied:
@@ -207,6 +211,7 @@ class AssetServer:
             if not readable(self._socket):
                 return
             route = self._socket.recv(_DONTWAIT)
+            self._look_at_table()  # a scene that was told of since the last look may be what is asked for
             frame = self._socket.recv(_DONTWAIT, copy=False)
             lengths = [len(frame)]
             more = frame.more

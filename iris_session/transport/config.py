@@ -65,7 +65,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     used until the first state frame. `tick_period_ns`: simulated time of one tick.
 
     `asset_root`: folder of a store (`ROOT/ab/abcd...`) that holds the `assets`, by address, which clients may fetch as
-    long as this scene or the next one is the present one; empty for none.
+    long as this scene or the next one is the present one, and the specification for moments more; empty for none.
     """
 
     scene_hash: str

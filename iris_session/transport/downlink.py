@@ -36,6 +36,7 @@ class Downlink:
 
     `heard_ns`: session time of the last word of the authority, 0 before its first. `acknowledged`: batches taken by
     it since the start. `report`: the newest status report of the authority, encoded. `ended`: the session is over.
+    `on_scene`: called with another scene before anybody hears of it.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Downlink:
         forget: Callable[[Connection, str], None],
         revocation: Revocation,
         anchoring: Anchoring,
+        on_scene: Callable[[], None],
     ) -> None:
         self._socket = socket
         self._clients = clients
@@ -61,6 +63,7 @@ class Downlink:
         self._forget = forget
         self._revocation = revocation
         self._anchoring = anchoring
+        self._on_scene = on_scene
         self.heard_ns = 0
         self.acknowledged = 0
         self.report = b""
@@ -105,6 +108,7 @@ class Downlink:
             self._publisher.publish_presence(self.heard_ns, frames[1])
         elif kind == link.SCENE:
             self._publisher.set_scene(link.decode_scene(frames[1]))
+            self._on_scene()
         elif kind == link.REPORT:
             self.report = frames[1]
         elif kind == link.END:

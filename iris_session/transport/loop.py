@@ -159,6 +159,7 @@ class Front:
             departures.forget,
             revocation,
             anchoring,
+            self._assets.look,
         )
         self.ended = ""
         #: The link closed without a word: its process ends, or has ended already.

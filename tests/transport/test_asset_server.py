@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import psutil
 import pytest
 import zmq
@@ -19,7 +20,9 @@ from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUES
 from iris_session.protocol.client_messages import Heartbeat
 from iris_session.protocol.codec import encode_asset_request
 from iris_session.protocol.names import AssetRefusal
+from iris_session.protocol.server_messages import Event, SceneChanged
 from iris_session.protocol.status import GetStatus, StatusReport
+from iris_session.protocol.steps import Decision
 from iris_session.system.priority import NICER
 from iris_session.transport import FrontConfig, FrontLimits
 from iris_session.transport.asset_files import AssetFiles
@@ -146,6 +149,22 @@ def test_the_scene_before_is_served_and_the_one_before_that_is_not(shop: Shop) -
     once(third, b"third")
     assert ann.answer(ann.ask(second)) == b"second"
     assert ann.answer(ann.ask(shop.addresses[1])) == AssetRefusal.UNKNOWN
+
+
+def test_who_hears_of_a_scene_is_served_it_and_those_that_were_replaced_lately(shop: Shop) -> None:
+    client = shop.joined()
+    ann = shop.welcome(shop.fetcher(client))
+    looks = []
+    for number in range(1, 21):
+        looks.append(put(shop.root, b"look %d" % number))
+        info = with_assets(shop.root, looks[-1], shop.addresses[1])
+        shop.session.process.set_scene(msgspec.structs.replace(info, scene_hash=looks[-1]))
+        event = Event(number, number, 0, SceneChanged(1, number, "patch", looks[-1]))
+        shop.session.once(Decision((), events=(event,)))
+        client.wait_for(Event, number)
+        assert ann.answer(ann.ask(looks[-1])) == b"look %d" % number
+    assert ann.answer(ann.ask(looks[-5])) == b"look 16"
+    assert ann.answer(ann.ask(shop.addresses[0])) == AssetRefusal.UNKNOWN
 
 
 def test_who_does_not_read_delays_nobody_and_gets_it_later(shop: Shop) -> None:

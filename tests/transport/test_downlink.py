@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, StateHeader
+from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
 from iris_session.transport import link_messages as link
 from iris_session.transport.anchoring import Anchoring
 from iris_session.transport.clients import ClientTable
@@ -28,6 +28,7 @@ class Far:
         near = context.socket(zmq.PAIR)
         near.connect("inproc://link")
         self.published: list[tuple[bytes, ...]] = []
+        self.heard_of: list[str] = []  # scenes
         self.drops = Drops()
         self.publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
         unused = None
@@ -42,6 +43,7 @@ class Far:
             lambda connection: None,
             unused,  # type: ignore[arg-type]
             Anchoring(FrontConfig(), ClientTable(), lambda entry: True, self.drops),
+            lambda: self.heard_of.append(self.publisher.scene.scene_hash),
         )
 
     def send_multipart(self, frames: tuple[bytes, ...]) -> None:
@@ -99,6 +101,16 @@ def test_a_state_of_the_next_scene_waits_for_it(far: Far) -> None:
     assert far.publisher.scene.scene_hash == "scene2"
     assert [h.tick for h in far.headers()] == [2]
     assert "state_of_other_scene" not in far.drops.by_reason
+
+
+def test_another_scene_is_told_of_inside_before_anybody_outside_hears(far: Far) -> None:
+    far.downlink.broadcast = lambda event: far.heard_of.append(event.body.scene_hash)  # type: ignore[method-assign, union-attr]
+    far.scene(1)
+    event = Event(1, 1, 0, SceneChanged(1, 1, "patch", "to everybody"))
+    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    far.scene(2)
+    far.downlink.drain()
+    assert far.heard_of == ["scene1", "to everybody", "scene2"]
 
 
 def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(far: Far) -> None:

@@ -1,0 +1,95 @@
+"""What the thread of assets is told to serve: two scenes, and for a while the specifications before them."""
+
+from __future__ import annotations
+
+import zmq
+
+from iris_session.transport.asset_desk import LOOK_NS, MAX_REPLACED, REPLACED_NS, AssetDesk
+from iris_session.transport.asset_server import Table, Tallied
+from iris_session.transport.clients import ClientTable
+from iris_session.transport.config import SceneInfo
+from iris_session.transport.keyring import Keyring
+from iris_session.transport.limiter import Drops
+from iris_session.transport.state_publisher import StatePublisher
+
+ROOT = "/store"
+
+
+class Told:
+    """In place of the thread: keeps what it is told, at the time that it is."""
+
+    def __init__(self) -> None:
+        self.table = Table()
+        self.late_until_ns = 0
+
+    def start(self) -> None: ...
+
+    def publish(self, table: Table) -> None:
+        self.table = table
+
+    def tallied(self) -> Tallied:
+        return Tallied(0, 0, 0, 0, {})
+
+    @property
+    def served(self) -> set[str]:
+        return {address for root, addresses in self.table.stores for address in addresses if root == ROOT}
+
+
+class Desk:
+    def __init__(self) -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self.publisher = StatePublisher(context.socket(zmq.PUB), look(0), lambda: 0)
+        self.publisher.use_socket(None)
+        self.told, drops = Told(), Drops()
+        self.desk = AssetDesk(
+            self.told,  # type: ignore[arg-type]
+            ClientTable(),
+            Keyring(),
+            drops,
+            self.publisher,
+            lambda key: False,
+        )
+
+    def show(self, info: SceneInfo) -> set[str]:
+        self.publisher.set_scene(info)
+        self.desk.look()
+        return self.told.served
+
+
+def look(number: int) -> SceneInfo:
+    return SceneInfo(f"look{number}", asset_root=ROOT, assets=(f"look{number}", f"mesh{number}"))
+
+
+def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_their_specification() -> None:
+    desk = Desk()
+    assert desk.show(look(0)) == {"look0", "mesh0"}
+    assert desk.show(look(1)) == {"look0", "mesh0", "look1", "mesh1"}
+    assert desk.show(look(2)) == {"look0", "look1", "mesh1", "look2", "mesh2"}
+    assert desk.desk.report().served == 2
+    plain = SceneInfo("a model")
+    desk.show(plain)
+    desk.show(look(3))
+    assert desk.show(look(4)) == {"look0", "look1", "look2", "look3", "mesh3", "look4", "mesh4"}, "it offers nothing"
+
+
+def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
+    desk = Desk()
+    desk.desk.turn(0)
+    for number in range(3):
+        desk.show(look(number))
+    desk.desk.turn(REPLACED_NS)
+    assert "look0" in desk.told.served
+    desk.show(look(3))
+    desk.desk.turn(REPLACED_NS + LOOK_NS)
+    assert desk.told.served >= {"look1", "look2", "look3"}
+    assert "look0" not in desk.told.served
+    desk.desk.turn(2 * REPLACED_NS + LOOK_NS)
+    assert desk.told.served == {"look2", "mesh2", "look3", "mesh3"}
+
+
+def test_they_are_so_many_at_most() -> None:
+    desk = Desk()
+    n = MAX_REPLACED + 10
+    for number in range(n):
+        served = desk.show(look(number))
+    assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
