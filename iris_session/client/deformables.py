@@ -9,6 +9,7 @@ while True:
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Final
 
@@ -29,8 +30,9 @@ from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
 
-#: A scene whose assets did not come is tried again after so many calls of `tend`: who polls has the clock.
-RETRY_CALLS: Final = 500
+#: A scene whose assets did not come is asked for again after so long [s], then after twice that, at most the second.
+FIRST_PAUSE_S: Final = 0.02
+LONGEST_PAUSE_S: Final = 2.5
 #: Largest asset of a deformable in memory, about twice what the largest mesh has: it is read where the client polls.
 MAX_ASSET_BYTES: Final = 128 << 20
 
@@ -43,7 +45,7 @@ class _Mesh:
     def __init__(self, key: str, spec: Deformable, asset: memoryview) -> None:
         arrays = decode_arrays(asset, ArrayKind.DEFORMABLE, MAX_ASSET_BYTES)
         topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
-        self.key, self.stream = key, spec.stream
+        self.key, self.stream, self.address = key, spec.stream, spec.address
         self.decoder = DeformableDecoder(topology)
         self.numbers = arrays.get("vertex")
         if self.numbers is not None:
@@ -51,6 +53,7 @@ class _Mesh:
             if int(self.numbers.max(initial=0)) >= MAX_VERTICES:
                 raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
         self.seq = -1
+        self.fault = ""
 
     def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
         """By number in the model; what is inside of a solid is not a number."""
@@ -66,80 +69,143 @@ class Deformables:
     name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at which they were there,
     by the same names. What is at rest comes once a second: older than that is not known, but what was there then.
 
-    `scene_hash`: of the scene they are of. `fault`: why nothing can be seen of it, empty while all is well. Everything
-    happens in `tend`, which never waits.
+    `scene_hash`: of the scene they are of. After a patch they go on as they are until the new specification is here,
+    and what is the same in both goes on after it. `fault`: why something cannot be seen, empty while all is well.
+    Everything happens in `tend`, which never waits.
     """
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self.scene_hash = ""
-        self.fault = ""
         self.vertices: dict[str, NDArray[np.float32]] = {}
         self.capture_ns: dict[str, int] = {}
         self._meshes: list[_Mesh] = []
-        self._parts: tuple[Deformable, ...] = ()
+        self._epoch = -1
+        self._parked = False  # the meshes are of a scene that is no more: their vertices are not shown
+        self._asked = ""  # the scene whose specification is on its way, or did not come
+        self._parts: tuple[Deformable, ...] | None = None  # of that
         self._fetch: AssetFetch | None = None
-        self._retry_in = 0
+        self._fault = ""
+        self._pause_s = self._retry_s = 0.0
+
+    @property
+    def fault(self) -> str:
+        return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
     def tend(self) -> list[str]:
         """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
-        scene_hash = self._client.mirror.scene_hash
-        self._retry_in = max(0, self._retry_in - 1)
-        if self._client.ready and (scene_hash != self.scene_hash or (self.fault and not self._retry_in)):
-            self._begin(scene_hash)
+        if not self._client.mirror.synced:  # it may have heard of another scene, and not yet of which
+            return []
+        if self._client.ready:
+            self._follow(self._client.mirror.scene_hash, self._client.mirror.scene_epoch)
         if self._fetch is not None and self._fetch.done:
             self._take(self._fetch)
-        return [mesh.key for mesh in self._meshes if self._show(mesh)]
+        return [] if self._parked else [mesh.key for mesh in self._meshes if self._show(mesh)]
 
-    def _begin(self, scene_hash: str) -> None:
-        self._drop()
-        self.scene_hash, self.fault, self._retry_in = scene_hash, "", RETRY_CALLS
-        if is_address(scene_hash):
-            self._fetch = self._client.fetch_assets([scene_hash])
+    def _follow(self, scene_hash: str, epoch: int) -> None:
+        begun_anew, self._epoch = epoch != self._epoch, epoch
+        if scene_hash == self.scene_hash:  # also after a reset, or when a patch was taken back
+            if self._asked != scene_hash:
+                self._cancel()
+                self._asked, self._fault = scene_hash, ""
+            self._parked = False
+            return
+        if begun_anew:  # what waits is of another scene, and so is what was shown
+            self._cancel()
+            self._parked = True
+            self.vertices.clear()
+            self.capture_ns.clear()
+        if self._fetch is not None:  # it has most of what a later look has: patches may come faster than assets
+            return
+        if scene_hash != self._asked:
+            self._asked, self._pause_s = scene_hash, FIRST_PAUSE_S / 2.0
+        elif time.monotonic() < self._retry_s:
+            return
+        self._begin()
+
+    def _begin(self) -> None:
+        if is_address(self._asked):
+            self._fetch = self._client.fetch_assets([self._asked])
         else:
-            self.fault = "this session shares no specification of its scene"
+            self._use([], self._asked)
+            self._fault = "this session shares no specification of its scene"
 
-    def _drop(self) -> None:
+    def _cancel(self) -> None:
         if self._fetch is not None:
             self._client.cancel_assets(self._fetch)
-        for mesh in self._meshes:
-            self._client.drop_media(mesh.stream)
-        self._meshes, self._parts, self._fetch = [], (), None
-        self.vertices.clear()
-        self.capture_ns.clear()
+        self._fetch = self._parts = None
 
     def _take(self, fetch: AssetFetch) -> None:
-        """The specification, then the meshes that it names."""
+        """The specification, then the meshes that it names and that are not here."""
         self._fetch = None
         try:
             fetch.check()
-            if not self._parts:
-                self._parts = decode_scene(fetch.view(self.scene_hash)).deformables
-                if self._parts:
-                    self._fetch = self._client.fetch_assets([part.address for part in self._parts])
-            else:
-                for key, part in zip(keys(self._parts), self._parts, strict=True):
-                    mesh = _Mesh(key, part, fetch.view(part.address))
-                    mesh.feed = self._client.media(part.stream)
-                    self._meshes.append(mesh)
+            if self._parts is None:
+                self._parts = decode_scene(fetch.view(self._asked)).deformables
+                here = {_identity(mesh.key, mesh) for mesh in self._meshes}
+                named = zip(keys(self._parts), self._parts, strict=True)
+                if new := [part.address for key, part in named if _identity(key, part) not in here]:
+                    self._fetch = self._client.fetch_assets(new)
+                    return
+            self._use(self._made(self._parts, fetch), self._asked)
         except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
-            self._drop()
-            self.fault = str(error)
+            self._failed(error)
+        self._parts = None
+
+    def _made(self, parts: Sequence[Deformable], fetch: AssetFetch) -> list[_Mesh]:
+        """The meshes of a scene: of those that are here already, the very same."""
+        here = {_identity(mesh.key, mesh): mesh for mesh in self._meshes}
+        found = []
+        for key, part in zip(keys(parts), parts, strict=True):
+            mesh = here.get(_identity(key, part))
+            found.append(_Mesh(key, part, fetch.view(part.address)) if mesh is None else mesh)
+        return found
+
+    def _use(self, meshes: list[_Mesh], scene_hash: str) -> None:
+        """Shows these and no others from now on."""
+        kept = [mesh for mesh in self._meshes if mesh in meshes]
+        gone = [mesh for mesh in self._meshes if mesh not in meshes]
+        for stream in {mesh.stream for mesh in gone} - {mesh.stream for mesh in kept}:
+            self._client.drop_media(stream)
+        for mesh in gone:
+            self.vertices.pop(mesh.key, None)
+            self.capture_ns.pop(mesh.key, None)
+        for mesh in meshes:
+            if mesh not in kept:
+                mesh.feed = self._client.media(mesh.stream)
+        self._meshes, self.scene_hash = meshes, scene_hash
+        self._parked, self._fault = False, ""
+
+    def _failed(self, error: Exception) -> None:
+        """What is shown goes on, unless it is of another scene."""
+        if self._client.mirror.scene_hash != self._asked:  # the newest is asked for at the next call
+            return
+        if self._parked:
+            self._use([], "")
+        self._fault = str(error)
+        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._retry_s = time.monotonic() + self._pause_s
 
     def _show(self, mesh: _Mesh) -> bool:
         frame = mesh.feed.newest
         if frame is None or frame.header.seq == mesh.seq or frame.header.encoding != MediaEncoding.DEFORMABLE:
             return False
-        mesh.seq = frame.header.seq
-        if frame.header.scene_epoch != self._client.mirror.scene_epoch:
+        if frame.header.scene_epoch != self._client.mirror.scene_epoch:  # or events tell of its scene in a moment
             return False
+        mesh.seq = frame.header.seq
         try:
             self.vertices[mesh.key] = mesh.placed(mesh.decoder.decode(frame.data))
         except StreamError as error:
-            self.fault = str(error)
+            mesh.fault = str(error)
             return False
         self.capture_ns[mesh.key] = frame.header.capture_ns
+        mesh.fault = ""
         return True
+
+
+def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
+    """What is equal for the same deformable in two specifications."""
+    return key, part.stream, part.address
 
 
 def keys(parts: Sequence[Deformable]) -> list[str]:

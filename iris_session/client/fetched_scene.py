@@ -18,6 +18,7 @@ from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.errors import AssetError, ClientError, NotConnectedError
 from iris_session.protocol.assets import is_address
+from iris_session.protocol.names import AssetRefusal
 from iris_session.protocol.scene import SceneError, SceneSpec, decode_scene
 from iris_session.scene import MeshArrays, decode_image, decode_mesh
 from iris_session.scene.budget import Budget, choose_levels
@@ -27,6 +28,10 @@ from iris_session.scene.images import Pixels
 EVERYTHING: Final = Budget()
 #: How long a slow network may take [s].
 DEFAULT_TIMEOUT_S: Final = 60.0
+#: How long a session may say that it has not the specification that it names, and the first pause before it is asked
+#: again [s]; each is twice the one before.
+REFUSED_S: Final = 2.0
+FIRST_PAUSE_S: Final = 0.01
 
 
 @dataclass(frozen=True)
@@ -53,26 +58,62 @@ def fetch_scene(
 ) -> FetchedScene:
     """Fetches the present scene and waits for it; what the cache of this machine has does not travel.
 
-    A scene that is replaced meanwhile is left for the new one. After `scene_changed`, call it again when
-    `client.mirror.scene_hash` is another. Raises `NotConnectedError` when it takes longer than `timeout_s`, or the
-    session shares no specification; `ClientError` for one that this package does not read.
+    A scene that is replaced meanwhile is left for the new one, of which only what is new comes. After `scene_changed`,
+    call it again when `client.mirror.scene_hash` is another. Raises `NotConnectedError` when it takes longer than
+    `timeout_s`, or the session shares no specification; `AssetError` for a specification that the session says for
+    `REFUSED_S` not to have; `ClientError` for one that this package does not read.
     """
     until = time.monotonic() + timeout_s
+    refused = _Refused()
+    made: Mapping[str, MeshArrays | Pixels] = {}
     while True:
         scene_hash = client.mirror.scene_hash
         try:
-            scene = _fetch(client, scene_hash, budget, until, on_progress)
-        except ClientError:
-            if client.mirror.scene_hash == scene_hash or time.monotonic() >= until:
+            scene, made = _fetch(client, scene_hash, budget, until, on_progress, made)
+        except ClientError as error:
+            now = time.monotonic()
+            replaced = client.mirror.scene_hash != scene_hash
+            if now >= until or not (replaced or refused.again(error, scene_hash, now)):
                 raise
-            continue  # another scene took its place
+            if not replaced:
+                client.wait_for(_named_another(scene_hash), min(refused.pause_s, until - now))
+            continue
         if client.mirror.scene_hash == scene_hash:
             return scene
 
 
+class _Refused:
+    """Refusals of one specification: a session may name it moments before it serves it. `pause_s`: until it is asked
+    for again."""
+
+    def __init__(self) -> None:
+        self.pause_s = 0.0
+        self._scene_hash = ""
+        self._until = 0.0
+
+    def again(self, error: ClientError, scene_hash: str, now: float) -> bool:
+        """Whether to ask again, after one more."""
+        if not isinstance(error, AssetError) or error.reason != AssetRefusal.UNKNOWN:
+            return False
+        if scene_hash != self._scene_hash:
+            self._scene_hash, self._until, self.pause_s = scene_hash, now + REFUSED_S, FIRST_PAUSE_S / 2
+        self.pause_s *= 2
+        return now < self._until
+
+
+def _named_another(scene_hash: str) -> Callable[[Client], bool]:
+    return lambda client: client.mirror.scene_hash != scene_hash
+
+
 def _fetch(
-    client: Client, scene_hash: str, budget: Budget, until: float, on_progress: Callable[[AssetFetch], None] | None
-) -> FetchedScene:
+    client: Client,
+    scene_hash: str,
+    budget: Budget,
+    until: float,
+    on_progress: Callable[[AssetFetch], None] | None,
+    before: Mapping[str, MeshArrays | Pixels],
+) -> tuple[FetchedScene, Mapping[str, MeshArrays | Pixels]]:
+    """The scene, and all that it is made of, by address. `before`: what is decoded already."""
     spec = _specification(client, scene_hash, until)
     choice = choose_levels(spec, budget)
     meshes = [mesh.levels[level] for mesh, level in zip(spec.meshes, choice.mesh_levels, strict=True)]
@@ -84,9 +125,10 @@ def _fetch(
         return decoders[address](data)  # type: ignore[no-any-return]
 
     sizes = {one.address: one.bytes for one in meshes} | {one.address: one.bytes for one in textures}
-    fetch = _wait(client, client.fetch_assets(sizes, on_progress, decode), until)
-    made = fetch.decoded
-    return FetchedScene(
+    missing = {address: size for address, size in sizes.items() if address not in before}
+    fetch = _wait(client, client.fetch_assets(missing, on_progress, decode), until)
+    made = {address: before[address] for address in sizes if address in before} | fetch.decoded
+    scene = FetchedScene(
         scene_hash,
         spec,
         {i: made[one.address] for i, one in enumerate(meshes) if one.address in made},
@@ -94,6 +136,7 @@ def _fetch(
         choice.hidden,
         dict(fetch.failed),
     )
+    return scene, made
 
 
 def _specification(client: Client, scene_hash: str, until: float) -> SceneSpec:

@@ -15,7 +15,7 @@ import numpy as np
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.protocol.client_messages import Control, Sample
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.entries import HOST, Entry, Lost
+from iris_session.protocol.entries import HOST, Entry, Lost, SceneLoaded, ScenePatched
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo, StateHeader
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import FixedView
@@ -23,6 +23,7 @@ from iris_session.transport import FrontConfig, FrontProcess, SceneInfo
 
 ROBOTS = ("left", "right")
 BODIES = ("left/hand", "right/hand", "hammer")
+OBJECTS = (ObjectSpec("hammer", "hammer"),)
 PERIOD_S = 0.004
 T_BODY_SITE = Pose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0))
 
@@ -54,8 +55,8 @@ class LiveSession:
         self.front = FrontProcess(FrontConfig(**settings), shown)  # type: ignore[arg-type]
         ports = self.front.start()
         self.address = f"127.0.0.1:{ports.control}"
-        specs = [RobotSpec(name, ("j1",), ("a1",), f"{name}/tip", name) for name in ROBOTS]
-        self.authority = Authority(authority or AuthorityConfig(), specs, [ObjectSpec("hammer", "hammer")])
+        self.specs = tuple(RobotSpec(name, ("j1",), ("a1",), f"{name}/tip", name) for name in ROBOTS)
+        self.authority = Authority(authority or AuthorityConfig(), self.specs, OBJECTS)
         self.view = FixedView(
             tips=dict.fromkeys(ROBOTS, IDENTITY), q=dict.fromkeys(ROBOTS, (0.0,)), objects={"hammer": IDENTITY}
         )
@@ -63,6 +64,8 @@ class LiveSession:
         self.commands: dict[str, str] = {}
         self.poses = np.zeros((len(BODIES), 7))
         self._inject: deque[Entry] = deque()  # other threads append
+        self._shown = shown
+        self._shows: deque[tuple[SceneInfo, str]] = deque()  # other threads append
         self._scene_epoch = 1
         self._paused = threading.Event()
         self._stop = threading.Event()
@@ -81,6 +84,11 @@ class LiveSession:
         """An entry of the front about the first participant who sent a sample."""
         joined = next(entry for entry in self.entries if isinstance(entry.message, Sample))
         self._inject.append(Entry(joined.connection, joined.connection, self.now_ns, message))  # type: ignore[arg-type]
+
+    def show(self, scene_hash: str, assets: tuple[str, ...], cause: str = "patch") -> None:
+        """Another look of the scene, or (`new_scene`) another one, or (empty) what is served of the present one."""
+        self._shown = msgspec.structs.replace(self._shown, scene_hash=scene_hash, assets=assets)
+        self._shows.append((self._shown, cause))
 
     def reset(self) -> None:
         self.host(Control(0, "reset"))
@@ -106,6 +114,13 @@ class LiveSession:
                 continue
             if not self.front.alive:
                 self.front.restart()
+            while self._shows:
+                shown, cause = self._shows.popleft()
+                self.front.set_scene(shown)
+                if cause == "patch":
+                    self.host(ScenePatched((), shown.scene_hash))
+                elif cause:
+                    self.host(SceneLoaded(shown.scene_hash, self.specs, OBJECTS))
             inject = [self._inject.popleft() for _ in range(len(self._inject))]
             entries = [*inject, *self.front.link.poll()]
             self.entries += entries

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -33,11 +33,20 @@ class Shared:
         self.spec = parse_mujoco(flexes(), self.store).spec
 
     def begin(self, parts: list[Deformable]) -> LiveSession:
-        spec: SceneSpec = msgspec.structs.replace(self.spec, deformables=tuple(parts))
+        address, assets = self.of(parts)
+        return LiveSession(asset_root=str(self.store.root), assets=assets, scene_hash=address)
+
+    def of(self, parts: Iterable[Deformable], name: str = "scene") -> tuple[str, tuple[str, ...]]:
+        """Address of a specification with these, and all that it needs."""
+        spec: SceneSpec = msgspec.structs.replace(self.spec, deformables=tuple(parts), name=name)
         address = self.store.put(encode_scene(spec))
-        return LiveSession(
-            asset_root=str(self.store.root), assets=(address, *asset_addresses(spec)), scene_hash=address
-        )
+        return address, (address, *asset_addresses(spec))
+
+    def rest(self, part: Deformable) -> tuple[DeformableEncoder, np.ndarray]:
+        """Encoder of one, and its vertices at rest."""
+        arrays = decode_arrays(self.store.get(part.address), ArrayKind.DEFORMABLE)
+        topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
+        return DeformableEncoder(topology, 0.0005), arrays["position"].astype(np.float64)
 
 
 @pytest.fixture
@@ -66,11 +75,7 @@ def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: 
     live = shared.begin(parts)
     try:
         client, shapes = watch(live, joined, tmp_path / "cache")
-        rests = {}
-        for part in parts:
-            arrays = decode_arrays(shared.store.get(part.address), ArrayKind.DEFORMABLE)
-            encoder = DeformableEncoder(DeformableTopology.from_bytes(arrays["plan"].tobytes()), 0.0005)
-            rests[part.stream] = encoder, arrays["position"].astype(np.float64)
+        rests = {part.stream: shared.rest(part) for part in parts}
 
         def told(_: Client) -> bool:
             for stream, (encoder, rest) in rests.items():
@@ -87,6 +92,133 @@ def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: 
         assert [len(shapes.vertices[f"flex-{i}"]) for i in range(3)] >= [20, 6, 50]
     finally:
         live.close()
+
+
+class Play:
+    """A session whose deformables go up, and a client that looks at them."""
+
+    def __init__(self, shared: Shared, joined: list[Client], cache: Path) -> None:
+        self.parts = list(shared.spec.deformables)
+        self.live = shared.begin(self.parts)
+        self.client, self.shapes = watch(self.live, joined, cache)
+        self.epoch = 1
+        self.faults: set[str] = set()
+        self._rests = {part.stream: shared.rest(part) for part in self.parts}
+        self._height = 0.0
+
+    def look(self) -> list[str]:
+        """All go up by a millimetre, in the present epoch."""
+        self._height += 0.001
+        for stream, (encoder, rest) in self._rests.items():
+            frames = encoder.encode(rest + np.array((0.0, 0.0, self._height)))
+            assert frames is not None
+            self.live.front.publish_media(stream, frames, self.live.now_ns, self.epoch, MediaEncoding.DEFORMABLE)
+        moved = self.shapes.tend()
+        self.faults.add(self.shapes.fault)
+        return moved
+
+    def until(self, condition: Callable[[], bool]) -> set[str]:
+        """Looks until something is so. What has moved meanwhile."""
+        moved: set[str] = set()
+
+        def so(_: Client) -> bool:
+            moved.update(self.look())
+            return condition()
+
+        assert self.client.wait_for(so, DEADLINE_S), (self.shapes.fault, moved)
+        return moved
+
+    def until_moved(self, names: set[str]) -> None:
+        moved: set[str] = set()
+
+        def so(_: Client) -> bool:
+            moved.update(self.look())
+            return moved >= names
+
+        assert self.client.wait_for(so, DEADLINE_S), (self.shapes.fault, moved)
+
+
+@pytest.fixture
+def play(shared: Shared, joined: list[Client], tmp_path: Path) -> Iterator[Play]:
+    play = Play(shared, joined, tmp_path / "cache")
+    yield play
+    play.live.close()
+
+
+def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Play, shared: Shared) -> None:
+    first, second, third = keys(play.parts)
+    play.until_moved({first, second, third})
+    feeds = {part.stream: play.client.media(part.stream) for part in play.parts}
+    kept = {mesh.key: mesh for mesh in play.shapes._meshes}
+    renamed = msgspec.structs.replace(play.parts[1], name="other")
+    address, assets = shared.of([play.parts[0], renamed], "patched")
+    seen_ns = dict(play.shapes.capture_ns)
+    play.live.show(address, assets)
+
+    def patched() -> bool:
+        here = play.shapes.scene_hash == address
+        assert play.shapes.vertices.keys() >= {first} if here else {first, second, third}
+        return here
+
+    play.until(patched)
+    assert play.shapes.capture_ns.keys() >= {first}
+    assert play.shapes.capture_ns[first] >= seen_ns[first]
+    assert not {second, third} & play.shapes.vertices.keys(), "they are gone"
+    play.until_moved({first, "other"})
+    assert [mesh is kept.get(mesh.key) for mesh in play.shapes._meshes] == [True, False]
+    assert play.client.media(play.parts[0].stream) is feeds[play.parts[0].stream]
+    assert play.client._feeds.keys() == {part.stream for part in play.parts[:2]}
+    assert play.faults == {""}
+
+
+def test_while_a_patched_scene_does_not_come_all_go_on_and_it_is_taken_when_it_does(play: Play, shared: Shared) -> None:
+    names = set(keys(play.parts))
+    play.until_moved(names)
+    address, assets = shared.of(play.parts, "patched")
+    play.live.show(address, assets[1:])
+    play.until(lambda: "unknown_asset" in play.shapes.fault)
+    play.until_moved(names)
+    assert play.shapes.scene_hash != address
+    play.live.show(address, assets, "")
+    play.until(lambda: not play.shapes.fault)
+    assert play.shapes.scene_hash == address
+    assert play.shapes.vertices.keys() == names
+
+
+def test_patches_that_come_faster_than_their_assets_stop_nothing(play: Play, shared: Shared) -> None:
+    names = set(keys(play.parts))
+    play.until_moved(names)
+    for number in range(5):  # none of them is served
+        address = f"{number:064x}"
+        play.live.show(address, ())
+        play.until(lambda address=address: play.client.mirror.scene_hash == address)  # type: ignore[misc]
+        assert play.shapes.vertices.keys() == names
+    address, assets = shared.of(play.parts, "the last one")
+    play.live.show(address, assets)
+    play.until(lambda: play.shapes.scene_hash == address)
+    play.until_moved(names)
+    assert play.shapes.fault == ""
+
+
+def test_of_another_scene_nothing_is_shown_before_it_is_known(play: Play, shared: Shared) -> None:
+    """Nor frames of the scene before, whatever comes first."""
+    first, second, third = keys(play.parts)
+    play.until_moved({first, second, third})
+    address, assets = shared.of(play.parts[:2], "another")
+    play.live.show(address, assets[1:], "new_scene")
+    play.until(lambda: play.client.mirror.synced and play.client.mirror.scene_epoch == 2)
+    play.until(lambda: "unknown_asset" in play.shapes.fault)
+    assert (play.shapes.vertices, play.shapes.capture_ns) == ({}, {})
+    assert not play.client._feeds
+    play.live.show(address, assets, "")
+    play.until(lambda: play.shapes.scene_hash == address)
+    feed = play.client.media(play.parts[0].stream)
+    had = feed.received
+    play.until(lambda: feed.received > had + 5)
+    assert play.shapes.vertices == {}, "all that came was of the epoch before"
+    play.epoch = 2
+    play.until_moved({first, second})
+    assert play.shapes.fault == ""
 
 
 def test_names_that_are_names_stay() -> None:

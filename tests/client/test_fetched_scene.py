@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import msgspec
 import mujoco
 import pytest
 
-from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError
+from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError, fetched_scene
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
+from iris_session.protocol.names import AssetRefusal
 from iris_session.protocol.scene import MAX_SCENE_BYTES, encode_scene
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget
@@ -18,6 +22,8 @@ from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.client.harness import LiveSession
 
 pytestmark = pytest.mark.e2e
+
+DEADLINE_S = 60.0
 
 SCENE = """
 <mujoco>
@@ -40,12 +46,19 @@ def store(tmp_path: Path) -> AssetStore:
 
 
 @pytest.fixture
-def join(tmp_path: Path, store: AssetStore) -> Iterator[Callable[..., Client]]:
+def sessions() -> list[LiveSession]:
+    """Those that were begun."""
+    return []
+
+
+@pytest.fixture
+def join(tmp_path: Path, store: AssetStore, sessions: list[LiveSession]) -> Iterator[Callable[..., Client]]:
     opened: list[LiveSession | Client] = []
 
     def make(scene_hash: str, *addresses: str) -> Client:
         live = LiveSession(asset_root=str(store.root), assets=addresses, scene_hash=scene_hash)
         opened.append(live)
+        sessions.append(live)
         client = Client(live.address, name="ann", role="observer", alignment="not_needed")
         client.asset_cache = AssetCache(tmp_path / "cache")
         opened.append(client)
@@ -75,6 +88,7 @@ def test_what_cannot_be_had_is_said(
     def copied(*_: object) -> bytes:
         raise AssertionError("a session could fill the memory with it before it is refused")
 
+    monkeypatch.setattr(fetched_scene, "REFUSED_S", 0.2)
     monkeypatch.setattr(AssetCache, "read", copied)
     monkeypatch.setattr(AssetFetch, "read", copied)
     with pytest.raises(NotConnectedError, match="shares no specification"):
@@ -90,3 +104,58 @@ def test_what_cannot_be_had_is_said(
     part = fetch_scene(join(lonely, lonely))
     assert part.meshes == part.textures == {}
     assert len(part.failed) == 2, "the session does not offer them"
+
+
+def test_a_scene_that_is_refused_is_asked_for_again_and_one_that_stays_refused_is_an_error(
+    store: AssetStore, join: Callable[..., Client], sessions: list[LiveSession], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
+    client = join(parsed.scene_hash)
+    (live,) = sessions
+    monkeypatch.setattr(fetched_scene, "REFUSED_S", DEADLINE_S)
+    with ThreadPoolExecutor(1) as other:
+        fetching = other.submit(fetch_scene, client, timeout_s=DEADLINE_S)
+        while live.front.link.status.drops.get(f"assets_{AssetRefusal.UNKNOWN}", 0) < 2 and not fetching.done():
+            time.sleep(0.01)
+        live.show(parsed.scene_hash, parsed.addresses, "")
+        assert fetching.result().spec == parsed.spec
+
+    monkeypatch.setattr(fetched_scene, "REFUSED_S", 0.2)
+    live.show("0" * 64, parsed.addresses)
+    assert client.wait_for(lambda c: c.mirror.scene_hash == "0" * 64, DEADLINE_S)
+    with pytest.raises(AssetError) as told:
+        fetch_scene(client)
+    assert (told.value.address, told.value.reason) == ("0" * 64, AssetRefusal.UNKNOWN)
+
+
+def test_a_scene_that_is_replaced_meanwhile_is_left_for_the_newest_which_gets_what_is_new(
+    store: AssetStore,
+    join: Callable[..., Client],
+    sessions: list[LiveSession],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
+    plain = msgspec.structs.replace(parsed.spec, visuals=parsed.spec.visuals[:2])
+    newest, refused = store.put(encode_scene(plain)), "1" * 64
+    client = join(parsed.scene_hash, *parsed.addresses)
+    fetches: list[AssetFetch] = []
+    wait = fetched_scene._wait
+
+    def replaced_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
+        fetches.append(fetch)
+        if fetch.addresses == (refused,):
+            sessions[0].show(newest, (newest, *parsed.addresses))
+            assert client.wait_for(lambda c: c.mirror.scene_hash == newest, DEADLINE_S)
+        result = wait(client, fetch, until)
+        if len(fetches) == 2:  # the meshes are here
+            sessions[0].show(refused, parsed.addresses)
+            assert client.wait_for(lambda c: c.mirror.scene_hash == refused, DEADLINE_S)
+        return result
+
+    monkeypatch.setattr(fetched_scene, "_wait", replaced_meanwhile)
+    scene = fetch_scene(client, timeout_s=DEADLINE_S)
+    assert (scene.spec, scene.scene_hash) == (plain, newest)
+    assert (scene.meshes.keys(), scene.textures.keys()) == ({0}, {0})
+    asked = [fetch.addresses for fetch in fetches]
+    assert asked == [(parsed.scene_hash,), asked[1], (refused,), (newest,), ()]
+    assert len(asked[1]) == 2, "a mesh and a texture, which are not fetched and decoded again"
