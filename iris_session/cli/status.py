@@ -184,8 +184,11 @@ def screen(report: StatusReport) -> list[str]:
 
 def _lines(report: StatusReport) -> Iterator[str]:
     from iris_session.doctor.condition import stages
+    from iris_session.protocol.status import NOT_PUBLISHED
 
-    state = "E-STOP" if report.estop else "paused" if report.paused else "running"
+    silent = next((text for text in report.warnings if text.startswith(NOT_PUBLISHED)), "")
+    going = silent.partition(":")[0].replace(NOT_PUBLISHED, "silent for", 1) or "running"
+    state = "E-STOP" if report.estop else "paused" if report.paused else going
     if report.stalled:
         state = f"STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s"
     elif report.authority_silent_ns < 0:

@@ -71,7 +71,7 @@ def conditions(report: StatusReport, own_id: str = "") -> list[Finding]:
     first = session(report)
     return [
         first,
-        alignment(people, ", ".join(one.anchor_id for one in report.anchors)),
+        alignment(people, ", ".join(one.anchor_id for one in report.anchors), driven=bool(report.robots)),
         *headsets.headsets(people, report),
         leases(people, report.robots),
         *([] if first.failed and not report.estop else stepping),
@@ -110,9 +110,10 @@ def session(report: StatusReport) -> Finding:
     return ok("session", f"steps: tick {report.tick}, at the pace of the program that owns it")
 
 
-def alignment(people: tuple[ParticipantReport, ...], sheets: str = "") -> Finding:
-    """Who cannot drive, or sees the scene in the wrong place, for want of an alignment. `sheets`: of the session."""
-    void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE]
+def alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, driven: bool = True) -> Finding:
+    """Who cannot drive, or sees the scene in the wrong place, for want of an alignment. `sheets`: of the session.
+    `driven`: there are robots; where none is, only headsets that look for a sheet, or have lost it, want one."""
+    void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE and (driven or _looks(p))]
     texts = [f"{p.name} has no alignment{_unaligned(p)}" for p in void]
     measured = [p for p in people if p.alignment == AlignmentKind.MEASURED]
     fine = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
@@ -124,8 +125,14 @@ def alignment(people: tuple[ParticipantReport, ...], sheets: str = "") -> Findin
     advice = "look at the sheet, nearer or from a second place" + (
         f"; sheets of this session: {sheets}" if sheets else ""
     )
-    say = failed if any(p.role in DRIVERS for p in void) else warning
+    say = failed if driven and any(p.role in DRIVERS for p in void) else warning
     return say("alignment", "; ".join(texts), why, advice)
+
+
+def _looks(p: ParticipantReport) -> bool:
+    """Whether it has seen a sheet, or what may be one: a screen sees none."""
+    seen = p.alignment_report
+    return p.alignment_void_ns >= 0 or (seen is not None and bool(seen.seen or seen.unusable))
 
 
 def _unaligned(p: ParticipantReport) -> str:

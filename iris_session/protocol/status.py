@@ -6,6 +6,7 @@ None of them reaches the authority: the front answers them, so asking costs no s
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Final
 
 import msgspec
 
@@ -52,6 +53,10 @@ class DeliveryBudget(Message, frozen=True, tag="delivery_budget"):
     mbit_per_s: float = 0.0
     reason: Text = ""
     streams: tuple[StreamBudget, ...] = ()
+
+
+#: How a warning of a `StatusReport` begins while the program that publishes is silent: then come seconds, and a colon.
+NOT_PUBLISHED: Final = "nothing was published for"
 
 
 class Quantiles(msgspec.Struct, frozen=True, array_like=True):

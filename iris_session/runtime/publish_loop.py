@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from iris_session.physics.carrier import Carrier
 from iris_session.protocol.entries import ExternalReset
+from iris_session.protocol.status import NOT_PUBLISHED
 from iris_session.runtime.cadence import Cadence
 from iris_session.runtime.deformables import Bending
 from iris_session.runtime.draft import Frame
@@ -119,7 +120,7 @@ class PublishLoop:
         silent_ns = self._cadence.silent_ns(self._stepper.clock())
         if not silent_ns:
             return ()
-        return (f"nothing was published for {silent_ns * 1e-9:.1f} s: the program that publishes stands still",)
+        return (f"{NOT_PUBLISHED} {silent_ns * 1e-9:.1f} s: the program that publishes stands still",)
 
     def check(self) -> None:
         """Raises what stopped the helper, `OwnershipError` after `close`."""

@@ -213,8 +213,9 @@ class StatusDesk:
 
 def _of_client(report: ClientReport) -> dict[str, Any]:
     expected = report.delivered + report.missed
+    measured = report.delivered > 0 and report.age_ms_p99 > 0.0  # 0: what came was sent again, and has no age
     return {
-        "state_age": Quantiles(report.age_ms_p50, report.age_ms_p99) if report.delivered else None,
+        "state_age": Quantiles(report.age_ms_p50, report.age_ms_p99) if measured else None,
         "missed_share": report.missed / expected if expected else 0.0,
         "rtt_ms": report.rtt_ms,
         "bytes_per_s": report.bytes_per_s,

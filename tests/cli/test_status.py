@@ -14,6 +14,7 @@ from iris_session.cli.status import screen
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.status import (
+    NOT_PUBLISHED,
     AssetsReport,
     MediaStreamReport,
     ParticipantReport,
@@ -107,6 +108,8 @@ def test_names_of_strangers_move_no_cursor() -> None:
         ({"authority_silent_ns": -1}, "HAS NOT TAKEN A STEP YET"),
         ({"estop": True}, "E-STOP"),
         ({"paused": True}, "paused"),
+        ({}, "running"),
+        ({"warnings": ("a disk", f"{NOT_PUBLISHED} 8.5 s: the program stands still")}, "'lab'  silent for 8.5 s  tick"),
     ],
 )
 def test_what_matters_most_is_on_top(fields: dict[str, object], words: str) -> None:

@@ -142,6 +142,15 @@ def test_who_only_looks_should_have_one() -> None:
     only(report, "alignment", "warning", "ann has no alignment")
 
 
+def test_where_nobody_drives_a_screen_needs_none() -> None:
+    screen = change(ANN, alignment="none", role="observer", holds=(), alignment_report=AlignmentReport())
+    shown = change(WELL, participants=(screen,), robots=())
+    assert "alignment" not in troubles(shown)
+    assert "alignment" not in troubles(change(shown, participants=(change(screen, role="operator"),)))
+    headset = change(screen, role="operator", alignment_report=AlignmentReport(unusable=3))
+    only(change(shown, participants=(headset,)), "alignment", "warning", "ann has no alignment (3 observations")
+
+
 def test_no_lease_and_who_has_it() -> None:
     bob = change(ANN, id="p2", name="bob", holds=(), waits_for=("left",))
     taken = change(RIGHT, holder="p3", holder_name="carl")

@@ -97,6 +97,14 @@ def test_both_halves_make_one_report(session: FrontSession) -> None:
     assert ann.lost == ""
 
 
+def test_what_is_only_sent_again_has_no_age(session: FrontSession) -> None:
+    client = session.client()
+    session.process.link.send_report(half(row(client.join().participant_id)))
+    client.send(ClientReport(0.0, 0.0, 4))
+    report = ask(session, client, lambda r: bool(r.participants) and r.participants[0].reported)
+    assert report.participants[0].state_age is None
+
+
 def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
     """A scene that stands still is sent four times a second: one that was late is not the usual way."""
     client = session.client()
