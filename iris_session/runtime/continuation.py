@@ -174,8 +174,9 @@ class Continuation:
         header = self.header
         if header.recording_class != CLOSED:
             raise ResumeError(
-                f"{self.file} is of class {header.recording_class!r}: its physics were the user's own and are not in "
-                "it; only recordings of our own loop ('closed') can be resumed"
+                f"{self.file} is of class {header.recording_class!r}: what moved it was the user's own and is not in "
+                "it; only recordings of our own loop ('closed') can be resumed. Begin anew: serve the file again that "
+                "was shown, or start the program that moved the world"
             )
         problems: list[str] = []
         blas.use_one_thread()  # as in the run that is taken again

@@ -53,6 +53,11 @@ class DeformableStreams:
         self._streams = [_Stream(mesh) for mesh in meshes]
         self._epoch = -1
 
+    @property
+    def streams(self) -> frozenset[str]:
+        """Their names. From any thread."""
+        return frozenset(one.mesh.stream for one in self._streams)
+
     def send(self, scene_epoch: int, end_ns: int, shown_ns: int) -> None:
         """The vertices as they are after the newest tick, which ended at `shown_ns`; call it at the rate of the state.
         `end_ns`: when it did, or now, where the state is sent again."""

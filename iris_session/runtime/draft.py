@@ -12,7 +12,7 @@ import reprlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -205,7 +205,7 @@ def _unit(given: Sequence[float], name: str) -> tuple[float, float, float, float
 
 def _numbers(given: Sequence[float], n: int, what: str) -> list[float]:
     try:
-        numbers = [float(number) for number in given]
+        numbers = [_number(number) for number in given]
     except (TypeError, ValueError, OverflowError) as error:
         raise PublishError(f"{what} is {_brief(given)}: {n} numbers are expected") from error
     if len(numbers) != n or not all(map(math.isfinite, numbers)):
@@ -213,9 +213,21 @@ def _numbers(given: Sequence[float], n: int, what: str) -> list[float]:
     return numbers
 
 
+def _number(given: Any) -> float:
+    if isinstance(given, str | bytes):  # digits would be taken for numbers
+        raise TypeError("a text")
+    return float(given)
+
+
+def _no_texts(array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype.kind in "US":
+        raise TypeError("of numbers, not texts")
+    return array
+
+
 def _finite(given: ArrayLike, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
     try:
-        array = np.asarray(given, np.float64)
+        array = np.asarray(_no_texts(np.asarray(given)), np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise PublishError(f"{what}: an array of shape {shape} is expected ({error})") from error
     if array.shape != shape:

@@ -129,7 +129,8 @@ class SessionProcesses:
                     vertices_endpoint=self.recorder.vertices_endpoint,
                 )
                 self._in_use = RecordingLock(self.recording, shared=True)
-                self._keeper = NoteKeeper(note_path(self.recording))
+                if not self._core.config.authority.user_owned_loop:  # else nobody can go on from the recording
+                    self._keeper = NoteKeeper(note_path(self.recording))
             self.name = others.free_name(self._config.name, self.session_id)
             self.notes += others.notes
             self.front = FrontProcess(
@@ -153,7 +154,7 @@ class SessionProcesses:
                 self.notes.append(f"others reach it at {', '.join(others_join_at)}")
         except (FrontError, RecordingError) as error:
             self.close()
-            raise StartError(str(error)) from error
+            raise StartError(str(error)) from None  # whose text says it all
         except BaseException:
             self.close()
             raise
@@ -227,6 +228,10 @@ class SessionProcesses:
         self._deformables = DeformableStreams(bending, self._publish_vertices)
         stepper.beside_state.append(self._deformables.send)
         return stepper
+
+    def own_streams(self) -> frozenset[str]:
+        """Media streams that carry what bends in the scene."""
+        return frozenset() if self._deformables is None else self._deformables.streams
 
     def _publish_vertices(
         self, stream: str, frames: dict[str, bytes], capture_ns: int, scene_epoch: int, encoding: str

@@ -34,9 +34,13 @@ class Publishing:
         capture, as of `session.clock()` (default: now). `encoding`: what the bytes are, for those who read them.
 
         False: the frame is dropped, because the front takes nothing now or the session is being closed. Raises
-        `ValueError` for a name that no stream can have, other classes, or more than 8 MiB.
+        `ValueError` for a name that no stream can have, or that of what bends in the scene, other classes, or more than
+        8 MiB.
         """
-        front = self._live().front
+        processes = self._live()
+        if stream in processes.own_streams():
+            raise ValueError(f"stream {stream!r} carries the vertices of a deformable of the scene: take another name")
+        front = processes.front
         if front is None:  # the session is being closed
             return False
         last = None if self._stepper is None else self._stepper.last

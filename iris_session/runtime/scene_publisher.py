@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from numpy.typing import ArrayLike
 
@@ -92,9 +92,9 @@ class ScenePublisher(Owner):
             composed = self._builder.build(store)
             carrier = Carrier(composed.moving, composed.poses)
         except (SceneBuildError, PhysicsError) as error:
-            raise ConfigError(f"the scene cannot be built: {error}") from error
+            raise ConfigError(f"the scene cannot be built: {error}") from None
         except OSError as error:
-            raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from error
+            raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
         with _held(store, composed.addresses):  # until the processes hold them
             self._begin(composed, carrier)
 
@@ -280,9 +280,9 @@ def _checked(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:
     return config
 
 
-def _time(time_s: float) -> float:
+def _time(time_s: Any) -> float:
     try:
-        given_s = float(time_s)
+        given_s = -1.0 if isinstance(time_s, str | bytes) else float(time_s)
     except (TypeError, ValueError):
         given_s = -1.0
     if not 0.0 <= given_s <= LONGEST_S:  # NaN is neither

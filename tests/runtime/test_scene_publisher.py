@@ -28,6 +28,7 @@ from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.runtime.cadence import SILENT_NS
+from iris_session.runtime.resume_note import note_path
 from iris_session.runtime.verification import verify_recording
 from iris_session.scene import AssetStore
 
@@ -114,6 +115,7 @@ def test_times_that_cannot_be_are_refused_and_change_nothing(session: ScenePubli
         (-1.0, None, "seconds from 0"),
         (1e10, None, "seconds from 0"),  # more nanoseconds than a recording counts
         ("noon", None, "time_s is 'noon'"),
+        ("1", None, "time_s is '1'"),
         (14.0, -1, "whole nanoseconds"),
         (14.0, 0.5, "whole nanoseconds"),
         (14.0, session.clock() + second, "ahead of session.clock"),
@@ -297,5 +299,6 @@ def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:
         assert [body.name for body in recording.header.bodies] == ["box"]
         rows = list(recording.rows())
         assert 10 < sum(bool(row.plant) for row in rows) <= 62, "only where something was published"
-    with pytest.raises(ResumeError, match="class 'open'"):
+    with pytest.raises(ResumeError, match=r"class 'open'.*serve the file again that was shown"):
         Session(config=SessionConfig(resume=path))
+    assert not note_path(path).exists(), "what nobody can go on from needs none"

@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -256,8 +257,9 @@ def test_a_start_that_failed_can_be_tried_again(tmp_path: Path) -> None:
     blocked.write_bytes(b"somebody else's")
     config = SessionConfig(control_port=0, state_port=0, record=blocked, realtime=False)
     session = Session(scene_path("handover"), config=config)
-    with pytest.raises(StartError, match="never overwritten"):
+    with pytest.raises(StartError, match="never overwritten") as caught:
         session.start()
+    assert "".join(traceback.format_exception(caught.value)).count("Traceback") == 1, "its text says it all"
     blocked.unlink()
     with session:
         session.run(seconds=0.05)
