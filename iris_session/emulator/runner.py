@@ -76,6 +76,9 @@ def _drive(person: Person, ready: bool) -> None:
             person.fail(str(error), time.monotonic_ns())
         return
     person.step(time.monotonic_ns())
+    mirror = person.client.mirror
+    if person.report.phase == "acquire" and mirror.synced and not mirror.robots:
+        person.fail("this session has no robots to drive: behaviour=observer looks only", time.monotonic_ns())
 
 
 def _give_up_joining(people: Sequence[Person], timeout_s: float, now_ns: int) -> None:

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from iris_session import SceneBuilder, ScenePublisher, SessionConfig
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR
 from iris_session.emulator.runner import run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
@@ -212,6 +213,16 @@ def test_who_gets_no_robot_says_why(session: LiveSession) -> None:
     (report,) = run_headsets(session.address, specs, seconds=30.0)
     assert "nothing" in report.failed
     assert report.phase == "failed"
+
+
+def test_where_no_robot_is_nobody_waits_for_one() -> None:
+    scene = SceneBuilder()
+    scene.add_box(half_size=(0.1, 0.1, 0.1))
+    anchors = {DEFAULT_ANCHOR_ID: DEFAULT_T_WORLD_ANCHOR}
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, anchors=anchors)
+    with ScenePublisher(scene, config) as shown:
+        (report,) = run_headsets(shown.address, [HeadsetSpec(name="ann", behaviour="wander", **QUICK)], seconds=60.0)
+    assert report.failed == "this session has no robots to drive: behaviour=observer looks only"
 
 
 def test_who_names_no_robot_gets_one_of_the_policy_and_drives_it(session: LiveSession) -> None:
