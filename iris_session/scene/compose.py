@@ -175,6 +175,7 @@ class SceneBuilder:
             self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
         return name
 
+    @takes()
     def add_urdf(
         self,
         path: str | PathLike[str],
@@ -241,6 +242,7 @@ class SceneBuilder:
         self._world.names.add(name)
         return name
 
+    @takes()
     def add_light(
         self,
         name: str = "",
@@ -277,6 +279,7 @@ class SceneBuilder:
         self._world.lights.append((self._body_named(on), light))
         return name
 
+    @takes()
     def add_camera(
         self,
         name: str = "",

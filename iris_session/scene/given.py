@@ -59,9 +59,9 @@ _ELSEWHERE: Final = {
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-def takes(options: type[Any]) -> Callable[[Method], Method]:
-    """Of a method with `**options`: any that is not in the dictionary type `options` is a `TypeError` which names the
-    nearest one, as Python's own; what it was to do would be left undone. `help` and editors show them one by one."""
+def takes(options: type[Any] | None = None) -> Callable[[Method], Method]:
+    """Of a method, with `**options` or without: a keyword that it does not have, nor the dictionary type `options`, is
+    a `TypeError` that names the nearest one; what it was to do would be left undone. `help` shows them one by one."""
 
     def wrap(method: Method) -> Method:
         signature = inspect.signature(method)
@@ -70,7 +70,7 @@ def takes(options: type[Any]) -> Callable[[Method], Method]:
             inspect.Parameter(
                 name, inspect.Parameter.KEYWORD_ONLY, default=..., annotation=getattr(kind, "__forward_arg__", kind)
             )
-            for name, kind in options.__annotations__.items()
+            for name, kind in (options.__annotations__ if options else {}).items()
         ]
         known = [one.name for one in (*own, *given) if one.name != "self"]
 

@@ -292,7 +292,14 @@ def test_refusals_say_what_would_be_right(
             {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "position": (0, 0, 1)},
             r"add_deformable\(\) has no keyword position: there are edges, ",
         ),
-        ("add_urdf", {"path": "/lost.urdf", "movable": True}, "movable"),
+        (
+            "add_urdf",
+            {"path": "/lost.urdf", "movable": True},
+            r"add_urdf\(\) has no keyword movable: there are collisions, ",
+        ),
+        ("add_urdf", {"path": "/lost.urdf", "package_dir": "x"}, "package_dirs is meant"),
+        ("add_light", {"pos": (0, 0, 1)}, "position is meant"),
+        ("add_camera", {"fov": 60}, "fovy is meant"),
     ],
 )
 def test_keywords_that_a_method_does_not_have_are_refused(method: str, arguments: dict[str, object], text: str) -> None:
