@@ -17,7 +17,7 @@ class Display:
         self._client = client
         self.buffer = PoseBuffer(int(delay_s * 1e9))
         self.hands: dict[str, PoseTuple] = {}
-        self._vertices: dict[str, NDArray[np.floating]] = {}
+        self._vertices: dict[str, tuple[NDArray[np.floating], int]] = {}
         #: A behaviour has asked for a vertex: somebody must tell where they are.
         self.wants_vertices = False
         self._epoch = 0
@@ -32,9 +32,10 @@ class Display:
             self._vertices.clear()
         self.buffer.add(state.header.session_time, state.poses)
 
-    def take_vertices(self, deformable: str, p_world: NDArray[np.floating]) -> None:
-        """New positions of all vertices of a deformable came [m], in the order of the model."""
-        self._vertices[deformable] = p_world
+    def take_vertices(self, deformable: str, p_world: NDArray[np.floating], capture_ns: int) -> None:
+        """New positions of all vertices of a deformable came [m], in the order of the model, and of which session time
+        they are."""
+        self._vertices[deformable] = p_world, capture_ns
 
     def refresh(self, session_ns: int) -> None:
         """The next picture."""
@@ -64,11 +65,15 @@ class Display:
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
         self.wants_vertices = True
-        vertices = self._vertices.get(deformable)
-        if vertices is None or not 0 <= index < len(vertices):
+        shown = self._vertices.get(deformable)
+        if shown is None or not 0 <= index < len(shown[0]):
             return None
-        x, y, z = vertices[index].tolist()
+        x, y, z = shown[0][index].tolist()
         return (x, y, z)
+
+    def vertices_ns(self, deformable: str) -> int:
+        shown = self._vertices.get(deformable)
+        return 0 if shown is None else shown[1]
 
     def lease_version(self, robot: str) -> int | None:
         return self._client.lease_version(robot)

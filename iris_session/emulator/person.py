@@ -115,7 +115,8 @@ class Person:
         self._now_ns = now_ns
         if self.display.wants_vertices:
             for name in self._deformables.tend():
-                self.display.take_vertices(name, self._deformables.vertices[name])
+                shapes = self._deformables
+                self.display.take_vertices(name, shapes.vertices[name], shapes.capture_ns[name])
         for samples, seen in self._uplink.pop(now_ns):
             sent = self.client.send_samples(samples) if len(samples) > 1 else self.client.send(samples[0])
             self.report.samples += len(samples) if sent else 0

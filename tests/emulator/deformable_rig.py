@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from iris_session.emulator.behaviours import make_behaviour
-from iris_session.emulator.behaviours.deformables import CORNERS
+from iris_session.emulator.behaviours.deformables import watched
 from iris_session.runtime.goals import GoalWatch
 from iris_session.runtime.plays import Play, make_play
 from tests.emulator.handover_rig import Rig
@@ -30,6 +30,8 @@ class SoftRig(Rig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for view in self.views.values():
+            view.freezes = True
         for name in self.world.flexes.names if self.shift else ():
             self._shift_deformable(name)
 
@@ -82,9 +84,9 @@ def soft_demo(play: Play, seed: int, *, shift: bool = True) -> SoftRig:
         for person in play.people
         for task in person.tasks
     }
-    watched = {goal.deformable: CORNERS[goal.deformable] for goal in play.goals}
+    vertices = {goal.deformable: watched(goal.deformable) for goal in play.goals}
     watches = [GoalWatch(goal) for goal in play.goals]
-    return SoftRig(behaviours, seed, "", vertices=watched, watches=watches, model=play.model, shift=shift)
+    return SoftRig(behaviours, seed, "", vertices=vertices, watches=watches, model=play.model, shift=shift)
 
 
 def main(runs: int, name: str = "cloth", first: int = 0) -> None:
@@ -99,9 +101,8 @@ def main(runs: int, name: str = "cloth", first: int = 0) -> None:
         good += not wrong
         times.append(rig.now_s)
         tries = [b.attempts for b in rig.behaviours.values()]
-        notes = (
-            f"attempts {tries}, trouble {rig.world.trouble}, {(time.process_time() - began) / rig.now_s:.2f} CPU s/s"
-        )
+        cost = (time.process_time() - began) / rig.now_s
+        notes = f"attempts {tries}, trouble {rig.world.trouble}, {cost:.2f} CPU s/s"
         print(f"seed {seed}: {wrong or 'ok'}, {rig.now_s:.1f} s, {notes}", flush=True)
     print(f"{name}: {good}/{runs} succeeded, {min(times):.1f} to {max(times):.1f} s each")
 

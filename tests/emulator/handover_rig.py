@@ -62,15 +62,21 @@ class LateView:
         self.lease: int | None = 1
         self.hand: PoseTuple = ((rng.uniform(-1, 1), -1.2, 0.3), quat_normalize(tuple(rng.gauss(0, 1) for _ in "wxyz")))
         self._rng, self._noise, self._stalls = rng, noise, stalls
-        self._frames: deque[tuple[float, dict[str, PoseTuple]]] = deque(maxlen=16)
+        self._frames: deque[tuple[float, float, dict[str, PoseTuple]]] = deque(maxlen=16)
         self._stalled_until_s = 0.0
         self._frame: dict[str, PoseTuple] = {}
         self._shown: dict[str, PoseTuple] = {}  # of the frame, with noise: only what this person looked at
         #: All of the frame at once. What bends is folded for most seeds, not for all: theirs keep their noise.
         self.sees_all = False
+        #: The picture of what bends stands still for up to a second and a half, every four seconds or so.
+        self.freezes = False
+        self._frozen_until_s = 0.0
+        self._bent: dict[str, PoseTuple] = {}
+        self._vertices: dict[str, PoseTuple] = {}
+        self._vertices_s = 0.0
 
     def publish(self, now_s: float, poses: dict[str, PoseTuple]) -> None:
-        self._frames.append((now_s + self._rng.uniform(0.030, 0.060), poses))
+        self._frames.append((now_s + self._rng.uniform(0.030, 0.060), now_s, poses))
 
     def stalled(self, now_s: float) -> bool:
         """Whether this person's computer stands still: 30 ms in every hundredth frame."""
@@ -80,27 +86,36 @@ class LateView:
 
     def look(self, now_s: float) -> None:
         self.session_time_ns = round(now_s * 1e9)
-        arrived = [poses for arrives_s, poses in self._frames if arrives_s <= now_s]
-        if arrived:
-            self._frame, self._shown = arrived[-1], {}
-            for name in self._frame if self.sees_all else ():
-                self._seen(name)
+        arrived = [(of_s, poses) for arrives_s, of_s, poses in self._frames if arrives_s <= now_s]
+        if not arrived:
+            return
+        of_s, poses = arrived[-1]
+        self._frame, self._shown = poses, {}
+        for name in poses if self.sees_all else ():
+            self._seen(name, poses, self._shown)
+        if self.freezes and now_s >= self._frozen_until_s and self._rng.random() < 0.003:
+            self._frozen_until_s = now_s + self._rng.uniform(0.2, 1.5)
+        if now_s >= self._frozen_until_s:
+            self._vertices_s, self._bent, self._vertices = of_s, poses, self._shown
 
-    def _seen(self, name: str) -> PoseTuple | None:
+    def _seen(self, name: str, frame: dict[str, PoseTuple], shown: dict[str, PoseTuple]) -> PoseTuple | None:
         """As often as it is looked at in a picture, it is at the same place."""
-        if name not in self._shown and name in self._frame:
-            self._shown[name] = shaken(self._frame[name], self._rng, self._noise)
-        return self._shown.get(name)
+        if name not in shown and name in frame:
+            shown[name] = shaken(frame[name], self._rng, self._noise)
+        return shown.get(name)
 
     def body_pose(self, name: str) -> PoseTuple | None:
-        return self._seen(name)
+        return self._seen(name, self._frame, self._shown)
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
-        return self._seen(f"tip:{robot}")
+        return self._seen(f"tip:{robot}", self._frame, self._shown)
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
-        seen = self._seen(f"vertex:{deformable}:{index}")
+        seen = self._seen(f"vertex:{deformable}:{index}", self._bent, self._vertices)
         return None if seen is None else seen[0]
+
+    def vertices_ns(self, deformable: str) -> int:
+        return round(self._vertices_s * 1e9)
 
     def lease_version(self, robot: str) -> int | None:
         return self.lease

@@ -31,6 +31,11 @@ class OperatorView(Protocol):
         """Where vertex `index` of a deformable is [m]; `None`: not in the stream."""
         ...
 
+    def vertices_ns(self, deformable: str) -> int:
+        """Session time at which the vertices of a deformable were where they are shown; 0: not in the stream. They may
+        be late: media give way where a link or a computer is busy."""
+        ...
+
     def lease_version(self, robot: str) -> int | None:
         """Version of my lease on `robot`; `None`: it is not mine."""
         ...

@@ -1,10 +1,12 @@
 """What a person sees and knows of deformables: where points of them are, and which points are the corners.
 
-Vertices are numbered as in the model: a MuJoCo grid counts its last axis fastest.
+Their picture may be later than that of the robots, even stand still for a while. Vertices are numbered as in the
+model: a MuJoCo grid counts its last axis fastest.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from typing import Final
 
@@ -19,10 +21,20 @@ CORNERS: Final[Mapping[str, tuple[int, ...]]] = {
     "rose": (0, 3, 12, 15, 96, 99, 108, 111),  # 7 x 4 x 4, the first half of them at the -x end
     "mint": (0, 3, 12, 15, 96, 99, 108, 111),
 }
+#: Vertices next to a corner on the way to the middle, by the vertex at the corner: the first and the second.
+INNER: Final[Mapping[str, Mapping[int, tuple[int, int]]]] = {
+    "cloth": {0: (18, 36), 16: (32, 48), 272: (256, 240), 288: (270, 252)},
+}
+
+
+def watched(deformable: str) -> tuple[int, ...]:
+    """Vertices of `deformable` that people look at."""
+    return (*CORNERS[deformable], *itertools.chain(*INNER.get(deformable, {}).values()))
 
 
 class SoftEyes(Eyes):
-    """Watches the corners of one deformable, robots, and bodies. `missing`: which of them were never seen so far."""
+    """Watches the corners of one deformable and what is next to them, robots, and bodies. `missing`: which of them were
+    never seen so far."""
 
     def __init__(
         self, deformable: str, robots: tuple[str, ...], bodies: tuple[str, ...] = (), arm: ArmKind = ARM
@@ -31,31 +43,41 @@ class SoftEyes(Eyes):
             raise ValueError(f"no operator knows the deformable '{deformable}'. Known: {', '.join(CORNERS)}")
         super().__init__(bodies, robots, arm=arm)
         self.deformable = deformable
-        self._corners: dict[int, Seen] = {}
+        self._watched = watched(deformable)
+        self._vertices: dict[int, Seen] = {}
+        self._captured_s = 0.0
+        self._now_s = 0.0
 
     def look(self, view: OperatorView) -> None:
         super().look(view)
-        now_s = view.session_time_ns * 1e-9
-        for index in CORNERS[self.deformable]:
+        self._now_s = now_s = view.session_time_ns * 1e-9
+        self._captured_s = view.vertices_ns(self.deformable) * 1e-9
+        for index in self._watched:
             p_world = view.vertex(self.deformable, index)
             if p_world is None:
                 continue
             pose: PoseTuple = (p_world, IDENTITY_QUAT)
-            if index in self._corners:
-                self._corners[index].update(pose, now_s)
+            if index in self._vertices:
+                self._vertices[index].update(pose, now_s)
             else:
-                self._corners[index] = Seen(pose, now_s)
-        if len(self._corners) < len(CORNERS[self.deformable]):
+                self._vertices[index] = Seen(pose, now_s)
+        if len(self._vertices) < len(self._watched):
             self.missing = (*self.missing, self.deformable)
 
     def corner(self, index: int) -> Vec3:
         """Where a corner is [m], smoothed."""
-        return self._corners[index].pose[0]
+        return self._vertices[index].pose[0]
+
+    def inside(self, corner: int, cells: float) -> Vec3:
+        """A point so far from a corner towards the middle [m], in cells of the grid along both edges, 1 to 2."""
+        (ax, ay, az), (bx, by, bz) = (self._vertices[index].pose[0] for index in INNER[self.deformable][corner])
+        w = cells - 1.0
+        return (ax + w * (bx - ax), ay + w * (by - ay), az + w * (bz - az))
 
     @property
     def corners(self) -> dict[int, Vec3]:
         """Where all corners are [m], smoothed, by vertex."""
-        return {index: seen.pose[0] for index, seen in self._corners.items()}
+        return {index: self._vertices[index].pose[0] for index in CORNERS[self.deformable]}
 
     @property
     def middle(self) -> Vec3:
@@ -64,8 +86,20 @@ class SoftEyes(Eyes):
 
     @property
     def corners_still_s(self) -> float:
-        """For how long [s] all corners have kept still."""
-        return min(seen.still_s for seen in self._corners.values())
+        """For how long [s] all corners were seen to keep still: a picture that stands still tells of nothing."""
+        return max(
+            0.0, self._captured_s - max(self._vertices[index].rest_since_s for index in CORNERS[self.deformable])
+        )
+
+    @property
+    def now_s(self) -> float:
+        """Session time of the picture [s]."""
+        return self._now_s
+
+    @property
+    def captured_s(self) -> float:
+        """Session time [s] at which the deformable was as it is shown."""
+        return self._captured_s
 
 
 def mean(points: Iterable[Vec3]) -> Vec3:

@@ -21,7 +21,7 @@ class Seen:
         self.pose = pose
         self._now_s = now_s
         self._rest = pose[0]
-        self._rest_since_s = now_s
+        self.rest_since_s = now_s
 
     def update(self, pose: PoseTuple, now_s: float) -> None:
         a = 1.0 - math.exp(-(now_s - self._now_s) / SMOOTHING_S)
@@ -31,12 +31,12 @@ class Seen:
         self.pose = (p, quat_mul(quat_from_rotvec((a * rx, a * ry, a * rz)), q))
         self._now_s = now_s
         if distance(p, self._rest) > STILL_M:
-            self._rest, self._rest_since_s = p, now_s
+            self._rest, self.rest_since_s = p, now_s
 
     @property
     def still_s(self) -> float:
         """For how long [s] it has kept still."""
-        return self._now_s - self._rest_since_s
+        return self._now_s - self.rest_since_s
 
 
 class Eyes:

@@ -8,12 +8,12 @@ import math
 from anchors.pose import PoseTuple, Vec3, distance, quat_angle, quat_from_yaw, quat_mul
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.deformables import SoftEyes
-from iris_session.emulator.behaviours.phases import Phases
+from iris_session.emulator.behaviours.soft import PICTURE_LATE_S, SoftPhases
 from iris_session.emulator.behaviours.things import DOWN, above
 from iris_session.protocol.names import Device
 
-#: The cloth is pinched so far from its corner, along both edges [m].
-INSET: float = 0.032
+#: The cloth is pinched so far from its corner, along both edges, in cells of 22.5 mm.
+INSET_CELLS: float = 1.42
 #: Height of the tip above the table at which the finger tips, 12 mm below it, press the cloth of 8 mm onto the table
 #: [m]. The hand is only so steady, so it aims at the table itself; on every new attempt a little deeper.
 PRESS: float = 0.0115
@@ -25,6 +25,9 @@ TRIGGER_BEFORE: float = 0.25
 RELEASE: float = 0.036
 #: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
+#: So far at most the fingers are carried out from between the people [m]: a cloth that is drawn taut flies in when the
+#: first of them lets go.
+APART: float = 0.01
 #: So far at most the fingers go beyond the other corner [m]: the one that is tucked under them may unfold when it is
 #: let go.
 BEYOND: float = 0.01
@@ -34,32 +37,43 @@ TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
 CAREFUL_SPEED: float = 0.12
 CARRY_SPEED: float = 0.22
-#: Corners that lie nearer to each other than this are folded onto each other [m].
-FOLDED: float = 0.05
+#: Corners that lie nearer to each other than this are folded onto each other [m]; when they are laid down they must lie
+#: nearer, because a cloth settles for a while.
+FOLDED: float = 0.049
+LAID: float = 0.044
 #: Distance of the finger pads below which a gripper is shut on cloth [m].
 SHUT: float = 0.02
 #: A corner that stays so far above the table hangs on a finger [m]; so often it is laid down again.
 HANGING: float = 0.03
 SHAKES: int = 3
-#: How long a partner is waited for [s].
+#: A hand that is so far above the table is back where it began [m]; the cloth is looked at once more after this [s].
+HOME_ABOVE: float = 0.22
+SETTLED_S: float = 1.5
+#: How long a partner is waited for [s]; and before the corners are let go at once, which succeeds alone, too.
 PATIENCE_S: float = 60.0
+TOGETHER_S: float = 6.0
 
 
-class Folder(Phases):
+class Folder(SoftPhases):
     """Folds `cloth` with `robot`, together with the operator of `partner`."""
+
+    most_attempts = 6  # corners that were laid down apart are soon brought together
 
     def __init__(
         self, robot: str, cloth: str, partner: str, device: str = Device.CONTROLLER_RIGHT, arm: ArmKind = ARM
     ) -> None:
-        self.eyes = SoftEyes(cloth, (robot, partner), arm=arm)
-        super().__init__(robot, device, self.eyes, arm)
+        super().__init__(robot, device, SoftEyes(cloth, (robot, partner), arm=arm), arm)
         self.cloth, self.partner = cloth, partner
+        self._slipped = f"the {cloth} slipped out of the gripper of {robot}"
         self._mine = self._onto = self._other = -1  # vertices: to take, to bring it to, and the one the partner takes
         self._pinch: Vec3 = (0.0, 0.0, 0.0)
         self._goal: Vec3 = (0.0, 0.0, 0.0)
         self._outward: Vec3 = (0.0, 0.0, 0.0)  # from the partner's corner to mine
         self._ahead: Vec3 = (0.0, 0.0, 0.0)  # from my corner to where it goes
         self._shakes = 0
+        self._since_s = 0.0  # session time from which on the cloth must be seen
+        self._mending = False  # the corners were laid down apart and are brought together
+        self._alone = False  # the partner does not take part any more
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
         self._steps |= {
             "wait": self._wait,
@@ -72,11 +86,15 @@ class Folder(Phases):
             "together": self._together,
             "over": self._over,
             "across": self._across,
+            "sight": self._sight,
             "aim": self._aim,
             "lower": self._lower,
+            "ready": self._ready,
             "open": self._open,
             "leave": self._leave,
             "judge": self._judge,
+            "return": self._go_home,
+            "watch": self._watch,
             "shake": self._shake,
             "back_off": self._back_off,
         }
@@ -89,17 +107,22 @@ class Folder(Phases):
         """Waits until the cloth lies still; chooses the corners on the own side."""
         if self.eyes.corners_still_s < 0.3:
             return
-        corners = self.eyes.corners
-        base = self.eyes.base(self.robot)[0]
-        near = sorted(corners, key=lambda index: distance(corners[index], base))[:2]
-        self._mine, self._onto = sorted(near, key=lambda index: corners[index][1])
-        self._other, beyond = sorted(set(corners) - set(near), key=lambda index: corners[index][1])
-        mine, onto, other = corners[self._mine], corners[self._onto], corners[self._other]
-        self._pinch = _inset(mine, onto, other)
-        self._goal = _inset(onto, mine, corners[beyond])
-        self._outward, self._ahead = _toward(other, mine), _toward(mine, onto)
+        if self._mine < 0:
+            self._choose()
+        mine = self.eyes.corner(self._mine)
+        self._pinch = self.eyes.inside(self._mine, INSET_CELLS)  # wherever and however the corner lies
+        self._goal = self.eyes.inside(self._onto, INSET_CELLS)
         self._diagonal = math.atan2(self._pinch[1] - mine[1], self._pinch[0] - mine[0])
         self._enter("approach")
+
+    def _choose(self) -> None:
+        """The corners on the own side, and the directions of the fold, while the cloth lies flat."""
+        corners, base = self.eyes.corners, self.eyes.base(self.robot)[0]
+        near = sorted(corners, key=lambda index: distance(corners[index], base))[:2]
+        self._mine, self._onto = sorted(near, key=lambda index: corners[index][1])
+        self._other = min(set(corners) - set(near), key=lambda index: corners[index][1])
+        mine, onto, other = corners[self._mine], corners[self._onto], corners[self._other]
+        self._outward, self._ahead = _toward(other, mine), _toward(mine, onto)
 
     def _approach(self) -> None:
         if self._entering_now:
@@ -134,7 +157,7 @@ class Folder(Phases):
         if self._entering_now:
             self.hand.hold_still()
             self.hand.trigger_goal = 1.0
-        both = self.eyes.gap(self.partner) < SHUT and self.hand.trigger_done() and self._waited(0.9)
+        both = (self._alone or self.eyes.gap(self.partner) < SHUT) and self.hand.trigger_done() and self._waited(0.9)
         if both:
             self._enter("lift")
         elif self._waited(PATIENCE_S):
@@ -143,22 +166,21 @@ class Folder(Phases):
     def _lift(self) -> None:
         """Both at once: a corner that goes up alone drags the other from under the fingers that press on it."""
         if self._entering_now:
-            self.hand.move_to(above(self.eyes.tip(self.robot), 0.08), CAREFUL_SPEED, correct=False)
-        if not self.hand.moved() or not self._waited(1.0):
-            return
-        if self._holding():
+            (x, y, _), q = self.eyes.tip(self.robot)
+            self.hand.move_to(((x, y, self._table() + PRESS + 0.08), q), CAREFUL_SPEED, correct=False)
+        if self.hand.moved() and self._waited(1.0) and not self._stays_behind(self._slipped):
             self._enter("together")
-        else:
-            self._retry(f"the {self.cloth} slipped out of the gripper of {self.robot}")
 
     def _together(self) -> None:
         """Waits until the partner has lifted his corner too."""
         if self._entering_now:
             self.hand.hold_still()
-        if not self._holding():
-            self._retry(f"the {self.cloth} slipped out of the gripper of {self.robot}")
-        elif self.eyes.corner(self._other)[2] > self._table() + 0.05 and self.eyes.gap(self.partner) < SHUT:
-            self._enter("over")
+        if self._stays_behind(self._slipped):
+            return
+        lifted = self.eyes.corner(self._other)[2] > self._table() + 0.05 and self.eyes.gap(self.partner) < SHUT
+        if lifted or self._alone:
+            self._alone = True  # the partner may have laid his down when mine has to be taken again
+            self._enter("sight" if self._mending else "over")
         elif self._waited(PATIENCE_S):
             self._give_up(f"{self.partner} did not lift the other corner within {PATIENCE_S:.0f} s")
 
@@ -171,31 +193,52 @@ class Folder(Phases):
     def _across(self) -> None:
         if self._entering_now:
             self.hand.move_to(self._tip_at(self._goal, 0.08), CARRY_SPEED)
-        self._carried("aim", 0.02)
+        self._carried("sight", 0.02)
+
+    def _sight(self) -> None:
+        """Waits for a picture of the cloth that is younger than the movement."""
+        if self._entering_now:
+            self._since_s = self.eyes.now_s
+        if self.eyes.captured_s > self._since_s + 0.2 or self._waited(PICTURE_LATE_S):
+            self._carried("aim", math.inf)
 
     def _aim(self) -> None:
         """By sight: the corner itself over the other, which may have moved meanwhile."""
         if self._entering_now:
             tip = self.eyes.tip(self.robot)[0]
             mine, onto = self.eyes.corner(self._mine), self.eyes.corner(self._onto)
-            ox, oy, _ = self._outward
-            x, y = tip[0] + onto[0] - mine[0] + FALLS_BACK * ox, tip[1] + onto[1] - mine[1] + FALLS_BACK * oy
-            fx, fy, _ = self._ahead
-            back = min(0.0, BEYOND - (x - onto[0]) * fx - (y - onto[1]) * fy)
-            self._goal = (x + back * fx, y + back * fy, 0.0)
+            self._goal = (tip[0] + onto[0] - mine[0], tip[1] + onto[1] - mine[1], 0.0)
+            if not self._mending:
+                self._goal = self._within_reach_of_the_cloth(onto)
             self.hand.move_to(self._tip_at(self._goal, RELEASE + 0.015), CAREFUL_SPEED)
         self._carried("lower", 0.006)
 
+    def _within_reach_of_the_cloth(self, onto: Vec3) -> Vec3:
+        """The goal, a little outwards because the corner falls back, but so that the cloth is not drawn taut."""
+        (x, y, _), (ox, oy, _), (fx, fy, _) = self._goal, self._outward, self._ahead
+        x, y = x + FALLS_BACK * ox, y + FALLS_BACK * oy
+        apart = min(0.0, APART - (x - self._pinch[0]) * ox - (y - self._pinch[1]) * oy)
+        back = min(0.0, BEYOND - (x - onto[0]) * fx - (y - onto[1]) * fy)
+        return (x + apart * ox + back * fx, y + apart * oy + back * fy, 0.0)
+
     def _carried(self, then: str, within_m: float) -> None:
-        if not self._holding():
-            self._give_up(f"{self.robot} dropped the {self.cloth} on the way")
-        elif self.hand.arrived(within_m, 0.06) or self._waited(6.0):
+        if self._stays_behind(f"{self.robot} dropped the {self.cloth} on the way"):
+            return
+        if self.hand.arrived(within_m, 0.06) or self._waited(6.0):
             self._enter(then)
 
     def _lower(self) -> None:
         if self._entering_now:
             self.hand.move_to(self._tip_at(self._goal, RELEASE), CAREFUL_SPEED)
-        self._carried("open", 0.005)
+        self._carried("ready", 0.005)
+
+    def _ready(self) -> None:
+        """Both let go at once: the cloth between them draws on the corner that is let go first."""
+        if self._entering_now:
+            self.hand.hold_still()
+        low = self.eyes.tip(self.partner)[0][2] < self._table() + RELEASE + 0.008
+        if low or self.eyes.gap(self.partner) > SHUT or self._waited(TOGETHER_S):
+            self._enter("open")
 
     def _open(self) -> None:
         if self._entering_now:
@@ -217,12 +260,37 @@ class Folder(Phases):
         if self.eyes.corner(self._mine)[2] > self._table() + HANGING and self._shakes < SHAKES:
             self._shakes += 1
             self._enter("shake")
-            return
-        missing = distance(self.eyes.corner(self._mine), self.eyes.corner(self._onto))
-        if missing > FOLDED:
-            self._give_up(f"the corners of the {self.cloth} lie {missing * 100:.0f} cm apart")
-        else:
+        elif self._folded(LAID):
             self._enter("return")
+
+    def _folded(self, within_m: float) -> bool:
+        """Whether the corners lie together. If not, they are brought together: the outer one is taken, which lies by
+        itself and not on the other layer."""
+        mine, onto = self.eyes.corner(self._mine), self.eyes.corner(self._onto)
+        missing = distance(mine, onto)
+        if missing <= within_m:
+            return True
+        ox, oy, _ = self._outward
+        if (mine[0] - onto[0]) * ox + (mine[1] - onto[1]) * oy < 0.0:
+            self._mine, self._onto = self._onto, self._mine
+        self._mending = True
+        self._retry(f"the corners of the {self.cloth} lie {missing * 100:.1f} cm apart")
+        return False
+
+    def _go_home(self) -> None:
+        if self._entering_now and self._home is not None:
+            self.hand.move_to(self._home)
+        if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
+            self._enter("watch")
+
+    def _watch(self) -> None:
+        """Until the partner is back too: what he does may move the own corner."""
+        busy = self.eyes.tip(self.partner)[0][2] < self._table() + HOME_ABOVE
+        if self._entering_now or busy:
+            self._since_s = self.eyes.now_s
+        settled = self.eyes.captured_s > self._since_s + SETTLED_S
+        if self._waited(PATIENCE_S) or (settled and self._folded(FOLDED)):
+            self._finish()
 
     def _shake(self) -> None:
         """Down to where it belongs, and the fingers moved, so that it slips off."""
@@ -263,12 +331,6 @@ def _toward(a: Vec3, b: Vec3) -> Vec3:
     dx, dy = b[0] - a[0], b[1] - a[1]
     apart = max(math.hypot(dx, dy), 1e-6)
     return (dx / apart, dy / apart, 0.0)
-
-
-def _inset(corner: Vec3, one: Vec3, other: Vec3) -> Vec3:
-    """The point to pinch near a corner between two others: `INSET` along both edges."""
-    (ax, ay, _), (bx, by, _) = _toward(corner, one), _toward(corner, other)
-    return (corner[0] + INSET * (ax + bx), corner[1] + INSET * (ay + by), corner[2])
 
 
 def _between(a: Vec3, b: Vec3) -> Vec3:

@@ -12,8 +12,6 @@ from iris_session.emulator.behaviours.hand import ClutchedHand
 
 #: How long an operator looks for a robot or thing that is not in the picture [s].
 SEARCH_S = 10.0
-#: So often a task is tried before the operator gives up.
-ATTEMPTS = 4
 
 
 class Watching(Protocol):
@@ -32,10 +30,11 @@ class Watching(Protocol):
 class Phases:
     """`done` and not `failed`: it succeeded. A subclass fills `self._steps`: phase -> method called once per update.
 
-    `back_off`: the phase in which a new attempt begins.
+    `back_off`: the phase in which a new attempt begins; so often a task is tried before the operator gives up.
     """
 
     back_off = "back_off"
+    most_attempts = 4
 
     def __init__(self, robot: str, device: str, eyes: Watching, arm: ArmKind = ARM) -> None:
         self.phase = "wait"
@@ -87,7 +86,7 @@ class Phases:
 
     def _retry(self, reason: str) -> None:
         """Lets go and begins again, or gives up with `reason` after the last attempt."""
-        if self.attempts >= ATTEMPTS:
+        if self.attempts >= self.most_attempts:
             self._give_up(f"{reason} (after {self.attempts} attempts)")
             return
         self.attempts += 1

@@ -8,7 +8,7 @@ from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_angle, 
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.deformables import CORNERS, SoftEyes, mean
 from iris_session.emulator.behaviours.operator import CAREFUL_SPEED, CLEAR_ABOVE
-from iris_session.emulator.behaviours.phases import Phases
+from iris_session.emulator.behaviours.soft import SoftPhases
 from iris_session.emulator.behaviours.things import DOWN, above
 from iris_session.protocol.names import Device
 
@@ -25,7 +25,7 @@ SQUEEZED: float = 0.050
 EMPTY: float = 0.012
 
 
-class Stower(Phases):
+class Stower(SoftPhases):
     """Stows `soft` with `robot`. `place`: where in the box its middle comes to lie (x, y [m], world)."""
 
     def __init__(
@@ -36,8 +36,7 @@ class Stower(Phases):
         arm: ArmKind = ARM,
         place: tuple[float, float] | None = None,
     ) -> None:
-        self.eyes = SoftEyes(soft, (robot,), (BOX,), arm)
-        super().__init__(robot, device, self.eyes, arm)
+        super().__init__(robot, device, SoftEyes(soft, (robot,), (BOX,), arm), arm)
         self.soft = soft
         self._place = place
         self._grip: PoseTuple = ((0.0, 0.0, 0.0), DOWN)
@@ -94,7 +93,7 @@ class Stower(Phases):
 
     def _lift(self) -> None:
         if self._entering_now:
-            self.hand.move_to(above(self.eyes.tip(self.robot), LIFTED + 0.03))
+            self.hand.move_to(above(self._grip, LIFTED + 0.03))
         self._carried("carry", 0.01)
 
     def _carry(self) -> None:
@@ -112,9 +111,9 @@ class Stower(Phases):
         self._carried("open", 0.005)
 
     def _carried(self, then: str, within_m: float) -> None:
-        if not self._holding():
-            self._retry(f"the {self.soft} slipped out of the gripper of {self.robot}")
-        elif self.hand.arrived(within_m, 0.06) or self._waited(5.0):
+        if self._stays_behind(f"the {self.soft} slipped out of the gripper of {self.robot}"):
+            return
+        if self.hand.arrived(within_m, 0.06) or self._waited(5.0):
             self._enter(then)
 
     def _open(self) -> None:
