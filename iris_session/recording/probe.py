@@ -110,17 +110,19 @@ class Prober:
         return self._asked(RECORDINGS, path)
 
     def _asked(self, what: str, path: str | Path) -> int:
-        if self._child is None and (spare := _spare.take()) is not None:
-            answer = spare.ask(what, path)
+        earlier, self._child = self._child or _spare.take(), None
+        if earlier is not None:
+            answer = earlier.ask(what, path)
             if answer:
-                self._child = spare
+                self._child = earlier
                 return int(answer)
-            spare.end()  # over this file or before, as nobody asked: a fresh one tells
-        self._child = self._child or _Child()
-        answer = self._child.ask(what, path)
-        if not answer:
-            self._child.end()
-            self._child = None
+            earlier.end()  # over this file, or before, as nobody asked for a while: a fresh one tells
+        child = _Child()
+        answer = child.ask(what, path)
+        if answer:
+            self._child = child
+        else:
+            child.end()
         return int(answer or 0)
 
     def __enter__(self) -> Self:

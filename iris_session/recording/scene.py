@@ -25,7 +25,7 @@ from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
 from iris_session.scene.coordinates import on_deformable, with_coordinates
-from iris_session.scene.cubes import Cubes, baked, direction_scale
+from iris_session.scene.cubes import Atlas, Cubes, baked, direction_scale
 from iris_session.scene.shapes import height_field, primitive
 
 WORLD: Final = "world"
@@ -36,6 +36,9 @@ PLANE_HALF_THICKNESS_M: Final = 0.0005
 #: side of a face: six lie in one picture, which is then no larger.
 TEXTURE_SIDE: Final = 512
 CUBE_SIDE: Final = 128
+#: A mesh of more triangles wears the mean colour of its cube: to cut a million of them takes seconds and a gigabyte,
+#: and the recorder has other things to do.
+MOST_BAKED: Final = 50_000
 
 BOX: Final = "box"
 ELLIPSOID: Final = "ellipsoid"
@@ -112,6 +115,7 @@ class SceneReader:
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
         self._cubes = Cubes(spec, store, CUBE_SIDE)
+        self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
 
     def shown(self, thing: Visual | Deformable) -> bool:
         """Whether it is drawn at all."""
@@ -129,6 +133,8 @@ class SceneReader:
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
         texture = self.texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
+        if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
+            return Form(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
         if mesh is None and texture is not None:
             mesh = primitive(_ended(geometry))
         if mesh is None:
@@ -136,10 +142,17 @@ class SceneReader:
         if texture is None:
             return Form(MESH, mesh=mesh, tint=tint)
         if atlas is not None:
-            mesh = baked(mesh, geometry, direction_scale(self._spec, geometry, visual.material), atlas)
+            mesh = self._with_atlas(mesh, visual, atlas)
         else:
             mesh = with_coordinates(mesh, geometry, self._spec.materials[visual.material])
         return Form(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
+
+    def _with_atlas(self, mesh: MeshArrays, visual: Visual, atlas: Atlas) -> MeshArrays:
+        key = visual.geometry, visual.material
+        if key not in self._baked:
+            scale = direction_scale(self._spec, visual.geometry, visual.material)
+            self._baked[key] = baked(mesh, visual.geometry, scale, atlas)
+        return self._baked[key]
 
     def texture(self, material: int) -> Pixels | None:
         """The 2d texture of a material, red, green, blue and perhaps alpha."""
@@ -183,6 +196,11 @@ class SceneReader:
 def _with_colours(pixels: Pixels) -> Pixels:
     """Red, green, blue of what is grey."""
     return pixels if pixels.shape[2] >= 3 else np.repeat(pixels[:, :, :1], 3, axis=2)
+
+
+def _mean_colour(pixels: Pixels) -> tuple[float, float, float]:
+    red, green, blue = (_with_colours(pixels)[:, :, :3].mean(axis=(0, 1)) / 255.0).tolist()
+    return (red, green, blue)
 
 
 def places(spec: SceneSpec, bodies: Sequence[BodyInfo]) -> dict[int, Place]:

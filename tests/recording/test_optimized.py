@@ -267,7 +267,8 @@ def test_of_several_recordings_in_a_file_it_is_said_that_one_is_read(tmp_path: P
     first = write(tmp_path / "a.rrd", header, batch)
     second = tmp_path / "b.rrd"
     writer = RrdWriter(second, "another id")
-    writer.header(header)
+    other = msgspec.structs.replace(header, session_name="the other")
+    writer.header(other)
     writer.add(Batch(denials=[DenialRecord(1, 7, 3, Denial("held", "it is held"))]))
     writer.close()
     merged = optimize(tmp_path / "one.rrd", first, second)
@@ -275,6 +276,7 @@ def test_of_several_recordings_in_a_file_it_is_said_that_one_is_read(tmp_path: P
         found = (len(list(recording.rows())), len(list(recording.denials())))
     assert found in ((60, 0), (0, 1)), "nothing of the other"
     report = verify(merged, SmallCore)
-    one = f"session {header.session_name!r} of {header.created_utc or 'an unknown day'}"
+    read = header if found == (60, 0) else other
+    one = f"session {read.session_name!r} of {read.created_utc or 'an unknown day'}"
     assert report.notes == [f"one.rrd holds 2 recordings: only {one} is read; make a file of each of the others"]
     assert report.notes[0] in report.line()

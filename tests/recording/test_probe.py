@@ -49,6 +49,13 @@ def test_a_process_that_answered_is_asked_again_and_at_most_one_is_kept(path: Pa
         assert asked() == []
 
 
+def test_one_that_ended_between_two_questions_is_not_taken_for_a_damaged_file(path: Path) -> None:
+    with Prober() as prober:
+        assert prober.readable(path)
+        asked()[0].kill()
+        assert prober.readable(path)
+
+
 def test_one_that_ended_meanwhile_is_not_taken_for_a_damaged_file(path: Path) -> None:
     with Prober() as prober:
         assert prober.readable(path)

@@ -111,6 +111,21 @@ def test_every_shape_wears_its_texture(tmp_path: Path) -> None:
     assert len(looks) >= len(SHAPES) * len(LOOKS)
 
 
+def test_a_large_mesh_wears_the_mean_colour_of_its_cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, store = every_shape(), AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, infos(model))
+    large = [v for v in spec.visuals if v.geometry.hfield >= 0 and "cube" in spec.materials[v.material].name]
+    assert large
+    for visual in large:
+        assert reader.form(visual).mesh is reader.form(visual).mesh  # cut once
+    monkeypatch.setattr(scene, "MOST_BAKED", 1)
+    for visual in large:
+        form = reader.form(visual)
+        assert (form.kind, form.texture, form.uv) == (scene.MESH, None, None)
+        assert all(0.05 < part < 0.95 for part in form.tint)
+
+
 def test_a_cube_of_one_colour_tints_and_a_large_one_is_small(tmp_path: Path) -> None:
     """A shape that wears one colour stays the viewer's own; what is worn is in the file every time."""
     model = mujoco.MjModel.from_xml_string(
