@@ -80,7 +80,7 @@ class Deformables:
         self.vertices: dict[str, NDArray[np.float32]] = {}
         self.capture_ns: dict[str, int] = {}
         self._meshes: list[_Mesh] = []
-        self._epoch = -1
+        self._epoch = ("", -1)  # session and scene epoch: every session counts from 1
         self._parked = False  # the meshes are of a scene that is no more: their vertices are not shown
         self._asked = ""  # the scene whose specification is on its way, or did not come
         self._parts: tuple[Deformable, ...] | None = None  # of that
@@ -97,12 +97,14 @@ class Deformables:
         if not self._client.mirror.synced:  # it may have heard of another scene, and not yet of which
             return []
         if self._client.ready:
-            self._follow(self._client.mirror.scene_hash, self._client.mirror.scene_epoch)
+            welcome = self._client.connection.welcome
+            session = "" if welcome is None else welcome.session_id
+            self._follow(self._client.mirror.scene_hash, (session, self._client.mirror.scene_epoch))
         if self._fetch is not None and self._fetch.done:
             self._take(self._fetch)
         return [] if self._parked else [mesh.key for mesh in self._meshes if self._show(mesh)]
 
-    def _follow(self, scene_hash: str, epoch: int) -> None:
+    def _follow(self, scene_hash: str, epoch: tuple[str, int]) -> None:
         begun_anew, self._epoch = epoch != self._epoch, epoch
         if scene_hash == self.scene_hash:  # also after a reset, or when a patch was taken back
             if self._asked != scene_hash:

@@ -263,3 +263,16 @@ def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
     assert len(bomb) < 100_000
     with pytest.raises(AssetError, match=f"at most {MAX_ASSET_BYTES}"):
         _Mesh("a", part, memoryview(bomb))
+
+
+def test_another_session_shows_nothing_of_the_one_before() -> None:
+    """A server that was started anew at the same address: both count their scenes from 1."""
+    client = Client("127.0.0.1:1", role="observer", name="screen")
+    shapes = Deformables(client)
+    shapes._follow("one", ("a", 1))
+    shapes.vertices["cloth"], shapes.capture_ns["cloth"] = np.zeros((4, 3), np.float32), 5
+    shapes._follow("patched", ("a", 1))
+    assert shapes.vertices.keys() == shapes.capture_ns.keys() == {"cloth"}
+    shapes._follow("other", ("b", 1))
+    assert shapes.vertices == shapes.capture_ns == {}
+    client.close()
