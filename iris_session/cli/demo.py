@@ -42,7 +42,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random in the emulated people")
     parser.add_argument(
-        "--timeout", type=positive_seconds, default=90.0, metavar="S", help="give up after this many seconds"
+        "--timeout", type=positive_seconds, default=150.0, metavar="S", help="give up after this many seconds"
     )
     link = parser.add_mutually_exclusive_group()
     link.add_argument(

@@ -8,7 +8,7 @@ import math
 from anchors.pose import PoseTuple, Vec3, distance, quat_angle, quat_from_yaw, quat_mul
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.deformables import SoftEyes
-from iris_session.emulator.behaviours.soft import PICTURE_LATE_S, SoftPhases
+from iris_session.emulator.behaviours.soft import SoftPhases
 from iris_session.emulator.behaviours.things import DOWN, above
 from iris_session.protocol.names import Device
 
@@ -71,7 +71,7 @@ class Folder(SoftPhases):
         self._outward: Vec3 = (0.0, 0.0, 0.0)  # from the partner's corner to mine
         self._ahead: Vec3 = (0.0, 0.0, 0.0)  # from my corner to where it goes
         self._shakes = 0
-        self._since_s = 0.0  # session time from which on the cloth must be seen
+        self._since_s = 0.0  # since when both hands are back; session time
         self._mending = False  # the corners were laid down apart and are brought together
         self._alone = False  # the partner does not take part any more
         self._diagonal = 0.0  # yaw from my corner to the middle [rad]
@@ -197,9 +197,7 @@ class Folder(SoftPhases):
 
     def _sight(self) -> None:
         """Waits for a picture of the cloth that is younger than the movement."""
-        if self._entering_now:
-            self._since_s = self.eyes.now_s
-        if self.eyes.captured_s > self._since_s + 0.2 or self._waited(PICTURE_LATE_S):
+        if self._watched(0.2):
             self._carried("aim", math.inf)
 
     def _aim(self) -> None:
@@ -255,7 +253,7 @@ class Folder(SoftPhases):
 
     def _judge(self) -> None:
         """Whether the corner stayed where it was laid."""
-        if self.eyes.corners_still_s < 0.3 and not self._waited(5.0):
+        if self.eyes.corners_still_s < 0.3 and not self._watched(5.0):
             return
         if self.eyes.corner(self._mine)[2] > self._table() + HANGING and self._shakes < SHAKES:
             self._shakes += 1
@@ -289,7 +287,7 @@ class Folder(SoftPhases):
         if self._entering_now or busy:
             self._since_s = self.eyes.now_s
         settled = self.eyes.captured_s > self._since_s + SETTLED_S
-        if self._waited(PATIENCE_S) or (settled and self._folded(FOLDED)):
+        if (settled or self._waited(PATIENCE_S)) and self._folded(FOLDED):
             self._finish()
 
     def _shake(self) -> None:

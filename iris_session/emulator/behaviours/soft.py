@@ -21,6 +21,15 @@ class SoftPhases(Phases):
         self.eyes = eyes
         super().__init__(robot, device, eyes, arm)
         self._lost_s: float | None = None  # since when it seems to stay behind; session time
+        self._phase_s = 0.0  # when the phase began; session time
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._phase_s = self.eyes.now_s
+
+    def _watched(self, seconds: float) -> bool:
+        """Whether the picture shows what became of it in the first `seconds` of this phase, or is too late for that."""
+        return self.eyes.captured_s > self._phase_s + seconds or self._waited(seconds + PICTURE_LATE_S)
 
     @abstractmethod
     def _holding(self) -> bool:
