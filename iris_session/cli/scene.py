@@ -161,7 +161,8 @@ def _files_of_model(scene: str) -> list[Path]:
         return []
     import mujoco
 
-    return [Path(name) for name in mujoco.mju_getXMLDependencies(str(path))]
+    names = getattr(mujoco, "mju_getXMLDependencies", None)  # since MuJoCo 3.3.7
+    return [] if names is None else [Path(name) for name in names(str(path))]
 
 
 def _same_file(a: Path, b: Path) -> bool:

@@ -53,6 +53,10 @@ _MEANINGS: Final[Mapping[str, str]] = {
     "recorded_vertices": "frames of what bends that the recording is without",
 }
 
+#: Why a request for a piece of the scene was not answered: the reasons are those of the protocol.
+_OF_ASSETS: Final = "assets_"
+_ASSETS: Final = "requests for pieces of the scene, refused; clients ask again"
+
 
 def told(drops: Mapping[str, int]) -> str:
     """The most frequent ones with what they mean; empty for none."""
@@ -61,4 +65,5 @@ def told(drops: Mapping[str, int]) -> str:
 
 
 def _meaning(reason: str) -> str:
-    return f" ({_MEANINGS[reason]})" if reason in _MEANINGS else ""
+    meaning = _MEANINGS.get(reason, _ASSETS if reason.startswith(_OF_ASSETS) else "")
+    return f" ({meaning})" if meaning else ""

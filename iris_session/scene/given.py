@@ -146,7 +146,7 @@ def numbers(what: str, values: Any, count: int, *, above: float | None = None) -
     try:
         texts = isinstance(values, str | bytes)  # whose digits would be taken for numbers
         found = tuple(float(_no_text(v)) for v in ((None,) if texts else values))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneBuildError(f"{what} is {values!r}: {count} numbers are needed") from None
     if len(found) != count or not np.isfinite(found).all():
         raise SceneBuildError(f"{what} is {values!r}: {count} finite numbers are needed")
@@ -162,8 +162,9 @@ def _no_text(value: Any) -> Any:
 def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
     """Rows of finite float32, read-only."""
     try:
-        array = np.array(values, np.float32)
-    except (TypeError, ValueError):
+        given = np.asarray(values)
+        array = np.array([] if given.dtype.kind in "USO" else given, np.float32)
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0, np.float32)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
         raise SceneBuildError(f"an array of shape {array.shape}: finite numbers of shape (n, {width}) are needed")

@@ -283,7 +283,7 @@ class _Glb:
             look["roughnessFactor"] = min(max(shine, 0.05), 1.0)
             found["name"] = material.name or f"material_{index}"
             worn = material.texture()
-            if worn >= 0 and self._spec.textures[worn].channels == 4:
+            if mapped and worn >= 0 and self._spec.textures[worn].channels == 4:
                 found["alphaMode"] = "BLEND"
             for where, key, texture in (
                 (look, "baseColorTexture", self._texture(worn) if cube is None else self._atlas(cube)),

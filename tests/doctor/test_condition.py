@@ -11,7 +11,7 @@ import pytest
 
 from iris_session.doctor import condition
 from iris_session.doctor.condition import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
-from iris_session.doctor.dropped import _MEANINGS
+from iris_session.doctor.dropped import _MEANINGS, told
 from iris_session.doctor.findings import Finding
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
@@ -272,6 +272,8 @@ def test_what_drops_mean_is_told() -> None:
         one for one in conditions(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9") if one.check == "drops"
     )
     assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
+    meaning = "requests for pieces of the scene, refused; clients ask again"
+    assert told({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
 
 
 def test_every_reason_that_the_front_counts_is_explained() -> None:

@@ -61,6 +61,7 @@ def test_what_checks_files_takes_none_of_the_working_folder(trapped: Path, monke
         env=children.environment(), input='["readable", "/none"]\n', capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert "taken for a module" not in done.stderr
+    assert (done.returncode, done.stdout) == (0, "0\n")
 
 
 def test_a_checkout_that_is_not_installed_starts_its_own_modules(tmp_path: Path) -> None:

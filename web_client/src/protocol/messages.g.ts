@@ -1109,7 +1109,8 @@ export interface Paired {
  * Answer to `GetStatus`. Shares are of the last ten seconds unless they say `total`.
  *
  * `late_causes`: late ticks by where the time went (`LateCause`), and `skipped` for those given up after a long gap.
- * `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket.
+ * `lateness`: of ticks, after their deadline. `step_to_publish`: end of tick to the state socket, of the last five
+ * seconds; null below 25 states in them.
  * `drops`: by reason, everything that was thrown away anywhere. `restarts`: of front and recorder.
  * `authority_silent_ns`: since the authority last spoke to the front; then its part (ticks, roster, robots, recorder)
  * is as old. -1: it has not spoken yet. `cpu_share`: of one processor, by the authority's process; `load`: of the
