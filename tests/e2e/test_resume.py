@@ -106,6 +106,7 @@ def test_after_ctrl_c_everybody_is_back_and_what_was_stopped_stays_stopped(
     ann = driving.client
     me, lease = ann.participant_id, ann.mirror.leases["left"]
     dora.estop("to be kept")
+    stage.seconds(0.5)  # paused while it brakes, the arm would brake to its end afterwards: a millimetre
     dora.control("pause")
     stage.run(lambda: ann.mirror.estop and ann.mirror.paused, "everything stands still")
     session_id, tip = _session(ann), driving.tip
