@@ -54,7 +54,8 @@ E2E = $(BIN)/python -m pytest -q -m e2e -n $(JOBS) --dist loadfile --no-loadscop
 
 # Tests with real processes, sockets or threads (`live`, tests/conftest.py) run in real time: a machine that is taken away
 # for a second can fail one. When the run was whole and only such tests failed (status 1), they are named and judged once
-# more, alone; what fails twice fails, and processes left behind (status 7) fail at once. $(1): the run; $(2): its marker; $(3): options of the second.
+# more, alone; what fails twice fails, and processes left behind (status 7) fail at once.
+# $(1): the run; $(2): its marker; $(3): options of the second.
 LAST = --last-failed --last-failed-no-failures none
 define JUDGED
 $(1) $(T); status=$$?; \

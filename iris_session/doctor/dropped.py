@@ -55,7 +55,7 @@ _MEANINGS: Final[Mapping[str, str]] = {
 
 #: Why a request for a piece of the scene was not answered: the reasons are those of the protocol.
 _OF_ASSETS: Final = "assets_"
-_ASSETS: Final = "requests for pieces of the scene, refused; clients ask again"
+_ASSETS: Final = "requests for pieces of the scene that were refused"
 
 
 def told(drops: Mapping[str, int]) -> str:

@@ -15,7 +15,7 @@ from iris_session.client.discovery import FoundSession
 from iris_session.client.errors import ClientError
 from iris_session.client.meeting import is_loopback
 from iris_session.doctor import condition, door, reach
-from iris_session.doctor.findings import Findings, failed, ok
+from iris_session.doctor.findings import OK, Findings, failed, ok
 from iris_session.doctor.machine import machine
 from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.names import Role
@@ -128,7 +128,7 @@ def _way(target: Address, findings: Findings, heard: list[FoundSession]) -> bool
 def _door(result: Examination, target: Address, typed: str, code: str, role: str, told: Callable[[str], None]) -> None:
     findings = result.findings
     introduced, version, said = reach.introduction(target)
-    base = reach.base_of_ports(target) if said is None else None
+    base = reach.base_of_ports(target) if introduced.state != OK else None
     if base is not None:
         findings.add(base)
         findings.skip("version", *DOOR, *ARRIVAL, *CONDITION)

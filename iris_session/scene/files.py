@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -20,6 +21,7 @@ ROBOTS: Final = ("urdf",)
 #: What MuJoCo reads.
 MODELS: Final = ("mjb", "mjcf", "xml")
 ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
+_ROOM: Final = Path(__file__).parent
 #: Most files that an error text lists.
 _LISTED: Final = 8
 #: Errors whose texts say nothing of a file.
@@ -70,11 +72,20 @@ def guarded(path: Path, kind: str, read: Callable[[], Any]) -> Any:
     except _OF_CODE as error:  # what they say is about the code of a library, which has not found what it needs
         raise SceneBuildError(
             f"{path} is damaged, or no {kind.upper()}: something in it is missing or of another kind; "
-            "export or download it again"
+            f"export or download it again{_of_ours(error)}"
         ) from error
     except Exception as error:
         text = " ".join(str(error).split())[:200]  # one line
         raise SceneBuildError(f"{path} is damaged, or no {kind.upper()}: {type(error).__name__}: {text}") from error
+
+
+def _of_ours(error: BaseException) -> str:
+    """For error texts: where our own code stopped, if it was not a library; then it may be wrong, not the file."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    place = Path(last.filename)
+    if _ROOM not in place.parents:
+        return ""
+    return f" (if other programs open it, please report: {type(error).__name__}: {error}, {place.name}:{last.lineno})"
 
 
 def ending(path: Path) -> str:

@@ -161,13 +161,18 @@ def _no_text(value: Any) -> Any:
 
 def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
     """Rows of finite float32, read-only."""
+    needed = f"finite numbers of shape (n, {width}) are needed"
     try:
         given = np.asarray(values)
-        array = np.array([] if given.dtype.kind in "USO" else given, np.float32)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0, np.float32)
+    except (TypeError, ValueError):
+        raise SceneBuildError(f"rows that are no array: {needed}") from None
+    if given.dtype.kind not in "biuf":
+        what = "texts" if given.dtype.kind in "US" else f"an array of {given.dtype}"
+        raise SceneBuildError(f"{what} of shape {given.shape}: {needed}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite then
+        array = np.array(given, np.float32)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
-        raise SceneBuildError(f"an array of shape {array.shape}: finite numbers of shape (n, {width}) are needed")
+        raise SceneBuildError(f"an array of shape {array.shape}: {needed}")
     if count is not None and len(array) != count:
         raise SceneBuildError(f"{len(array)} rows for {count} vertices: one each is needed")
     array.setflags(write=False)

@@ -272,7 +272,7 @@ def test_what_drops_mean_is_told() -> None:
         one for one in conditions(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9") if one.check == "drops"
     )
     assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
-    meaning = "requests for pieces of the scene, refused; clients ask again"
+    meaning = "requests for pieces of the scene that were refused"
     assert told({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
 
 

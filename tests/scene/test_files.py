@@ -230,6 +230,22 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, name: str, data: bytes,
         load_file(tmp_path / name)
 
 
+def test_a_mistake_of_ours_is_not_only_told_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader of ours that stops is named; what a library stops at says nothing to anybody."""
+    monkeypatch.setattr("iris_session.scene.trimesh_files.read_with_trimesh", wrong_reader)
+    monkeypatch.setattr("iris_session.scene.files._ROOM", Path(__file__).parent)
+    (tmp_path / "a.stl").write_bytes(b"solid a")
+    with pytest.raises(SceneBuildError, match=r"please report: TypeError: .*test_files\.py:\d+"):
+        load_file(tmp_path / "a.stl")
+    monkeypatch.setattr("iris_session.scene.files._ROOM", tmp_path)
+    with pytest.raises(SceneBuildError, match=r"export or download it again$"):
+        load_file(tmp_path / "a.stl")
+
+
+def wrong_reader(*_: object) -> None:
+    raise TypeError("'float' object is not iterable")
+
+
 def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SceneBuildError, match="no such file"):
         load_file(tmp_path / "lost.stl")

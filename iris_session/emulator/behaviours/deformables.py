@@ -43,16 +43,16 @@ class SoftEyes(Eyes):
             raise ValueError(f"no operator knows the deformable '{deformable}'. Known: {', '.join(CORNERS)}")
         super().__init__(bodies, robots, arm=arm)
         self.deformable = deformable
-        self._watched = watched(deformable)
+        self._indices = watched(deformable)
         self._vertices: dict[int, Seen] = {}
-        self._captured_s = 0.0
-        self._now_s = 0.0
+        #: Session time of the picture, and at which the deformable was as it is shown [s].
+        self.now_s = self.captured_s = 0.0
 
     def look(self, view: OperatorView) -> None:
         super().look(view)
-        self._now_s = now_s = view.session_time_ns * 1e-9
-        self._captured_s = view.vertices_ns(self.deformable) * 1e-9
-        for index in self._watched:
+        self.now_s = now_s = view.session_time_ns * 1e-9
+        self.captured_s = view.vertices_ns(self.deformable) * 1e-9
+        for index in self._indices:
             p_world = view.vertex(self.deformable, index)
             if p_world is None:
                 continue
@@ -61,7 +61,7 @@ class SoftEyes(Eyes):
                 self._vertices[index].update(pose, now_s)
             else:
                 self._vertices[index] = Seen(pose, now_s)
-        if len(self._vertices) < len(self._watched):
+        if len(self._vertices) < len(self._indices):
             self.missing = (*self.missing, self.deformable)
 
     def corner(self, index: int) -> Vec3:
@@ -87,19 +87,7 @@ class SoftEyes(Eyes):
     @property
     def corners_still_s(self) -> float:
         """For how long [s] all corners were seen to keep still: a picture that stands still tells of nothing."""
-        return max(
-            0.0, self._captured_s - max(self._vertices[index].rest_since_s for index in CORNERS[self.deformable])
-        )
-
-    @property
-    def now_s(self) -> float:
-        """Session time of the picture [s]."""
-        return self._now_s
-
-    @property
-    def captured_s(self) -> float:
-        """Session time [s] at which the deformable was as it is shown."""
-        return self._captured_s
+        return max(0.0, self.captured_s - max(self._vertices[index].rest_since_s for index in CORNERS[self.deformable]))
 
 
 def mean(points: Iterable[Vec3]) -> Vec3:

@@ -93,7 +93,6 @@ class Folder(SoftPhases):
             "open": self._open,
             "leave": self._leave,
             "judge": self._judge,
-            "return": self._go_home,
             "watch": self._watch,
             "shake": self._shake,
             "back_off": self._back_off,
@@ -197,7 +196,7 @@ class Folder(SoftPhases):
 
     def _sight(self) -> None:
         """Waits for a picture of the cloth that is younger than the movement."""
-        if self._watched(0.2):
+        if self._seen_for(0.2):
             self._carried("aim", math.inf)
 
     def _aim(self) -> None:
@@ -253,7 +252,7 @@ class Folder(SoftPhases):
 
     def _judge(self) -> None:
         """Whether the corner stayed where it was laid."""
-        if self.eyes.corners_still_s < 0.3 and not self._watched(5.0):
+        if self.eyes.corners_still_s < 0.3 and not self._seen_for(5.0):
             return
         if self.eyes.corner(self._mine)[2] > self._table() + HANGING and self._shakes < SHAKES:
             self._shakes += 1
@@ -275,11 +274,8 @@ class Folder(SoftPhases):
         self._retry(f"the corners of the {self.cloth} lie {missing * 100:.1f} cm apart")
         return False
 
-    def _go_home(self) -> None:
-        if self._entering_now and self._home is not None:
-            self.hand.move_to(self._home)
-        if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
-            self._enter("watch")
+    def _returned(self) -> None:
+        self._enter("watch")
 
     def _watch(self) -> None:
         """Until the partner is back too: what he does may move the own corner."""

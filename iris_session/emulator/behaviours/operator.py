@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_rotate
 from iris_session.emulator.behaviours.arms import ARM, ArmKind
 from iris_session.emulator.behaviours.eyes import Eyes
@@ -37,9 +39,9 @@ class Operator(Phases):
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 
+    @abstractmethod
     def _first_phase(self) -> str:
         """The phase in which taking the thing begins, and begins again after a failed attempt."""
-        raise NotImplementedError
 
     def _wait(self) -> None:
         self._home = self.eyes.tip(self.robot)

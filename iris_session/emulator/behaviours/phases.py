@@ -71,11 +71,15 @@ class Phases:
             self._give_up(f"not to be seen in the scene: {', '.join(self._watching.missing)}")
 
     def _return(self) -> None:
-        """Back to where the hand began, and done."""
+        """Back to where the hand began."""
         if self._entering_now and self._home is not None:
             self.hand.move_to(self._home)
         if self.hand.arrived(0.02, 0.1) or self._waited(6.0):
-            self._finish()
+            self._returned()
+
+    def _returned(self) -> None:
+        """What follows when the hand is back where it began."""
+        self._finish()
 
     def _enter(self, phase: str) -> None:
         self.phase, self._entering, self._entered_s = phase, True, self.hand.now_s

@@ -27,8 +27,8 @@ class SoftPhases(Phases):
         super()._enter(phase)
         self._phase_s = self.eyes.now_s
 
-    def _watched(self, seconds: float) -> bool:
-        """Whether the picture shows what became of it in the first `seconds` of this phase, or is too late for that."""
+    def _seen_for(self, seconds: float) -> bool:
+        """Whether the picture shows the first `seconds` of this phase, or is too late for that."""
         return self.eyes.captured_s > self._phase_s + seconds or self._waited(seconds + PICTURE_LATE_S)
 
     @abstractmethod

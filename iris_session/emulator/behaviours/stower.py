@@ -88,7 +88,7 @@ class Stower(SoftPhases):
             self.hand.trigger_goal = 1.0
         if self.hand.trigger_done() and self._waited(0.9) and self._holding():
             self._enter("lift")
-        elif self._watched(2.5):
+        elif self._seen_for(2.5):
             self._retry(f"{self.robot} closed its gripper beside the {self.soft}")
 
     def _lift(self) -> None:
@@ -131,7 +131,7 @@ class Stower(SoftPhases):
 
     def _judge(self) -> None:
         """Whether it lies in the box."""
-        if self.eyes.corners_still_s < 0.3 and not self._watched(5.0):
+        if self.eyes.corners_still_s < 0.3 and not self._seen_for(5.0):
             return
         if all(self._inside(corner) for corner in self.eyes.corners.values()):
             self._enter("return")
