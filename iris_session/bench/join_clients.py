@@ -1,26 +1,37 @@
-"""Who joins in `bench join`: a client with an empty cache, then another with what that one left; and a bare transfer.
+"""Who joins in `bench join`: a client with an empty cache, then another with what that one left; and what both are
+compared with: threads of the same priority that only copy memory, and a bare transfer.
 
     python -m iris_session.bench.join_clients < job.json
 
-Prints `ready`, waits for a line, joins, and prints a `Joined` for each of the two as one line of JSON.
+Prints `ready`, waits for a line, joins, and prints a `Joined` for each of the two as one line of JSON, then a `Copied`;
+waits for another line, and prints the seconds of the bare transfer.
 """
 
 from __future__ import annotations
 
 import gc
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
+import numpy as np
 import zmq
 
 from iris_session.client import AssetCache, Client
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.scene import decode_image, decode_mesh
+from iris_session.system.priority import give_way
 
 JOIN_S: Final = 60.0
+#: Memory is copied for so long, after a pause in which the machine has nothing to do with joining any more; by as many
+#: threads as a client has for assets.
+COPY_S: Final = 2.0
+PAUSE_S: Final = 0.5
+COPY_THREADS: Final = 2
+COPY_BYTES: Final = 16 << 20
 
 
 class JoinJob(msgspec.Struct, frozen=True):
@@ -75,6 +86,34 @@ def join(job: JoinJob) -> Joined:
         )
 
 
+class Copied(msgspec.Struct, frozen=True):
+    """When memory was copied: session time."""
+
+    begin_ns: int
+    end_ns: int
+
+
+def copy_memory(origin_ns: int) -> Copied:
+    """As low as a client's threads for assets, and without any of their work: what every program costs the others that
+    leaves no core idle. numpy copies without Python's lock."""
+    time.sleep(PAUSE_S)
+    begin_ns = time.monotonic_ns()
+    end_ns = begin_ns + round(COPY_S * 1e9)
+
+    def work() -> None:
+        give_way()
+        source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
+        while time.monotonic_ns() < end_ns:
+            np.copyto(target, source)
+
+    threads = [threading.Thread(target=work) for _ in range(COPY_THREADS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return Copied(begin_ns - origin_ns, end_ns - origin_ns)
+
+
 def _decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
     """What a viewer makes of every asset, by what the scene says of it: this one has meshes and images."""
     meshes = {level.address for mesh in spec.meshes for level in mesh.levels}
@@ -107,6 +146,7 @@ def main() -> None:
     sys.stdin.readline()
     for _ in range(2):
         print(msgspec.json.encode(join(job)).decode(), flush=True)
+    print(msgspec.json.encode(copy_memory(job.origin_ns)).decode(), flush=True)
     sys.stdin.readline()
     print(bare(job.bare_port), flush=True)
 

@@ -16,7 +16,7 @@ KEYS = {
 
 @pytest.mark.e2e
 def test_join_at_the_size_of_a_toy(tmp_path: Path) -> None:
-    options = ("--objects", "70", "--assets-mb", "3", "--clients", "1", "--seconds", "8")
+    options = ("--objects", "70", "--assets-mb", "3", "--clients", "1", "--seconds", "10")
     result = _bench(tmp_path, "join", *options)
     _check(result, "join", KEYS)
     found = result["results"]
@@ -25,6 +25,7 @@ def test_join_at_the_size_of_a_toy(tmp_path: Path) -> None:
     assert found["warm_bytes"] == 0
     assert 0.0 < found["first_picture_s"] <= found["complete_s"]
     assert result["reference"]["bare_transfer_s"] > 0.0
+    assert result["reference"]["others_age_ms_p99_memory_copied"] > 0.0
     held = {one["key"]: one["ok"] for one in result["bars"]}
     assert held.keys() == {"ready_s", "server_rss_mib", "complete_s", "warm_bytes", "others_age_ms_p99"}
     assert held["warm_bytes"]
