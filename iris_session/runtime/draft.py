@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from anchors.pose import compose
 from iris_session.protocol.common import Pose
 from iris_session.runtime.errors import PublishError
 from iris_session.scene import SceneBuildError
@@ -57,6 +56,10 @@ class SceneDraft:
         self._poses = np.array([(*pose.p, *pose.q) for pose in scene.poses]).reshape(-1, 7)
         self._roots = {name: one.T_world_root for name, one in scene.articulations.items()}
         self._joints: dict[str, dict[str, float]] = {name: {} for name in scene.articulations}
+        self._loose = {  # bodies on floating and planar joints: of which articulation
+            part.body: name for name, one in scene.articulations.items() for part in one.parts if part.loose
+        }
+        self._moved: dict[str, dict[str, Pose]] = {name: {} for name in scene.articulations}  # where those were put
         self._beyond: dict[tuple[str, str], str] = {}  # joints that are, and what is said of them
         self._vertices = {name: one.vertices for name, one in scene.deformables.items()}
 
@@ -77,8 +80,10 @@ class SceneDraft:
         pose = Pose(_position(position, name), _unit(quaternion, name))
         with self._lock:
             if name in self._roots:
-                self._place(name, pose, self._joints[name])
+                self._put(self._placed(name, pose, self._joints[name], self._moved[name]))
                 self._roots[name] = pose
+            elif name in self._loose:
+                self._move_loose({name: pose})
             else:
                 self._poses[self._row(name)] = (*pose.p, *pose.q)
 
@@ -96,9 +101,13 @@ class SceneDraft:
         if len(set(rows)) != len(rows):
             twice = next(name for name in names if names.count(name) > 1)
             raise PublishError(f"set_poses: {twice!r} is named more than once: give one pose of each")
+        q = q / lengths[:, None]
+        loose = [row for row, name in enumerate(names) if name in self._loose] if self._loose else []
         with self._lock:
+            if loose:
+                self._move_loose({names[row]: Pose((*p[row].tolist(),), (*q[row].tolist(),)) for row in loose})
             self._poses[rows, :3] = p
-            self._poses[rows, 3:] = q / lengths[:, None]
+            self._poses[rows, 3:] = q
 
     def set_joints(self, name: str, positions: object) -> None:
         _check_name(name)
@@ -115,7 +124,7 @@ class SceneDraft:
             raise PublishError(f"set_joints({name!r}): {error}") from error
         with self._lock:
             joints = self._joints[name] | given
-            self._place(name, self._roots[name], joints)
+            self._put(self._placed(name, self._roots[name], joints, self._moved[name]))
             self._joints[name] = joints
             for joint in articulation.joints:
                 if joint.name in given:
@@ -148,17 +157,31 @@ class SceneDraft:
             raise PublishError(f"nothing that moves is called {name!r} in this scene; {_nearest(name, known, 'names')}")
         return row
 
-    def _place(self, name: str, root: Pose, joints: Mapping[str, float]) -> None:
-        """The bodies of an articulation, all or none: finite joints may still put one where nothing can be."""
+    def _move_loose(self, poses: Mapping[str, Pose]) -> None:
+        """Bodies on floating and planar joints, with everything on them; they stay there when joints are set."""
+        moved = {name: self._moved[name].copy() for name in {self._loose[body] for body in poses}}
+        for body, pose in poses.items():
+            moved[self._loose[body]][body] = pose
+        placed = [self._placed(name, self._roots[name], self._joints[name], one) for name, one in moved.items()]
+        self._moved |= moved
+        for one in placed:
+            self._put(one)
+
+    def _placed(
+        self, name: str, root: Pose, joints: Mapping[str, float], moved: Mapping[str, Pose]
+    ) -> Mapping[str, Pose]:
+        """The bodies of an articulation. Raises `PublishError`: finite joints may put one where nothing can be."""
         try:
-            bodies = self._scene.articulations[name].poses(joints)
-            placed = {body: compose((root.p, root.q), (T.p, T.q)) for body, T in bodies.items()}
+            placed = self._scene.articulations[name].placed(root, joints, moved)
         except ValueError:  # farther, or turned more often, than floats can tell
             placed = {}
-        if not placed or not all(abs(v) <= FARTHEST_M for p, _ in placed.values() for v in p):  # NaN is not
+        if not placed or not all(abs(v) <= FARTHEST_M for one in placed.values() for v in one.p):  # NaN is not
             raise PublishError(f"{name!r} would lie more than 1,000 km away: metres and radians are expected")
-        for body, (p, q) in placed.items():
-            self._poses[self._rows[body]] = (*p, *q)
+        return placed
+
+    def _put(self, placed: Mapping[str, Pose]) -> None:
+        for body, pose in placed.items():
+            self._poses[self._rows[body]] = (*pose.p, *pose.q)
 
     def _judge(self, name: str, joint: Joint, position: float) -> None:
         """Whether a joint is so far beyond its limits that somebody should know."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from anchors.pose import compose, quat_from_rotvec
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
 from iris_session.scene.errors import SceneBuildError
+
+_NONE: Final[Mapping[str, Pose]] = {}
 
 
 class Joint(NamedTuple):
@@ -33,6 +35,7 @@ class Part(NamedTuple):
     `T_parent_joint`: of the joint in the parent's frame; at position 0 the body's frame is there. `axis`: unit vector
     in the joint's frame. `sliding`: along the axis, else around it; a `joint` of -1 is fixed. The position is that of
     `joint` (by its place in `Articulation.joints`) times `multiplier` plus `offset`: 1 and 0 unless it mimics another.
+    `loose`: its joint is floating or planar; it stands at position 0 until somebody says where it is.
     """
 
     body: str
@@ -43,6 +46,7 @@ class Part(NamedTuple):
     joint: int = -1
     multiplier: float = 1.0
     offset: float = 0.0
+    loose: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,16 +74,22 @@ class Articulation:
         Joints that are not in `q` are at rest. Raises `SceneBuildError` for names that cannot be set, and for
         positions that are no finite numbers.
         """
+        return self.placed(IDENTITY, q)
+
+    def placed(self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE) -> dict[str, Pose]:
+        """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
+        name; what is below moves with them, whatever is above."""
         self.check(q)
         at = [float(q.get(joint.name, joint.rest)) for joint in self.joints]
         placed: list[tuple[Vec3, tuple[float, float, float, float]]] = []
         for part in self.parts:
-            T_root_body = (part.T_parent_joint.p, part.T_parent_joint.q)
-            if part.parent >= 0:
-                T_root_body = compose(placed[part.parent], T_root_body)
+            above = placed[part.parent] if part.parent >= 0 else (T_world_root.p, T_world_root.q)
+            T_world_body = compose(above, (part.T_parent_joint.p, part.T_parent_joint.q))
             if part.joint >= 0:
-                T_root_body = compose(T_root_body, _moved(part, at[part.joint]))
-            placed.append(T_root_body)
+                T_world_body = compose(T_world_body, _moved(part, at[part.joint]))
+            elif part.body in loose:
+                T_world_body = (loose[part.body].p, loose[part.body].q)
+            placed.append(T_world_body)
         return {part.body: Pose(*T) for part, T in zip(self.parts, placed, strict=True)}
 
     def check(self, q: Mapping[str, float]) -> None:

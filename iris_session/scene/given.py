@@ -56,6 +56,16 @@ _ELSEWHERE: Final = {
     "parent": "on",
     "size": "half_size",
 }
+
+
+class _UntilGiven:
+    """What `help` shows of a keyword without a value of its own."""
+
+    def __repr__(self) -> str:
+        return "..."
+
+
+_UNTIL_GIVEN: Final = _UntilGiven()
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -68,7 +78,10 @@ def takes(options: type[Any] | None = None) -> Callable[[Method], Method]:
         own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
         given = [
             inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=..., annotation=getattr(kind, "__forward_arg__", kind)
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=_UNTIL_GIVEN,
+                annotation=getattr(kind, "__forward_arg__", kind),
             )
             for name, kind in (options.__annotations__ if options else {}).items()
         ]

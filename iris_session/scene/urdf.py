@@ -27,8 +27,8 @@ from iris_session.scene.references import References, read_bounded
 from iris_session.scene.urdf_joints import read_joints, root_link
 from iris_session.scene.urdf_xml import parsed
 
-#: Joints that move in more ways than one, and that nothing sets: their links are bodies of their own, and stay.
-_UNSET: Final = frozenset({"floating", "planar"})
+#: Joints that move in more ways than one: their links are moved as bodies, not by positions of joints.
+_LOOSE: Final = frozenset({"floating", "planar"})
 
 
 @dataclass(frozen=True)
@@ -139,16 +139,17 @@ class _Reader:
                 if joint.type == "fixed":
                     waiting.append((joint.child, part, T_part_child))
                     continue
-                if joint.type in _UNSET:
-                    self._skip(f"joint {joint.name} is {joint.type}: its link stays where it is")
+                body = f"{self._name}/{joint.child}"
+                if joint.type in _LOOSE:
+                    self._skip(f"joint {joint.name} is {joint.type}: {body} stays where it is until set_pose moves it")
                     at = pose_of(T_part_child[:3, :3], T_part_child[:3, 3])
-                    parts.append(Part(f"{self._name}/{joint.child}", part, at))
+                    parts.append(Part(body, part, at, loose=True))
                     waiting.append((joint.child, len(parts) - 1, np.eye(4)))
                     continue
                 drive = table.drives[joint.name]
                 parts.append(
                     Part(
-                        body=f"{self._name}/{joint.child}",
+                        body=body,
                         parent=part,
                         T_parent_joint=pose_of(T_part_child[:3, :3], T_part_child[:3, 3]),
                         axis=drive.axis,

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.runtime.draft import MAX_SAID, SceneDraft
 from iris_session.runtime.errors import PublishError
 from iris_session.scene.articulation import Articulation, Joint, Part
@@ -86,6 +86,53 @@ def test_one_body_of_an_articulation_can_be_placed_by_itself(draft: SceneDraft) 
     draft.set_pose("arm/upper", (0.0, 0.0, 5.0), UNIT)
     assert pose(draft, "arm/upper")[2] == 5.0
     assert pose(draft, "arm/fore")[2] == 0.5
+
+
+def on_a_floating_base() -> SceneDraft:
+    """The arm, its upper arm on a floating joint."""
+    scene = composed()
+    robot = scene.articulations["arm"]
+    base, _, fore = robot.parts
+    parts = (base, Part("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT), loose=True), fore)
+    return SceneDraft(replace(scene, articulations={"arm": replace(robot, parts=parts)}))
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_what_is_on_a_floating_joint_stays_where_it_was_put(many: bool) -> None:
+    draft = on_a_floating_base()
+    draft.set_joints("arm", {"slide": 0.25})
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([1.25, 0.0, 1.0]), "at first it goes with the rest"
+    if many:
+        draft.set_poses(["red", "arm/upper"], [(1.0, 2.0, 3.0), (0.0, 0.0, 5.0)], [UNIT, TURNED])
+    else:
+        draft.set_pose("arm/upper", (0.0, 0.0, 5.0), TURNED)
+    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 5.0]), "what is on it goes with it"
+    draft.set_joints("arm", {"slide": 0.5})
+    draft.set_pose("arm", (7.0, 0.0, 0.0), UNIT)
+    assert pose(draft, "arm/base")[:3] == [7.0, 0.0, 0.0]
+    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
+
+
+def test_links_that_are_named_with_the_floating_one_are_where_they_are_said_to_be() -> None:
+    draft = on_a_floating_base()
+    draft.set_poses(["arm/fore", "arm/upper"], [(9.0, 9.0, 9.0), (0.0, 0.0, 5.0)], [UNIT, UNIT])
+    assert pose(draft, "arm/fore")[:3] == [9.0, 9.0, 9.0]
+
+
+def test_a_floating_link_that_takes_others_too_far_away_changes_nothing() -> None:
+    draft = on_a_floating_base()
+    before = everything(draft)
+    for put in (
+        lambda: draft.set_pose("arm/upper", (1e6, 0.0, 0.0), UNIT),
+        lambda: draft.set_poses(["red", "arm/upper"], [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)], [UNIT, UNIT]),
+    ):
+        with pytest.raises(PublishError, match="more than 1,000 km away"):
+            put()
+        assert everything(draft) == before
+    draft.set_joints("arm", {})
+    assert pose(draft, "arm/upper")[0] == 0.0
 
 
 def test_many_bodies_at_once_are_as_one_after_the_other(draft: SceneDraft) -> None:

@@ -315,6 +315,7 @@ def test_keywords_are_listed_for_help() -> None:
     named = inspect.signature(SceneBuilder.add_box).parameters
     assert list(named)[:3] == ["self", "name", "half_size"]
     assert {"rgba", "texture", "position", "quaternion", "movable", "on"} < set(named)
+    assert str(named["metallic"]) == "metallic: 'float' = ..."
     assert "movable" not in inspect.signature(SceneBuilder.add_deformable).parameters
 
 
