@@ -63,7 +63,7 @@ def every_shape() -> mujoco.MjModel:
         <camera name="chaser" mode="targetbody" target="seen" pos="6 -3 3"/>
         <camera name="top" pos="2 4 12" xyaxes="1 0 0 0 1 0" fovy="50"/>
         <camera name="flat" pos="2 4 9" xyaxes="1 0 0 0 1 0" fovy="9" projection="orthographic"/>
-        <camera name="real" pos="2 -6 5" xyaxes="1 0 0 0 .6 .8" resolution="240 180" sensorsize=".004 .003"
+        <camera name="real" pos="2 -6 5" xyaxes="1 0 0 0 .6 .8" resolution="240 180" sensorsize=".004 .0036"
                 focalpixel="200 210" principalpixel="9 -7"/>
         {"".join(geoms)}</worldbody></mujoco>""",
         _pictures(rng),

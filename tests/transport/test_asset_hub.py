@@ -139,6 +139,9 @@ def test_a_full_connection_is_passed_over_for_longer_and_longer() -> None:
     one.full(reader, now_ns)
     assert ask(one, 1, "small", now_ns=now_ns) == ""  # it reads again
     assert reader.retry_ns == 0
+    one.sent(reader)
+    one.full(reader, now_ns)
+    assert reader.retry_ns - now_ns == pauses[0], "what got through ends the long pauses"
 
 
 def test_who_left_waits_for_nothing() -> None:
@@ -150,6 +153,16 @@ def test_who_left_waits_for_nothing() -> None:
     ask(one, 2)
     one.left(102)
     assert (one.waiting, served(one, 1)) == (0, [])
+
+
+def test_begun_anew_nobody_waits_and_everybody_may_ask() -> None:
+    one = hub()
+    ask(one, 1)
+    ask(one, 2)
+    assert one.begin_anew() == [101, 102]
+    assert (one.waiting, one.turn(0), one.next_turn_ns()) == (0, None, None)
+    assert ask(one, 1) == ""
+    assert served(one, 10) == [1]
 
 
 def test_another_peer_by_the_same_name_is_somebody_else() -> None:
