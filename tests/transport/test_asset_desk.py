@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import zmq
 
+from iris_session.keys import AllowedKey, KeyPair
+from iris_session.protocol.client_messages import Hello
 from iris_session.transport.asset_desk import LOOK_NS, MAX_REPLACED, REPLACED_NS, AssetDesk
 from iris_session.transport.asset_server import Table, Tallied
-from iris_session.transport.clients import ClientTable
+from iris_session.transport.clients import ClientTable, Connection, Peer, Route
 from iris_session.transport.config import SceneInfo
 from iris_session.transport.keyring import Keyring
 from iris_session.transport.limiter import Drops
@@ -36,19 +38,26 @@ class Told:
 
 
 class Desk:
-    def __init__(self) -> None:
+    def __init__(self, keyring: Keyring | None = None) -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self.publisher = StatePublisher(context.socket(zmq.PUB), look(0), lambda: 0)
         self.publisher.use_socket(None)
-        self.told, drops = Told(), Drops()
+        self.told, self.drops, self.clients = Told(), Drops(), ClientTable()
+        self.revoked: set[str] = set()
         self.desk = AssetDesk(
             self.told,  # type: ignore[arg-type]
-            ClientTable(),
-            Keyring(),
-            drops,
+            self.clients,
+            keyring or Keyring(),
+            self.drops,
             self.publisher,
-            lambda key: False,
+            self.revoked.__contains__,
         )
+
+    def join(self, number: int, key: str, gateway: int = 0) -> None:
+        route, peer = Route(b"%d" % number), Peer(number, key)
+        connection = Connection(number, route, peer, ("127.0.0.1", 1), key, Hello("observer", "Ann"), gateway)
+        connection.admitted = True
+        self.clients.add(connection)
 
     def show(self, info: SceneInfo) -> set[str]:
         self.publisher.set_scene(info)
@@ -93,3 +102,18 @@ def test_they_are_so_many_at_most() -> None:
     for number in range(n):
         served = desk.show(look(number))
     assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
+
+
+def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
+    listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
+    desk = Desk(Keyring(KeyPair.new(), read=lambda: listed))
+    desk.join(1, "ann")
+    desk.join(2, "gate")
+    desk.join(3, "bob", gateway=2)
+    desk.revoked.add("eve")
+    desk.desk.turn(0)
+    assert desk.told.table.marks == {"ann", "gate"}
+    assert desk.told.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
+    desk.revoked.add("ann")
+    desk.desk.turn(LOOK_NS)
+    assert desk.told.table.marks == {"gate"}

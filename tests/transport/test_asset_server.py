@@ -322,6 +322,16 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
     assert capfd.readouterr().err.count("a fault in the thread of assets, which goes on: ZeroDivisionError") == 1
 
 
+def test_a_refusal_that_nobody_is_there_to_hear_is_counted() -> None:
+    sockets = open_below(FrontConfig(), None)
+    doors = MediaDoors(sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
+    server = AssetServer(sockets, doors, time.monotonic_ns)  # its thread has not begun, so this one may do its work
+    server._refuse(b"gone", 7, "", AssetRefusal.NOT_ALLOWED)
+    reasons = server.tallied().reasons
+    server.close()
+    assert reasons == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
+
+
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
     if ours + NICER > 19:
