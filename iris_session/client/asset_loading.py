@@ -3,9 +3,9 @@
     wanted --to_look--> looked up in the cache --missing(offset)--> asked for in chunks --whole--> hashed --again, drop
                                                `--drop
 
-Answers come in the order of the requests, so of one asset the bytes come in order too; whatever does not continue what
-is there is passed over, and asked for again. A window bounds what was asked for and is not stored yet. Chunks are as
-large as the link is fast.
+Answers come in the order of the requests, so of one asset the bytes come in order too, and a request whose successor is
+answered was lost: it went with a TCP connection that ended, and is made again. Whatever does not continue what is there
+is passed over. A window bounds what was asked for and is not stored yet. Chunks are as large as the link is fast.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WINDOW_BYTES: Final = 6 << 20
 WINDOW_REQUESTS: Final = MAX_ASSET_REQUESTS // 2
 #: Assets that are looked up, received or hashed at once: small ones must not wait for each other's round trips.
 AT_ONCE: Final = 32
-#: After a refusal that passes; doubled each time, until a chunk comes.
+#: After a refusal that passes, and after a connection that ended; doubled each time, until a chunk comes.
 FIRST_PAUSE_NS: Final = 50_000_000
 LONGEST_PAUSE_NS: Final = 2_000_000_000
 #: A request without an answer for so long, while nothing else comes either: the connection is made anew.
@@ -144,7 +144,7 @@ class AssetLoader:
 
     def requests(self, now_ns: int) -> Iterator[Ask]:
         """What is to be asked now, in the order of the assets. What was yielded counts as asked."""
-        if now_ns < self._paused_until_ns:
+        if self.pauses(now_ns):
             return
         for item in list(self._items.values()):
             while item.open:
@@ -169,12 +169,11 @@ class AssetLoader:
         ask, asked_ns = self._asked.pop(chunk.request_id, (None, 0))
         if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
             return False
+        self._overtake(ask.request_id)
         self._progress_ns, self._pause_ns = now_ns, 0
         self._suit(ask, size, now_ns - asked_ns)
         item = self._items.get(ask.address)
         if item is None or chunk.offset != item.got:
-            if item is not None and item.got < chunk.offset < item.asked:
-                item.asked = chunk.offset  # something before it did not come
             return None
         expected = min(ask.length, chunk.total - chunk.offset)
         if item.total not in (-1, chunk.total) or size > ask.length or (size == 0 and expected):
@@ -191,6 +190,14 @@ class AssetLoader:
         item.asked = max(item.got, min(item.asked, item.total))
         self._unstored += size
         return True
+
+    def _overtake(self, request_id: int) -> None:
+        """This request was answered: those before it will not be, and are made again."""
+        for lost in [earlier for earlier in self._asked if earlier < request_id]:
+            ask, _ = self._asked.pop(lost)
+            item = self._items.get(ask.address)
+            if item is not None:
+                item.asked = max(item.got, min(item.asked, ask.offset))
 
     def _suit(self, ask: Ask, size: int, took_ns: int) -> None:
         """Larger chunks for a fast link, smaller ones for a slow one: whole chunks tell."""
@@ -216,13 +223,13 @@ class AssetLoader:
         ask, _ = self._asked.pop(refused.request_id, (None, 0))
         if ask is None:
             return ""
+        self._overtake(ask.request_id)
         self._progress_ns = now_ns
         item = self._items.get(ask.address)
         if item is None:
             return ""
         if refused.reason in AssetRefusal.PASSING:
-            self._pause_ns = min(max(FIRST_PAUSE_NS, 2 * self._pause_ns), LONGEST_PAUSE_NS)
-            self._paused_until_ns = now_ns + self._pause_ns
+            self._pause(now_ns, self._pause_ns)
             item.asked = max(item.got, min(item.asked, ask.offset))
             return ""
         self.drop(ask.address)
@@ -232,8 +239,22 @@ class AssetLoader:
         text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
         return Failed(ask.address, refused.reason, text)
 
+    def pauses(self, now_ns: int) -> bool:
+        """Whether nothing is to be asked for now."""
+        return now_ns < self._paused_until_ns
+
+    def broke_off(self, now_ns: int) -> None:
+        """As `cut_off`, of a connection that the other end or the network ended: the next one is made after a pause."""
+        before_ns = self._pause_ns
+        self.cut_off()
+        self._pause(now_ns, before_ns)
+
+    def _pause(self, now_ns: int, before_ns: int) -> None:
+        self._pause_ns = min(max(FIRST_PAUSE_NS, 2 * before_ns), LONGEST_PAUSE_NS)
+        self._paused_until_ns = now_ns + self._pause_ns
+
     def cut_off(self) -> None:
-        """The connection ended: what was asked by it will not come, what came stays."""
+        """We ended the connection: what was asked by it will not come, what came stays."""
         self._asked.clear()
         self._pause_ns = self._paused_until_ns = 0
         for item in self._items.values():

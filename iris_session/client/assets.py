@@ -131,14 +131,21 @@ class Assets:
             for address in {address for fetch in self._fetches for address in fetch.pending}:
                 self._fail(address, error)
             return True
-        self._sockets.open_assets(welcome.endpoints.assets)
-        messages = self._sockets.drain_assets()
         now_ns = time.monotonic_ns()
+        if self._loader.pauses(now_ns) and not self._sockets.has_assets:
+            return False
+        self._sockets.open_assets(welcome.endpoints.assets)
+        ended = self._sockets.assets_ended()  # before the last that it has brought is taken
+        messages = self._sockets.drain_assets()
         for frames in messages:
             try:
                 self._take_message(workers, frames, now_ns)
             except ProtocolError:
                 self.assets_malformed += 1
+        if ended:
+            self._sockets.close_assets()
+            self._loader.broke_off(now_ns)
+            return True
         if self._loader.overdue(now_ns):
             self._drop_asset_link()
             return True

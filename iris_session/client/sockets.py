@@ -74,6 +74,7 @@ class ClientSockets:
         self._media: zmq.Socket[bytes] | None = None
         self._ingest: zmq.Socket[bytes] | None = None
         self._assets: zmq.Socket[bytes] | None = None
+        self._assets_monitor: zmq.Socket[bytes] | None = None
         #: Changes whenever a socket is opened or closed.
         self.version = 0
         self._wakes_anybody = False
@@ -169,6 +170,11 @@ class ClientSockets:
             return False
         return True
 
+    @property
+    def has_assets(self) -> bool:
+        """Whether the assets channel is open."""
+        return self._assets is not None
+
     def open_assets(self, port: int) -> None:
         """Connects to the assets channel, if it is not."""
         if self._assets is None:
@@ -178,6 +184,7 @@ class ClientSockets:
             assets.setsockopt(zmq.RCVHWM, ASSETS_HWM)
             assets.setsockopt(zmq.RECONNECT_IVL, 50)
             assets.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+            self._assets_monitor = assets.get_monitor_socket(zmq.EVENT_DISCONNECTED)
             assets.connect(f"tcp://{self._host}:{port}")
             self.version += 1
 
@@ -198,11 +205,15 @@ class ClientSockets:
             messages.append([frame.buffer for frame in self._assets.recv_multipart(_NOBLOCK, copy=False)])
         return messages
 
+    def assets_ended(self) -> bool:
+        """True once after the assets channel lost its peer, and with it what it had been asked."""
+        return _told(self._assets_monitor)
+
     def close_assets(self) -> None:
         """Ends the connection to the assets channel, and what was asked by it."""
         if self._assets is not None:
-            self._assets.close(linger=0)
-            self._assets = None
+            _close_watched(self._assets, self._assets_monitor, linger_ms=0)
+            self._assets = self._assets_monitor = None
             self.version += 1
 
     def close_media(self) -> None:
@@ -238,10 +249,7 @@ class ClientSockets:
 
     def disconnected(self) -> bool:
         """True once after the control socket lost its peer."""
-        lost = False
-        while _readable(self._monitor):
-            lost = bool(self._monitor.recv_multipart(zmq.NOBLOCK))
-        return lost
+        return _told(self._monitor)
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
         """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more.
@@ -250,7 +258,7 @@ class ClientSockets:
         """
         if self._control is not None:
             poller.register(self._control, zmq.POLLIN | (zmq.POLLOUT if sending else 0))
-        for sock in (self._monitor, self._state, self._media, self._assets):
+        for sock in (self._monitor, self._state, self._media, self._assets, self._assets_monitor):
             if sock is not None:
                 poller.register(sock, zmq.POLLIN)
         if self._wakes_anybody:
@@ -301,14 +309,9 @@ class ClientSockets:
         self._wake_in.close()
 
     def _close_control(self, linger_ms: int) -> None:
-        if self._control is None:
-            return
-        self._control.disable_monitor()
-        if self._monitor is not None:
-            self._monitor.close(linger=0)
-            self._monitor = None
-        self._control.close(linger=linger_ms)
-        self._control = None
+        if self._control is not None:
+            _close_watched(self._control, self._monitor, linger_ms)
+            self._control = self._monitor = None
 
     def _new_socket(self, kind: int, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> zmq.Socket[bytes]:
         sock: zmq.Socket[bytes] = (context or self._context).socket(kind)
@@ -328,6 +331,21 @@ class ClientSockets:
 def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
     """Whether something is there. Asking first costs less than the exception of an empty receive."""
     return sock is not None and bool(sock.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
+
+
+def _told(monitor: zmq.Socket[bytes] | None) -> bool:
+    """Whether a monitor has told something since the last look."""
+    told = False
+    while _readable(monitor):
+        told = bool(monitor.recv_multipart(_NOBLOCK))
+    return told
+
+
+def _close_watched(watched: zmq.Socket[bytes], monitor: zmq.Socket[bytes] | None, linger_ms: int) -> None:
+    watched.disable_monitor()
+    if monitor is not None:
+        monitor.close(linger=0)
+    watched.close(linger=linger_ms)
 
 
 def _drain(sock: zmq.Socket[bytes] | None) -> list[list[bytes]]:

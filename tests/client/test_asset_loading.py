@@ -112,15 +112,30 @@ def test_an_asset_larger_than_any_is_not_begun() -> None:
     assert answer(loader, b, MAX_ASSET_BYTES) is True
 
 
-def test_answers_in_another_order_leave_no_gap() -> None:
-    loader = started("a")
-    (ask,) = loader.requests(0)
-    answer(loader, ask, 4 * CHUNK_BYTES)
-    first, second, third = loader.requests(0)
-    assert answer(loader, third, 4 * CHUNK_BYTES) is None
-    assert answer(loader, first, 4 * CHUNK_BYTES) is True
-    assert answer(loader, second, 4 * CHUNK_BYTES) is True
-    assert [ask.offset for ask in loader.requests(0)] == [third.offset]
+def test_requests_that_went_with_a_connection_are_made_again() -> None:
+    """libzmq connects anew, and sends what it had not sent: the answers to those tell that the others are lost."""
+    total = 6 * CHUNK_BYTES
+    loader = started("a", "b")
+    first, other = loader.requests(0)
+    answer(loader, first, total)
+    asks = list(loader.requests(0))
+    assert [ask.offset for ask in asks] == [n * CHUNK_BYTES for n in range(1, 6)]
+    assert answer(loader, asks[3], total) is None, "what is before it did not come"
+    again = list(loader.requests(0))
+    assert [(ask.address, ask.offset) for ask in again] == [*[("a", ask.offset) for ask in asks], ("b", 0)]
+    assert answer(loader, asks[4], total) is None
+    assert [answer(loader, ask, total) for ask in (*asks[:3], other)] == [False] * 4
+    assert [answer(loader, ask, total) for ask in again[:5]] == [True] * 5
+    assert loader.whole("a")
+    assert list(loader.requests(0)) == [], "each was made again once"
+    assert refuse(loader, again[5], AssetRefusal.UNKNOWN) != ""
+
+
+def test_a_refusal_tells_too_that_what_was_asked_before_is_lost() -> None:
+    loader = started("a", "b")
+    _, other = loader.requests(0)
+    assert isinstance(refuse(loader, other, AssetRefusal.UNKNOWN), Failed)
+    assert [(ask.address, ask.offset) for ask in loader.requests(0)] == [("a", 0)]
 
 
 def test_small_ones_are_bounded_by_number() -> None:
@@ -223,9 +238,9 @@ def test_a_session_that_contradicts_itself() -> None:
     a, b, c = loader.requests(0)
     answer(loader, a, 4 * CHUNK_BYTES)
     a2 = next(iter(loader.requests(0)))
-    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), Failed)  # another size than before
     assert isinstance(answer(loader, b, 100, size=0), Failed)  # nothing, where there is something
     assert isinstance(answer(loader, c, 2**40, size=CHUNK_BYTES + 1), Failed)  # more than was asked for
+    assert isinstance(answer(loader, a2, 5 * CHUNK_BYTES), Failed)  # another size than before
     assert loader.idle
     assert answer(loader, c, 5) is False
     assert loader.refused(AssetRefused(1, 999, "", AssetRefusal.UNKNOWN), 0) == ""

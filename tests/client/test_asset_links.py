@@ -1,0 +1,112 @@
+"""Connections to the assets channel that end while the session goes on: nothing waits, nothing comes for ever."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from iris_session.client import AssetCache, Client, asset_loading
+from tests.client.harness import LiveSession
+from tests.transport.asset_rig import noise, put
+
+MIB = 1 << 20
+DEADLINE_S = 30.0
+
+
+class Relay:
+    """Between clients and a port. Each time that so many bytes have come from there, in all, it ends every connection,
+    with what was under way."""
+
+    def __init__(self, port: int, cuts: list[int]) -> None:
+        self._to, self._cuts = port, cuts
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._ends: list[socket.socket] = []
+        self._threads: list[threading.Thread] = []
+        self.port = self._listening.getsockname()[1]
+        self.accepted = self.came = 0
+        self._begin(self._accept)
+
+    def _begin(self, work: Callable[..., None], *of: object) -> None:
+        self._threads.append(threading.Thread(target=work, args=of, daemon=True))
+        self._threads[-1].start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near = self._listening.accept()[0]
+                far = socket.create_connection(("127.0.0.1", self._to))
+                self.accepted += 1
+                self._ends += [near, far]
+                self._begin(self._pass_on, near, far, False)
+                self._begin(self._pass_on, far, near, True)
+
+    def _pass_on(self, source: socket.socket, sink: socket.socket, counts: bool) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65_536):
+                self.came += counts * len(data)
+                if counts and self._cuts and self.came >= self._cuts[0]:
+                    self._cuts.pop(0)
+                    self._cut()
+                sink.sendall(data)
+        _end(sink)
+
+    def _cut(self) -> None:
+        for end in self._ends:
+            _end(end)
+
+    def close(self) -> None:
+        _end(self._listening)
+        self._threads[0].join()
+        self._cut()
+        for thread in self._threads:
+            thread.join()
+        for one in (self._listening, *self._ends):
+            one.close()
+
+
+def _end(one: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[LiveSession]:
+    addresses = tuple(put(tmp_path / "store", noise(size)) for size in (24 * MIB, *[300_000] * 20))
+    live = LiveSession(asset_root=str(tmp_path / "store"), assets=addresses)
+    yield live
+    live.close()
+
+
+@pytest.mark.parametrize("cuts", [[200], [5 * MIB], [6 * MIB, 9 * MIB, 12 * MIB]], ids=["at first", "once", "often"])
+def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
+    live: LiveSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cuts: list[int]
+) -> None:
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # whatever helps, it is not that one
+    addresses, n_cuts = live.front.scene.assets, len(cuts)
+    client = Client(live.address, role="observer", alignment="not_needed")
+    client.asset_cache = AssetCache(tmp_path / "cache")
+    client.connect(DEADLINE_S)
+    welcome = client.connection.welcome
+    assert welcome is not None
+    relay = Relay(welcome.endpoints.assets, cuts)
+    endpoints = msgspec.structs.replace(welcome.endpoints, assets=relay.port)
+    client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
+    try:
+        fetch = client.fetch_assets(addresses)
+        done = client.wait_for(lambda _: fetch.done or relay.came > 200 * MIB, DEADLINE_S)
+        assert done, (fetch.bytes_done, relay.came)
+        fetch.check()
+        assert not cuts, "all were made"
+        assert relay.accepted <= n_cuts + 2
+        most = fetch.bytes_total + (n_cuts + 1) * asset_loading.WINDOW_BYTES
+        assert relay.came <= most, "nothing came more often than it was lost"
+        assert client.connection.counters.reconnects == 0
+    finally:
+        client.close()
+        relay.close()
