@@ -21,6 +21,8 @@ _PLY_HEAD: Final = 1 << 16
 _ODD_CORNER: Final = re.compile(rb"^[ \t]*f(?=[ \t])[^\n]*?[ \t/](?:-|0+(?:[/ \t\r\n]|$))", re.MULTILINE)
 _NO_NORMAL: Final = re.compile(rb"^[ \t]*f[ \t][^\n]*?/[^ \t\n/]*/0+(?=[ \t\r\n]|$)", re.MULTILINE)
 _OBJ_LISTS: Final = (b"v", b"vt", b"vn")
+#: Of what is no corner, in the error text [characters].
+_SHOWN: Final = 60
 _WHAT: Final = ("vertex", "texture coordinate", "normal")
 
 
@@ -55,12 +57,32 @@ def ply(name: str, data: bytes) -> bytes:
     return data
 
 
+def off(name: str, data: bytes) -> bytes:
+    """As many faces as its head says, the last one with all its corners. Without comments: of what stands before the
+    first one trimesh reads all but a line twice."""
+    if b"#" in data:
+        data = b"\n".join(line.partition(b"#")[0] for line in data.splitlines())
+    rows = [row for line in data.partition(b"OFF")[2].splitlines() if (row := line.split())]
+    try:
+        vertices, faces = (int(word) for word in rows[0][:2])
+        listed = rows[1 + vertices : 1 + vertices + faces]
+        whole = len(listed) == faces and (not faces or len(listed[-1]) > int(listed[-1][0]))
+    except (ValueError, IndexError):
+        return data  # whoever reads it says what is wrong
+    if not whole:
+        raise SceneBuildError(
+            f"{name} is cut: its head says {faces:,} faces, and it ends in number {len(listed):,}; "
+            "export or download it again"
+        )
+    return data
+
+
 def obj(name: str, data: bytes) -> bytes:
     """Corners count from 1, and forward."""
-    return absolute_corners(name, data) if _ODD_CORNER.search(data) else data
+    return absolute_corners(name, data) if _ODD_CORNER.search(_one_line_each(data)) else data
 
 
-CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply": ply, "obj": obj}
+CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply": ply, "off": off, "obj": obj}
 
 
 def absolute_corners(name: str, data: bytes) -> bytes:
@@ -69,7 +91,7 @@ def absolute_corners(name: str, data: bytes) -> bytes:
     as trimesh takes all or none. A normal of 0 leaves out all of them: they are made."""
     counts = [0, 0, 0]
     total = [len(re.findall(rb"^[ \t]*" + kind + rb"[ \t]", data, re.MULTILINE)) for kind in _OBJ_LISTS]
-    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    text = _one_line_each(data)
     parts = 2 if _NO_NORMAL.search(text) else 3
     out = []
     for number, line in enumerate(text.split(b"\n"), start=1):
@@ -84,6 +106,11 @@ def absolute_corners(name: str, data: bytes) -> bytes:
     return b"\n".join(out) + (b"\nvt 0 0\n" if total[1] else b"")
 
 
+def _one_line_each(data: bytes) -> bytes:
+    """An OBJ without lines that go on in the next one."""
+    return data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+
+
 def _corner(where: str, corner: bytes, counts: list[int], total: list[int], parts: int) -> bytes:
     """`counts`: how many there are so far, by which what is negative counts; `total`: in the whole file; `parts`: how
     many of the corner's numbers are read."""
@@ -95,7 +122,8 @@ def _corner(where: str, corner: bytes, counts: list[int], total: list[int], part
         try:
             place = int(text)
         except ValueError:
-            raise SceneBuildError(f"{where}: {corner.decode(errors='replace')!r} is no corner of a face") from None
+            shown = corner[:_SHOWN].decode(errors="replace")
+            raise SceneBuildError(f"{where}: {shown!r} is no corner of a face") from None
         if place == 0 and k == 1:
             found.append(b"%d" % (total[1] + 1) if total[1] else b"")
             continue

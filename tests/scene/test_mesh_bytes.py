@@ -20,6 +20,7 @@ PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     "element face {}\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
 )
+OFF = "OFF\n3 {} 0\n0 0 0\n1 0 0\n0 1 0\n"
 
 
 def written(tmp_path: Path, name: str, content: str | bytes) -> Path:
@@ -42,11 +43,15 @@ def binary_stl(said: int, there: bytes, head: bytes = b"") -> bytes:
         ("a.ply", PLY.format(2_000_000_000) + "3 0 1 2", "its head says 2,000,000,003 lines, and it has 4"),
         ("a.ply", PLY.format(1) + "3 0 1 7\n", "names vertex 7 of 3|names something that it does not have"),
         ("a.ply", PLY.format(1) + "3 0 1 -1\n", "names vertex -1 of 3"),
+        ("a.off", OFF.format(2) + "3 0 1 2\n", "its head says 2 faces, and it ends in number 1"),
+        ("a.off", OFF.format(2) + "3 0 1 2\n3 0 1", "its head says 2 faces, and it ends in number 2"),
+        ("a.off", OFF.format("x"), "damaged, or no OFF"),
         ("a.obj", f"{CORNERS}f 1 2 3\nf 1 2 10\n", r"a\.obj, line 5: a face names vertex 10 of 3"),
         ("a.obj", f"{CORNERS}f 0 1 2\n", r"a\.obj, line 4: a face names vertex 0 of 3"),
         ("a.obj", f"{CORNERS}f 1 2 -4\n", r"a\.obj, line 4: a face names vertex -4 of 3"),
         ("a.obj", f"{CORNERS}vt 0 0\nf 1/1 2/-2 3/1\n", "names texture coordinate -2 of 1"),
         ("a.obj", f"{CORNERS}f 1 -x 3\n", "'-x' is no corner of a face"),
+        ("a.obj", f"{CORNERS}f 1 2 {'-' * 9999}\n", "line 4: '-{60}' is no corner of a face"),
     ],
 )
 def test_what_is_cut_or_not_there_is_told(tmp_path: Path, name: str, content: str | bytes, text: str) -> None:
@@ -62,6 +67,8 @@ def test_what_is_cut_or_not_there_is_told(tmp_path: Path, name: str, content: st
         ("a.stl", binary_stl(2, 2 * TRIANGLE, b"solid by name only"), 2),
         ("a.stl", f"solid x\n{2 * FACET}endsolid x", 2),
         ("a.ply", PLY.format(1) + "3 0 1 2", 1),
+        ("a.off", OFF.format(2) + "\n3 0 1 2 # first\n3 0 2 1 255 0 0", 2),
+        ("a.off", "C" + OFF.format(1) + "3 0 1 2", 1),
     ],
 )
 def test_what_is_whole_is_read(tmp_path: Path, name: str, content: str | bytes, triangles: int) -> None:
@@ -77,6 +84,21 @@ def test_corners_of_an_obj_count_back_from_their_own_line(tmp_path: Path) -> Non
     mesh = node.surfaces[0].mesh
     heights = sorted(sorted(face) for face in mesh.position[mesh.index][:, :, 2].tolist())
     assert heights == [[0, 0, 0], [0, 0, 5], [5, 5, 5]]
+
+
+def test_corners_count_back_in_a_line_that_goes_on_too(tmp_path: Path) -> None:
+    path = written(tmp_path, "a.obj", f"{CORNERS}f \\\n-3 -2 -1\nv 9 9 9\nv 8 8 8\nv 7 7 7\n")
+    (node,) = load_file(path).nodes
+    mesh = node.surfaces[0].mesh
+    assert mesh.position[mesh.index][0].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def test_comments_of_an_off_are_no_geometry(tmp_path: Path) -> None:
+    """Wherever they stand: trimesh made a vertex at (3, 1, 0) of these counts."""
+    text = OFF.format(1).replace("1 0\n", "1 0 # corners, faces, edges\n", 1) + "3 0 1 2 # OFF\n"
+    (node,) = load_file(written(tmp_path, "a.off", text)).nodes
+    mesh = node.surfaces[0].mesh
+    assert mesh.position[mesh.index].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
 
 
 def test_a_texture_coordinate_of_0_is_none(tmp_path: Path) -> None:
