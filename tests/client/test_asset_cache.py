@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import subprocess
@@ -166,6 +167,35 @@ def test_a_part_that_is_being_written_stays_however_old_it_is(tmp_path: Path) ->
     for part in parts:
         part.append(DATA[40_000:])
         assert part.finish()
+    assert cache.find(ADDRESS) == DATA
+
+
+def test_only_the_common_part_is_left_for_another_time(tmp_path: Path) -> None:
+    cache = AssetCache(tmp_path)
+    common, own = cache.begin(ADDRESS), cache.begin(ADDRESS)
+    for part in (common, own):
+        part.append(DATA[:40_000])
+        part.close()
+    assert [path.name for path in tmp_path.glob("??/*")] == [f"{ADDRESS}.part"]
+
+
+def test_what_another_finishes_just_then_is_not_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the opening of its part and the lock on it: then it has the name of the asset."""
+    cache = AssetCache(tmp_path)
+    other = cache.begin(ADDRESS)
+    other.append(DATA)
+    lock = fcntl.flock
+
+    def finished_first(descriptor: int, how: int) -> None:
+        monkeypatch.undo()
+        assert other.finish()
+        lock(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", finished_first)
+    late = cache.begin(ADDRESS)
+    assert late.offset == 0
+    late.append(b"other bytes")
+    late.close()
     assert cache.find(ADDRESS) == DATA
 
 

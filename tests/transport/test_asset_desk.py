@@ -6,7 +6,14 @@ import zmq
 
 from iris_session.keys import AllowedKey, KeyPair
 from iris_session.protocol.client_messages import Hello
-from iris_session.transport.asset_desk import LOOK_NS, MAX_REPLACED, REPLACED_NS, AssetDesk
+from iris_session.transport.asset_desk import (
+    LATE_NS,
+    LATE_TURN_NS,
+    LOOK_NS,
+    MAX_REPLACED,
+    REPLACED_NS,
+    AssetDesk,
+)
 from iris_session.transport.asset_server import Table, Tallied
 from iris_session.transport.clients import ClientTable, Connection, Peer, Route
 from iris_session.transport.config import SceneInfo
@@ -117,3 +124,26 @@ def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked
     desk.revoked.add("ann")
     desk.desk.turn(LOOK_NS)
     assert desk.told.table.marks == {"gate"}
+
+
+def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
+    desk = Desk()
+    now_ns, steps = 1, desk.publisher
+
+    def yields(after_ns: int, *, delay_ns: int | None) -> bool:
+        """A turn so long after the last one, with a state that left so late, or none."""
+        nonlocal now_ns
+        now_ns += after_ns
+        if delay_ns is not None:
+            steps.frames += 1
+            steps._delays.append((now_ns, delay_ns))
+        desk.told.late_until_ns = 0
+        desk.desk.turn(now_ns)
+        return desk.told.late_until_ns > now_ns
+
+    assert not yields(0, delay_ns=None)
+    assert not yields(LATE_TURN_NS, delay_ns=LATE_NS)
+    assert yields(1, delay_ns=LATE_NS + 1)
+    assert not yields(1, delay_ns=None), "of a state that was late long ago"
+    assert yields(LATE_TURN_NS + 1, delay_ns=None)
+    assert yields(LATE_TURN_NS + 1, delay_ns=0), "state in time does not make up for a loop that was late"
