@@ -119,7 +119,11 @@ class Receiving:
                 self._deliver(message)
         elif isinstance(message, Event):
             if self.mirror.apply_event(message):
-                self.stream.scene_epoch = self.mirror.scene_epoch
+                self.stream.scene_epoch = self.mirror.bodies_until
+                if (
+                    not self.mirror.synced
+                ):  # another scene: its bodies are asked for at once, however lately others were
+                    self._snapshot_at = min(self._snapshot_at, now_ns)
                 if isinstance(message.body, EStopChanged) and message.body.active:
                     self.stop.withdraw()
                 self._deliver(message)
@@ -196,7 +200,7 @@ class Receiving:
             self._deliver(told)
         if self.mirror.estop:
             self.stop.withdraw()
-        self.stream.scene_epoch = self.mirror.scene_epoch
+        self.stream.scene_epoch = self.mirror.bodies_until
         self.stream.keep_presence(self.mirror.connected)
         self.stream.load_keyframe(snapshot.state_seq, poses)
         self._maybe_ready()

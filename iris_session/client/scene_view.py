@@ -80,22 +80,25 @@ class SceneView:
         return self.connection.clock.error_bound_ns(time.monotonic_ns())
 
     def body_pose(self, body: str) -> PoseTuple | None:
-        """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet.
+        """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet, as for a moment after
+        another one was loaded.
 
         Bodies whose poses come are those in `mirror.bodies`: all of a MuJoCo scene, of a publisher's only those that
         can move. Where something else stands is in the specification: `fetch_scene(client).spec.bodies`.
         """
-        state, index = self._state, self.connection.mirror.body_index.get(body)
-        if state is None or index is None or index >= len(state.poses):
-            return None
-        return pose_at(state.poses, index)
+        poses, index = self._placed, self.connection.mirror.body_index.get(body)
+        return None if poses is None or index is None or index >= len(poses) else pose_at(poses, index)
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         """`T_world_site` of a robot's end effector in the newest scene."""
-        state, tip = self._state, self.connection.mirror.tip(robot)
-        if state is None or tip is None or tip[0] >= len(state.poses):
-            return None
-        return compose(pose_at(state.poses, tip[0]), tip[1])
+        poses, tip = self._placed, self.connection.mirror.tip(robot)
+        return None if poses is None or tip is None or tip[0] >= len(poses) else compose(pose_at(poses, tip[0]), tip[1])
+
+    @property
+    def _placed(self) -> Poses | None:
+        """Newest poses of the bodies in `mirror`: none while those that came last are of the bodies before them."""
+        state = self._state
+        return None if state is None or state.header.scene_epoch < self.connection.mirror.bodies_since else state.poses
 
     def lease_version(self, target: str) -> int | None:
         """Our fencing token for a robot or object, `None` when it is not ours."""

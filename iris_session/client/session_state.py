@@ -50,6 +50,7 @@ class SessionMirror:
 
     `body_index` and `index_of_id` give the row of a body in state frames, by name and by `BodyInfo.id`.
     `synced` is false before the first snapshot and after a gap; the other attributes then show the last known state.
+    `bodies` are those of the epochs from `bodies_since` to `bodies_until`, as far as is known.
     Counters: `gaps`, `discarded` (events older than the snapshot or repeated), `held_overflow`.
     """
 
@@ -75,6 +76,7 @@ class SessionMirror:
         self.leases: dict[str, Lease] = {}
         self.robots: dict[str, RobotInfo] = {}
         self.bodies: tuple[BodyInfo, ...] = ()
+        self.bodies_since = self.bodies_until = 0
         self.body_index: dict[str, int] = {}
         self.index_of_id: dict[int, int] = {}
         self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
@@ -103,7 +105,9 @@ class SessionMirror:
         self.participants = {p.id: p for p in snapshot.participants}
         self.leases = {lease.target: lease for lease in snapshot.leases}
         self.robots = {robot.name: robot for robot in snapshot.robots}
-        self.bodies = snapshot.bodies
+        if snapshot.bodies != self.bodies:
+            self.bodies_since = snapshot.scene_epoch
+        self.bodies, self.bodies_until = snapshot.bodies, snapshot.scene_epoch
         self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
         self.index_of_id = {body.id: i for i, body in enumerate(snapshot.bodies)}
         self.synced = self._begun = True
@@ -207,6 +211,8 @@ class SessionMirror:
                 self.scene_hash = scene_hash or self.scene_hash
                 self.tick_period_ns = period_ns or self.tick_period_ns
                 self.synced = cause in SAME_BODIES
+                if self.synced:
+                    self.bodies_until = epoch
             case EStopChanged(active=active):
                 self.estop = active
             case PauseChanged(paused=paused):

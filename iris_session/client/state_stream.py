@@ -70,8 +70,8 @@ class StateCounters:
 class StateStream:
     """Decodes the newest of each drain. `wants_snapshot` becomes true when the deltas have lost their base.
 
-    `scene_epoch`: the epoch that the application knows by events or snapshot; frames of another one are decoded, and
-    counted, but not handed out, because their bodies may be other ones.
+    `scene_epoch`: the newest epoch whose bodies the application knows, by events or snapshot; frames of another one are
+    decoded, and counted, but not handed out, because their bodies may be other ones.
     """
 
     def __init__(self) -> None:

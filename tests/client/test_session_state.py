@@ -172,6 +172,31 @@ def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
     assert mirror.tick_period_ns == 1_000_000, "0: as it was"
 
 
+def test_bodies_are_of_the_epochs_that_have_them() -> None:
+    """Poses of an epoch go with the bodies of that one only; a reset changes none."""
+    ball, box = (BodyInfo(1, name, True) for name in ("ball", "box"))
+    mirror = synced()
+    told: list[tuple[int, int]] = []
+
+    def snap(epoch: int, *bodies: BodyInfo) -> None:
+        mirror.apply_snapshot(Snapshot(0, mirror.event_seq, epoch, 0, "", 0, 0.0, 0, (), (), bodies=bodies))
+        told.append((mirror.bodies_since, mirror.bodies_until))
+
+    def change(epoch: int, cause: str) -> None:
+        mirror.apply_event(event(mirror.event_seq + 1, SceneChanged(epoch, 0, cause)))
+        told.append((mirror.bodies_since, mirror.bodies_until))
+
+    snap(3, ball)
+    change(4, "reset")
+    change(5, "new_scene")
+    snap(5, box, ball)
+    change(6, "external")
+    snap(6, box, ball)
+    change(7, "new_scene")
+    snap(7, box, ball)
+    assert told == [(3, 3), (3, 4), (3, 4), (5, 5), (5, 6), (5, 6), (5, 6), (5, 7)]
+
+
 def test_hash_tells_different_states_apart_and_ignores_order() -> None:
     a, b = synced(), synced()
     for mirror, order in ((a, ("p1", "p2")), (b, ("p2", "p1"))):
