@@ -172,8 +172,21 @@ def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
         assert list(loader.requests(now_ns + pause_ns - 1)) == []
         now_ns += pause_ns
     (ask,) = loader.requests(now_ns)
-    assert answer(loader, ask, 5) is True
+    assert answer(loader, ask, CHUNK_BYTES + 5) is True
+    (ask,) = loader.requests(now_ns)
+    assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
+    (ask,) = loader.requests(now_ns + FIRST_PAUSE_NS)  # the short pause again, after something came
+    assert answer(loader, ask, CHUNK_BYTES + 5) is True
     assert loader.whole("a")
+
+
+def test_a_new_connection_does_not_wait_out_a_refusal_of_the_one_before() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    assert refuse(loader, ask, AssetRefusal.BUSY) == ""
+    assert list(loader.requests(0)) == []
+    loader.cut_off()
+    assert [again.offset for again in loader.requests(0)] == [0]
 
 
 def test_one_refusal_in_the_middle_leaves_no_gap() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import threading
@@ -227,6 +228,17 @@ def test_what_is_cancelled_is_not_fetched_any_more_and_goes_on_later(store: Stor
     assert client.assets_malformed == 0
 
 
+def test_what_another_still_waits_for_is_not_cancelled_with_it(store: Store, join: Callable[..., Client]) -> None:
+    client = join()
+    large = store.addresses[1]
+    fetch, other = client.fetch_assets([large]), client.fetch_assets([large])
+    assert client.wait_for(lambda _: fetch.bytes_done >= MIB, DEADLINE_S)
+    client.cancel_assets(fetch)
+    until_done(client, other)
+    assert other.read(large) == store.data[large]
+    assert other.bytes_received == len(store.data[large])
+
+
 def test_each_fetch_gets_what_its_own_function_makes_of_an_asset(store: Store, join: Callable[..., Client]) -> None:
     client = join()
     address = store.addresses[0]
@@ -351,6 +363,23 @@ def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
     again = honest.fetch_assets([address])
     until_done(honest, again)
     assert again.read(address) == store.data[address], "what the liar left in the cache does no harm"
+
+
+def test_a_connection_without_answers_is_made_anew(
+    turn_to: Callable[..., tuple[Client, Liar]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 100_000_000)
+    data, asked = b"asset", []
+
+    def answers(request: AssetRequest) -> list[list[bytes]]:
+        asked.append(request.request_id)
+        return [chunk(request, len(data), data)] if len(asked) > 1 else []
+
+    client, _ = turn_to(answers)
+    fetch = client.fetch_assets([hashlib.sha256(data).hexdigest()])
+    until_done(client, fetch)
+    assert fetch.failed == {}
+    assert len(asked) > 1
 
 
 def test_a_frame_larger_than_any_is_not_taken_into_memory(

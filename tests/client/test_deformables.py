@@ -276,3 +276,19 @@ def test_another_session_shows_nothing_of_the_one_before() -> None:
     shapes._follow("other", ("b", 1))
     assert shapes.vertices == shapes.capture_ns == {}
     client.close()
+
+
+def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    part = parse_mujoco(flexes(), store).spec.deformables[0]
+    client = Client("127.0.0.1:1", role="observer", name="screen")
+    shapes = Deformables(client)
+    both = [_Mesh(key, part, memoryview(store.get(part.address))) for key in ("one", "two")]
+    shapes._use(both, "1" * 64)
+    feed = client.media(part.stream)
+    shapes._use(both[:1], "2" * 64)
+    assert client._feeds == {part.stream: feed}
+    assert both[0].feed is feed
+    shapes._use([], "3" * 64)
+    assert client._feeds == {}
+    client.close()
