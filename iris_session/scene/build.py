@@ -28,7 +28,7 @@ from iris_session.scene.simplify import simplified
 from iris_session.scene.store import AssetStore
 
 #: Raised whenever the same content gives other assets.
-ENCODER_VERSION: Final = 3
+ENCODER_VERSION: Final = 4
 ALONE_BYTES: Final = 16 << 20
 #: Meshes are made coarser by this factor, as long as as many triangles stay.
 _COARSER: Final = 4

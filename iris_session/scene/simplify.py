@@ -2,7 +2,7 @@
 
 Not a quadric decimation, which keeps flat parts better: here the error is proven. No point of a triangle moves farther
 than the vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in
-threads.) Parts smaller than a cell vanish. Meshes with texture coordinates or colours are not made coarser: these
+threads.) Parts that fit into a cell vanish. Meshes with texture coordinates or colours are not made coarser: these
 would move across seams.
 """
 
@@ -19,6 +19,8 @@ from iris_session.scene.meshes import MeshArrays, index_corners
 CREASE: Final = 0.8
 #: Attempts to meet the wanted number of triangles by another size of the cells.
 _TRIES: Final = 3
+#: How often cells are halved for what is long and thin.
+_FINER: Final = 4
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -47,7 +49,29 @@ def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | N
 
 
 def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
-    """Points that stay, triangles between them, and the longest way that a point moved."""
+    """Points that stay, triangles between them, and the longest way that a point moved.
+
+    What is long and thin, as rods and legs of tables, would be gone where its width fits into a cell: it is clustered
+    again in finer ones, at last in none.
+    """
+    found, faces, n_points, longest = [], [], 0, 0.0
+    for finer in range(_FINER + 1):
+        some, between, lost, moved = _once(points, index, cell / (1 << finer))
+        found.append(some)
+        faces.append(between + n_points)
+        n_points, longest, index = n_points + len(some), max(longest, moved), lost
+        if not len(lost):
+            break
+    used, last = _compact(index, len(points))
+    found.append(points[used])
+    faces.append(last + n_points)
+    return np.concatenate(found), np.concatenate(faces), longest
+
+
+def _once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Ints, float]:
+    """As `_clustered`, for one size of cells; before the way the triangles that are lost."""
+    used, index = _compact(index, len(points))
+    points = points[used]
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     _, cluster = sorted_rows(cells)
     count = np.bincount(cluster)
@@ -57,15 +81,60 @@ def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints
     keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # of each cell the point nearest to the mean
     faces = cluster[index]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
+    lost = used[_lost(points, index[~whole], faces[~whole], faces[whole], 2 * moved)]
     faces = faces[whole]
     turned_over = np.einsum("fc,fc->f", _across(points[index[whole]]), _across(points[keep][faces])) < 0
     faces[turned_over] = faces[turned_over][:, ::-1]
     turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
     faces = np.take_along_axis(faces, turned % 3, axis=1)
     faces = faces[sorted_rows(faces)[0]]
-    used, faces = np.unique(faces, return_inverse=True)
-    moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
-    return points[keep[used]], faces.reshape(-1, 3), moved
+    stay, faces = np.unique(faces, return_inverse=True)
+    return points[keep[stay]], faces.reshape(-1, 3), lost, moved
+
+
+def _compact(index: Ints, n_points: int) -> tuple[Ints, Ints]:
+    """The points that triangles have, in order, and the triangles between these."""
+    has = np.zeros(n_points, bool)
+    has[index] = True
+    return np.flatnonzero(has), (np.cumsum(has) - 1)[index]
+
+
+def _lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) -> Ints:
+    """Of the triangles `flat`, which became lines or points between the clusters `ends`, those of parts larger than
+    `small` [m] of which nothing is left: no edge or corner of `faces` lies where they were."""
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    n = int(max(high.max(initial=0), faces.max(initial=0))) + 1
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    corners = np.flatnonzero(np.bincount(faces.reshape(-1), minlength=n))
+    there = np.concatenate([edges[:, 0] * n + edges[:, 1], corners * (n + 1)])
+    gone: Ints = flat[~np.isin(low * n + high, there)]
+    if not len(gone):
+        return gone
+    part = _parts(gone, len(points))
+    which = np.repeat(part, 3)
+    at = points[gone.reshape(-1)]
+    box = np.zeros((2, int(part.max()) + 1, 3))
+    box[0], box[1] = np.inf, -np.inf
+    np.minimum.at(box[0], which, at)
+    np.maximum.at(box[1], which, at)
+    large: Ints = gone[np.linalg.norm(box[1, part] - box[0, part], axis=1) > small]
+    return large
+
+
+def _parts(faces: Ints, n_points: int) -> Ints:
+    """Of each triangle the part that it belongs to, with all that share corners: the least number of these."""
+    least = np.arange(n_points)
+    while True:
+        of_corners = least[faces]
+        of_faces = np.repeat(of_corners.min(axis=1), 3)
+        lower = least.copy()
+        np.minimum.at(lower, of_corners.reshape(-1), of_faces)
+        np.minimum.at(lower, faces.reshape(-1), of_faces)
+        lower = lower[lower]
+        if np.array_equal(lower, least):
+            return least[faces[:, 0]]
+        least = lower
 
 
 def sorted_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:

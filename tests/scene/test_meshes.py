@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import trimesh
@@ -72,6 +74,40 @@ def test_coarser_meshes_stay_within_the_stated_error() -> None:
     assert outwards.min() > -0.01
     assert np.mean(outwards > 0.9) > 0.85
     assert len(encode_mesh_quantised(level)[0]) < 0.7 * len(encode_mesh(level))
+
+
+def cable(points: int) -> trimesh.Trimesh:
+    """A spiral 1.5 m long and 4 mm thick, finely divided."""
+    along = np.linspace(0, 1, points)
+    middle = np.stack([1.5 * along, 0.2 * np.sin(9 * along), 0.2 * np.cos(9 * along)], axis=1)
+    turn = np.arange(8) / 8 * 2 * np.pi
+    ring = 0.002 * np.stack([np.cos(turn), np.zeros(8), np.sin(turn)], axis=1)
+    a = np.arange(8 * (points - 1))
+    b = a // 8 * 8 + (a + 1) % 8
+    faces = np.concatenate([np.stack([a, b, a + 8], axis=1), np.stack([b, b + 8, a + 8], axis=1)])
+    return trimesh.Trimesh((middle[:, None] + ring).reshape(-1, 3), faces, process=False)
+
+
+def table() -> trimesh.Trimesh:
+    legs = [trimesh.creation.box((0.02, 0.02, 0.7)) for _ in range(4)]
+    for k, leg in enumerate(legs):
+        leg.apply_translation((0.5 * (k % 2), 0.5 * (k // 2), 0.35))
+    return trimesh.util.concatenate(legs)
+
+
+@pytest.mark.parametrize("thin", [table, lambda: cable(1_500)], ids=["legs of a table", "cable"])
+@pytest.mark.parametrize("triangles", [4_000, 1_000])
+def test_what_is_long_and_thin_stays(thin: Callable[[], trimesh.Trimesh], triangles: int) -> None:
+    """Where a cell is wider than they are, they would become lines: a table stood on three legs."""
+    whole = trimesh.util.concatenate([trimesh.creation.icosphere(5, radius=0.3), thin()])
+    coarse = simplified(smooth_mesh(np.array(whole.vertices), np.array(whole.faces, np.int64)), triangles)
+    assert coarse is not None
+    level, error = coarse
+    assert level.triangles < 1.5 * triangles
+    points = thin().triangles_center[::23]
+    _, distance, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(level.position, level.index), points)
+    assert distance.max() <= 2 * error
+    assert error < 0.1
 
 
 def test_textured_meshes_and_small_gains_are_left_alone() -> None:
