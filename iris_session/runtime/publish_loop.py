@@ -175,7 +175,8 @@ class PublishLoop:
 
     def _send(self, capture_ns: int, *, again: bool = False) -> None:
         self._state_ns = max(capture_ns, self._state_ns + 1)
-        self._shown_ns = self._shown_ns if again else self._state_ns
+        if not again:  # as it was, though later ones were recorded: what waited somewhere is as old as it is
+            self._shown_ns = max(capture_ns, self._shown_ns + 1)
         self._sent_ns = self._stepper.clock()
         self._stepper.publish_now(self._state_ns, self._shown_ns)
 

@@ -137,6 +137,22 @@ def test_while_nothing_is_published_the_session_goes_on(rig: Rig) -> None:
     assert rig.recorder.state_times == sorted(set(rig.recorder.state_times))
 
 
+def test_frames_that_waited_while_the_source_was_silent_keep_their_times(rig: Rig) -> None:
+    """A robot's link that hangs for half a second, and then brings everything: no two poses a nanosecond apart."""
+    rig.now_ns += PERIOD_NS
+    rig.publish(1.0, delay_ns=5 * MS)
+    begun_ns, sent = rig.now_ns, len(rig.front.states)
+    rig.now_ns += 2 * REPEAT_NS
+    wait_for(lambda: len(rig.front.states) > sent)
+    captured = [begun_ns + n * PERIOD_NS for n in range(20)]
+    first = len(rig.front.states)
+    for n, capture_ns in enumerate(captured):
+        rig.publish(2.0 + n, delay_ns=rig.now_ns - capture_ns)
+        rig.now_ns += PERIOD_NS
+    assert [state.session_time for state in rig.front.states[first:]] == captured
+    assert rig.recorder.state_times == sorted(set(rig.recorder.state_times)), "what was recorded is in its order"
+
+
 def test_a_publisher_that_falls_silent_is_said_until_it_speaks(rig: Rig) -> None:
     for x in range(1, 5):
         rig.now_ns += PERIOD_NS
