@@ -106,6 +106,44 @@ def test_ropes_are_lines_and_what_is_hidden_is_not_there(tmp_path: Path, store: 
     assert path.length == pytest.approx(1.0)
 
 
+def test_places_of_vertices_say_how_far_they_reach_also_where_they_are_the_normals_of_another(
+    tmp_path: Path, store: AssetStore
+) -> None:
+    scene = SceneBuilder()
+    for name, radius in (("large", 2.0), ("unit", 1.0)):
+        scene.add_sphere(name, radius=radius)
+    found = exported(scene.build(store).spec, store, tmp_path)
+    for mesh in found["meshes"]:
+        assert {"min", "max"} <= found["accessors"][mesh["primitives"][0]["attributes"]["POSITION"]].keys()
+    assert len(found["accessors"]) == 4, "the normals of both are one, and so are the triangles"
+
+
+def test_a_cloth_is_seen_from_both_sides(tmp_path: Path, store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_deformable("cloth", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    scene.add_box("box", half_size=(0.5, 0.5, 0.5))
+    found = exported(scene.build(store).spec, store, tmp_path)
+    worn = {node["name"]: found["meshes"][node["mesh"]]["primitives"][0] for node in found["nodes"] if "mesh" in node}
+    assert {name: found["materials"][one["material"]]["doubleSided"] for name, one in worn.items()} == {
+        "cloth": True,
+        "box": False,
+    }
+
+
+def test_lights_that_are_out_leave_nothing_and_a_flat_view_is_as_high_as_it_is(
+    tmp_path: Path, store: AssetStore
+) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><light name="on" active="true"/><light name="off" active="false"/>'
+        '<camera projection="orthographic" fovy="9" resolution="200 100"/></worldbody></mujoco>'
+    )
+    found = exported(parse_mujoco(model, store).spec, store, tmp_path)
+    assert {"on", "off"} & {node["name"] for node in found["nodes"]} == {"on"}
+    assert len(found["extensions"]["KHR_lights_punctual"]["lights"]) == 1
+    (camera,) = found["cameras"]
+    assert (camera["orthographic"]["ymag"], camera["orthographic"]["xmag"]) == (4.5, 9.0), "half of 9 m, twice as wide"
+
+
 def test_a_sky_has_no_form(tmp_path: Path, store: AssetStore) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 .5 0" width="8" height="8"/>'
@@ -158,3 +196,43 @@ def test_a_file_in_millimetres_keeps_its_texture(tmp_path: Path, store: AssetSto
     np.testing.assert_allclose(scaled.vertices, large.vertices / 1000, atol=1e-7)
     np.testing.assert_array_equal(scaled.visual.uv, large.visual.uv)
     np.testing.assert_array_equal(np.asarray(scaled.visual.material.baseColorTexture), pixels)
+
+
+WATCHERS = """<mujoco><worldbody>
+    <body name="seen" pos="1 2 3"><freejoint/><geom size=".1"/></body>
+    <body pos="0 0 1" euler="20 30 40"><joint/><geom size=".1"/>
+      <camera name="eye" mode="targetbody" target="seen" pos="1 0 0"/>
+      <camera name="rigid" pos="0 0 1" euler="0 50 0"/>
+      <camera name="lens" pos="0 0 1" resolution="240 180" sensorsize=".004 .003" focalpixel="200 310"/>
+      <light name="lamp" mode="targetbodycom" target="seen" pos="0 1 0"/>
+      <light name="fixed" dir="1 2 3"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_cameras_and_lights_look_as_they_do_at_first(tmp_path: Path, store: AssetStore) -> None:
+    """Also those that follow a body with their eyes, wherever it is."""
+    model = mujoco.MjModel.from_xml_string(WATCHERS)
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[7] = (-2, 1, 0.5), 0.7
+    mujoco.mj_forward(model, data)
+    found = exported(parse_mujoco(model, store, data=data).spec, store, tmp_path)
+    T_world = {0: np.diag([1.0, 1, 1, 1])}
+    waiting = [0]
+    while waiting:
+        at = waiting.pop()
+        for child in found["nodes"][at].get("children", []):
+            node = found["nodes"][child]
+            x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+            T = trimesh.transformations.quaternion_matrix([w, x, y, z])
+            T[:3, 3] = node.get("translation", (0, 0, 0))
+            T_world[child] = T_world[at] @ T
+            waiting.append(child)
+    named = {node.get("name"): T_world[k] for k, node in enumerate(found["nodes"]) if k in T_world}
+    for k, name in enumerate(("eye", "rigid")):
+        np.testing.assert_allclose(named[name][:3, :3], data.cam_xmat[k].reshape(3, 3), atol=1e-6)
+        np.testing.assert_allclose(named[name][:3, 3], data.cam_xpos[k], atol=1e-6)
+    for k, name in enumerate(("lamp", "fixed")):
+        np.testing.assert_allclose(-named[name][:3, 2], data.light_xdir[k], atol=1e-6)
+    lens = found["cameras"][2]["perspective"]
+    assert lens["aspectRatio"] == pytest.approx(240 / 180 * 310 / 200)
+    assert 180 / 2 / np.tan(lens["yfov"] / 2) == pytest.approx(310)
