@@ -16,7 +16,7 @@ from PIL import Image
 
 from iris_session.protocol.scene import Geometry, SceneSpec
 from iris_session.scene import AssetStore, EncodeOptions
-from iris_session.scene.cubes import Cubes, baked
+from iris_session.scene.cubes import Cube, Cubes, _cube_of, baked
 from iris_session.scene.glb import write_glb
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -204,6 +204,26 @@ def test_large_cubes_are_made_smaller_and_jpeg_stays(
     (picture,) = images(tmp_path / "a.glb")
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
     assert not_in_glb(spec) == ("1 cube textures of more than 32 pixels a face: they are there in a smaller size",)
+
+
+def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
+    spec = parse_mujoco(painted(SHAPES["box"], "cube", side=512), store).spec
+    visual = spec.visuals[0]
+    sides = []
+    for most in (512, 511):
+        cube = Cubes(spec, store, most).worn(visual.material, visual.geometry)
+        assert cube is not None
+        assert cube.atlas is not None
+        sides.append(cube.atlas.side)
+    assert sides == [512, 256]
+
+
+@pytest.mark.parametrize(("alpha", "pictured"), [(128, True), (255, False)])
+def test_one_colour_that_is_seen_through_needs_a_picture(alpha: int, *, pictured: bool) -> None:
+    faces = np.full((6, 8, 8, 4), (200, 100, 0, alpha), np.uint8)
+    found = _cube_of(Cube("", "png"), faces, 64)
+    assert (found.atlas is not None) == pictured
+    assert (found.tint != (1.0, 1.0, 1.0)) != pictured
 
 
 def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:

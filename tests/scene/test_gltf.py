@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from pathlib import Path
@@ -174,7 +175,7 @@ def test_sparse_quantised_strips_and_strides(tmp_path: Path, store: AssetStore) 
     document.json["accessors"][document.json["meshes"][square]["primitives"][0]["attributes"]["POSITION"]]["sparse"] = (
         sparse
     )
-    quantised = document.accessor(np.int16([[-32767, 0, 0], [32767, 0, 0], [0, 32767, 0], [0, 0, 32767]]))
+    quantised = document.accessor(np.int16([[-32768, 0, 0], [32767, 0, 0], [0, 32767, 0], [0, 0, 32767]]))
     document.json["accessors"][quantised]["normalized"] = True
     document.json["meshes"].append({"primitives": [{"attributes": {"POSITION": quantised}, "mode": 5}]})
     wide = np.zeros((3, 5), np.float32)
@@ -194,13 +195,13 @@ def test_sparse_quantised_strips_and_strides(tmp_path: Path, store: AssetStore) 
 
 
 def test_textures_as_the_material_has_them(tmp_path: Path, store: AssetStore) -> None:
-    alpha = np.dstack([PIXELS, np.tile(np.uint8([10, 200]), (8, 8))])
+    alpha = np.dstack([PIXELS, np.tile(np.uint8([10, 51]), (8, 8))])
     document = Document()
     texture = document.image(alpha)
-    turn = {"offset": [0.25, 0.5], "scale": [2.0, 3.0], "rotation": 0.0}
+    turn = {"offset": [0.25, 0.5], "scale": [2.0, 3.0], "rotation": math.pi / 2}
     base = {"index": texture, "extensions": {"KHR_texture_transform": turn}}
     document.json["materials"] = [
-        {"pbrMetallicRoughness": {"baseColorTexture": {"index": texture}}, "alphaMode": mode, "alphaCutoff": 0.5}
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": texture}}, "alphaMode": mode, "alphaCutoff": 0.2}
         for mode in ("OPAQUE", "MASK", "BLEND")
     ] + [{"pbrMetallicRoughness": {"baseColorTexture": base, "metallicRoughnessTexture": {"index": texture}}}]
     uv = document.accessor(SQUARE_UV)
@@ -213,14 +214,16 @@ def test_textures_as_the_material_has_them(tmp_path: Path, store: AssetStore) ->
         return decode_image(store.get(level.address), level.encoding)
 
     np.testing.assert_array_equal(pixels(0), PIXELS)
-    assert set(np.unique(pixels(1)[:, :, 3])) == {0, 255}
+    np.testing.assert_array_equal(pixels(1)[:, :, 3], np.tile([0, 255], (8, 8)), "0.2 is 51 of 255, and not cut")
     np.testing.assert_array_equal(pixels(2), alpha)
     packed = pixels(3, "orm")
     assert (packed[:, :, 0] == 255).all()  # nobody said that red shades
     np.testing.assert_array_equal(packed[:, :, 1:], PIXELS[:, :, 1:])
     worn = decode_mesh(store.get(spec.meshes[spec.visuals[3].geometry.mesh].levels[0].address))
     assert worn.uv is not None
-    np.testing.assert_allclose(sorted(worn.uv.tolist()), sorted((SQUARE_UV * [2, 3] + [0.25, 0.5]).tolist()))
+    corner = {tuple(p): uv for p, uv in zip(worn.position.round(3).tolist(), worn.uv, strict=True)}
+    for (x, y, z), (u, v) in zip(SQUARE.tolist(), SQUARE_UV.tolist(), strict=True):  # scaled, then turned, then moved
+        np.testing.assert_allclose(corner[x, y, z], [3 * v + 0.25, -2 * u + 0.5], atol=1e-6)
     again = built(_again(tmp_path / "a.glb", tmp_path / "b.glb", store), store)
     assert [t.channels for t in again.textures] == [t.channels for t in spec.textures], "alpha comes back"
 
@@ -352,6 +355,35 @@ def test_damaged_documents_are_refused(tmp_path: Path, change: dict[str, object]
     document.json.update(change)
     with pytest.raises(SceneBuildError, match=text):
         SceneBuilder().add_file(document.write(tmp_path / "a.glb"))
+
+
+def test_bounds_are_those_of_a_whole_file(tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    document = Document()
+    for _ in range(3):
+        document.square()
+    path = document.write(tmp_path / "a.glb")
+    with monkeypatch.context() as few:
+        few.setattr("iris_session.scene.gltf.MAX_TRIANGLES", 5)
+        with pytest.raises(SceneBuildError, match="more than 5 triangles"):
+            built(path, store)
+    places = base64.b64encode(np.tile(SQUARE[:3], (100, 1)).tobytes()).decode()
+    text = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 3_600, "uri": f"data:;base64,{places}"} for _ in range(3)],
+        "bufferViews": [{"buffer": k, "byteLength": 3_600} for k in range(3)],
+        "accessors": [{"bufferView": k, "componentType": 5126, "count": 300, "type": "VEC3"} for k in range(3)],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": k}}]} for k in range(3)],
+        "nodes": [{"mesh": k} for k in range(3)],
+    }
+    (tmp_path / "b.gltf").write_text(json.dumps(text))
+    size = (tmp_path / "b.gltf").stat().st_size
+    for most, fits in ((size + 3 * 3_600, True), (size + 3 * 3_600 - 2, False)):
+        monkeypatch.setattr("iris_session.scene.gltf_data.MAX_FILE_BYTES", most // 2 + most % 2)
+        if fits:
+            built(tmp_path / "b.gltf", store)
+        else:
+            with pytest.raises(SceneBuildError, match="draws in more than"):
+                built(tmp_path / "b.gltf", store)
 
 
 def test_cut_files_are_refused(tmp_path: Path, store: AssetStore) -> None:

@@ -46,6 +46,10 @@ def test_more_than_65536_corners() -> None:
     mesh = index_corners(position, np.zeros_like(position), None)
     assert mesh.vertices == 90_000
     assert np.array_equal(decode_mesh(encode_mesh(mesh)).position[mesh.index], position)
+    for most in (65_535, 65_536):  # the last number that two bytes hold, and the first that they do not
+        points = np.zeros((most + 1, 3), np.float32)
+        last = MeshArrays(points, points, None, np.array([[0, 1, most]], np.uint32))
+        assert decode_mesh(encode_mesh(last)).index.max() == most
 
 
 @given(st.integers(0, 1000), st.floats(1e-3, 1e3), st.floats(-100, 100))
@@ -132,6 +136,7 @@ def test_edges_stay_sharp_and_round_things_smooth() -> None:
         ([Stored("position", np.zeros((3, 2), np.float32))], "expected f4"),
         ([Stored("position", np.full((1, 3), np.nan, np.float32))], "not finite"),
         ([Stored("index", np.full((1, 3), 7, np.uint16))], "has the corner 7"),
+        ([Stored("index", np.full((1, 3), 1, np.uint16))], "has the corner 1, but there are 1"),
     ],
 )
 def test_what_is_no_mesh_is_refused(arrays: list[Stored], text: str) -> None:

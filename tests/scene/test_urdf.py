@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 import yourdfpy
 from numpy.typing import NDArray
 
@@ -94,6 +95,34 @@ def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
     assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
     assert len(scene.spec.meshes) == 2  # the six links wear one
     assert scene.skipped == ()
+
+
+def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{k}"/>' for k in range(4))
+    joints = "".join(
+        f'<joint name="j{k}" type="prismatic"><parent link="l0"/><child link="l{k}"/><axis xyz="0 0 1"/>'
+        f'<limit lower="-9" upper="9"/>{mimic}</joint>'
+        for k, mimic in (
+            (1, '<mimic joint="j2" multiplier="3" offset="0.01"/>'),
+            (2, '<mimic joint="j3" multiplier="2" offset="0.1"/>'),
+            (3, ""),
+        )
+    )
+    (tmp_path / "a.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    arm = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"]
+    assert arm.mimics == {"j1": "j3", "j2": "j3"}
+    at = {body: pose.p[2] for body, pose in arm.poses({"j3": 1.0}).items()}
+    assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
+
+
+def test_meshes_in_millimetres_are_that_small(tmp_path: Path) -> None:
+    trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.3mf")  # which counts in them
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="r"><link name="base"><visual><geometry><mesh filename="box.3mf" scale="2 2 2"/></geometry>'
+        "</visual></link></robot>"
+    )
+    (mesh,) = composed(tmp_path / "a.urdf", tmp_path).spec.meshes
+    np.testing.assert_allclose(np.subtract(mesh.high, mesh.low), (2.0, 4.0, 6.0), atol=1e-5)
 
 
 def test_picture_is_mujocos(tmp_path: Path) -> None:
