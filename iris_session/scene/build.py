@@ -35,6 +35,8 @@ _COARSER: Final = 4
 _FEWEST_TRIANGLES: Final = 500
 #: Textures are halved down to this side.
 _SMALLEST_SIDE: Final = 256
+#: What files in a form of their own begin with. MuJoCo has each as one row of bytes that look like grey pixels.
+_OWN_FORMS: Final = (b"\xabKTX 11\xbb\r\n", b"\xabKTX 20\xbb\r\n")
 
 
 class EncodeOptions(msgspec.Struct, frozen=True):
@@ -177,7 +179,7 @@ class Builder:
         return MeshLevel(self.store.put(data), len(data), AssetEncoding.ARRAYS, mesh.vertices, mesh.triangles, error)
 
     def _texture(self, pixels: Pixels, kind: str) -> TextureNote:
-        if pixels.shape[2] not in (1, 3, 4):
+        if pixels.shape[2] not in (1, 3, 4) or _own_form(pixels):
             data = pixels.tobytes()
             level = TextureLevel(
                 self.store.put(data), len(data), AssetEncoding.OPAQUE, pixels.shape[1], pixels.shape[0]
@@ -201,6 +203,10 @@ class Builder:
         image = encode_image(pixels, encoding, self.options.jpeg_quality)
         height, width = pixels.shape[0] // faces, pixels.shape[1]
         return TextureLevel(self.store.put(image.data), len(image.data), image.encoding, width, height, image.max_error)
+
+
+def _own_form(pixels: Pixels) -> bool:
+    return pixels.shape[0] == pixels.shape[2] == 1 and pixels[0, :12].tobytes().startswith(_OWN_FORMS)
 
 
 def _box(mesh: MeshArrays) -> tuple[Vec3, Vec3]:

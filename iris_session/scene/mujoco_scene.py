@@ -5,6 +5,7 @@ The model is not changed. Left out: collision settings, actuators, sensors, cont
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -23,7 +24,7 @@ from iris_session.protocol.scene import (
     asset_addresses,
     encode_scene,
 )
-from iris_session.protocol.scene_names import GeometryKind
+from iris_session.protocol.scene_names import AssetEncoding, GeometryKind
 from iris_session.scene.build import Builder, EncodeOptions
 from iris_session.scene.mujoco_assets import hfields, meshes, textures
 from iris_session.scene.mujoco_deformables import deformables
@@ -103,7 +104,8 @@ def parse_mujoco(
         environment=environment(model, found_textures),
     )
     spec = with_totals(spec)
-    return Parsed(spec, store.put(encode_scene(spec)), _skipped(model), builder.built, builder.recalled)
+    skipped = (*_skipped(model), *_unasked(model, sites=sites, tendons=tendons), *_own_forms(spec))
+    return Parsed(spec, store.put(encode_scene(spec)), skipped, builder.built, builder.recalled)
 
 
 def _bodies(model: mujoco.MjModel, data: Any) -> tuple[Body, ...]:
@@ -233,3 +235,21 @@ def _skipped(model: mujoco.MjModel) -> tuple[str, ...]:
     if model.nflex > MAX_STREAMS:
         found.append(f"how {model.nflex - MAX_STREAMS} of {model.nflex} flexes bend: {MAX_STREAMS} are streamed")
     return tuple(found)
+
+
+def _unasked(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[str]:
+    """Sites and tendons that MuJoCo shows and that nobody asked for."""
+    shown = SceneSpec().groups_shown
+    if not sites:
+        marks = (_site(model, i) for i in range(model.nsite))
+        if n := sum(mark.group in shown and mark.rgba[3] > 0 for mark in marks):
+            yield f"{n} sites: what people shall see is a geom"
+    if not tendons:
+        cables = (cable for cable in _tendons(model) if cable.group in shown)
+        if n := sum(cable.width > 0 and cable.rgba[3] > 0 for cable in cables):
+            yield f"{n} tendons: a cable that people shall see is a flex of dim 1, or geoms"
+
+
+def _own_forms(spec: SceneSpec) -> Iterator[str]:
+    if n := sum(texture.levels[0].encoding == AssetEncoding.OPAQUE for texture in spec.textures):
+        yield f"{n} textures in a form of their own (KTX) where that is not read: PNG is everywhere"

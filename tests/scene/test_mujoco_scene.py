@@ -219,6 +219,32 @@ def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
     assert (tendons.tendons[0].width, len(tendons.tendons[0].sites)) == (0.02, 2)
 
 
+def test_sites_and_tendons_that_mujoco_shows_are_named_as_left_out(tmp_path: Path) -> None:
+    xml = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="a"/></body>
+    <site name="b" pos="1 0 0"/><site group="4"/><site rgba="0 0 0 0"/></worldbody>
+    <tendon>{}<fixed><joint joint="j" coef="1"/></fixed></tendon></mujoco>"""
+    cable = '<spatial {}><site site="a"/><site site="b"/></spatial>'
+    shown, hidden = (xml.format(cable.format(look)) for look in ("", 'group="5"'))
+    assert [text.partition(":")[0] for text in parse(shown, tmp_path).skipped] == ["2 sites", "1 tendons"]
+    assert [text.partition(":")[0] for text in parse(hidden, tmp_path).skipped] == ["2 sites"]
+    assert parse(shown, tmp_path, sites=True, tendons=True).skipped == ()
+
+
+def test_a_texture_in_a_form_of_its_own_is_passed_on(tmp_path: Path) -> None:
+    """Not as a picture of its bytes."""
+    store, data = AssetStore(tmp_path), b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(500)
+    xml = """<mujoco><asset><texture name="t" type="2d" file="a.ktx"/><material name="m" texture="t"/></asset>
+    <worldbody><geom size=".1" material="m"/></worldbody></mujoco>"""
+    try:
+        model = mujoco.MjModel.from_xml_string(xml, {"a.ktx": data})
+    except ValueError as error:  # MuJoCo 3.3
+        pytest.skip(str(error))
+    parsed = parse_mujoco(model, store)
+    (level,) = parsed.spec.textures[0].levels
+    assert (level.encoding, store.get(level.address)) == ("opaque", data)
+    assert "KTX" in parsed.skipped[0]
+
+
 def test_an_image_that_lights_the_scene(tmp_path: Path) -> None:
     xml = """<mujoco><asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="48"/></asset>
     <worldbody><light type="image" texture="sky" intensity="20"/></worldbody></mujoco>"""
