@@ -235,11 +235,13 @@ class Assets:
             self._workers.close()
             self._workers = None
 
-    def _end_assets(self) -> None:
-        """The client is closed: what has not come will not."""
-        self._end_workers()
+    def _end_assets(self) -> AssetWorkers | None:
+        """The client is closed: what has not come will not. The workers, to be closed without the lock: what they
+        decode with may wait for it."""
+        workers, self._workers = self._workers, None
         error = AssetError("", "closed", "the client was closed")
         for fetch in self._fetches:
             for address in list(fetch.pending):
                 fetch.fail(address, error)
         self._fetches.clear()
+        return workers

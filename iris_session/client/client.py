@@ -146,14 +146,17 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         if thread is not None and thread is not threading.current_thread():
             self._sockets.wake()
             thread.join()
+        workers = None
         with self._lock:
             if self.connection.phase is not Phase.CLOSED:
                 self._end_meeting()
-                self._end_assets()
+                workers = self._end_assets()
                 self.connection.close()
                 self._flush()
                 self._sockets.close()
             self._changed.notify_all()
+        if workers is not None:
+            workers.close()
 
     def __enter__(self) -> Self:
         if self.ready:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -110,3 +111,29 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
     finally:
         client.close()
         relay.close()
+
+
+def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: LiveSession, tmp_path: Path) -> None:
+    client = Client(live.address, role="observer", alignment="not_needed")
+    client.asset_cache = AssetCache(tmp_path / "cache")
+    client.connect(DEADLINE_S)
+    address = live.front.scene.assets[1]
+    begun, lets_go, seen = threading.Event(), threading.Event(), []
+
+    def decode(_address: str, data: memoryview) -> None:
+        begun.set()
+        assert lets_go.wait(DEADLINE_S)
+        seen.append((len(data), client.presence))
+
+    fetch = client.fetch_assets([address], decode=decode)
+    assert client.wait_for(lambda _: begun.is_set(), DEADLINE_S)
+    closing = threading.Thread(target=client.close, daemon=True)
+    closing.start()
+    until = time.monotonic() + DEADLINE_S
+    while not fetch.done and time.monotonic() < until:  # it has had the lock, and gives it back
+        time.sleep(0.001)
+    lets_go.set()
+    closing.join(DEADLINE_S)
+    assert not closing.is_alive()
+    assert fetch.failed[address].reason == "closed"
+    assert seen == [(300_000, {})]
