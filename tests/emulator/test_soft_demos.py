@@ -8,8 +8,13 @@ import random
 import numpy as np
 import pytest
 
+from anchors.pose import IDENTITY_POSE, IDENTITY_QUAT
 from iris_session.emulator.behaviours import Folder, Stower, make_behaviour
+from iris_session.emulator.behaviours.deformables import CORNERS
+from iris_session.emulator.behaviours.eyes import Seen
 from iris_session.emulator.behaviours.phases import SEARCH_S
+from iris_session.emulator.behaviours.soft import SEEN_S
+from iris_session.emulator.behaviours.stower import BOX_INSIDE
 from iris_session.runtime.plays import make_play
 from tests.emulator.deformable_rig import SoftRig, soft_demo
 from tests.emulator.handover_rig import LateView
@@ -53,6 +58,45 @@ def test_a_deformable_that_is_not_to_be_seen_is_named(name: str) -> None:
 def test_nobody_knows_any_other_deformable(behaviour: type) -> None:
     with pytest.raises(ValueError, match=r"deformable 'jelly'. Known: cloth, rose, mint"):
         behaviour("left", "jelly", *(["right"] if behaviour is Folder else []))
+
+
+def stower(monkeypatch: pytest.MonkeyPatch) -> Stower:
+    """Its hand and the box are at the origin, and the fingers 3 cm apart; where the body is, a test says."""
+    made = Stower("left", "rose")
+    for name, value in {"tip": IDENTITY_POSE, "body": IDENTITY_POSE, "gap": 0.03}.items():
+        monkeypatch.setattr(made.eyes, name, lambda _, value=value: value)
+    return made
+
+
+def test_a_late_picture_tells_nothing_of_what_began_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = stower(monkeypatch)
+    monkeypatch.setattr(one, "_holding", lambda: False)
+    eyes = one.eyes
+    eyes.now_s = eyes.captured_s = 5.0
+    one._enter("carry")
+    eyes.now_s = 9.0
+    assert not one._seen_for(2.5)
+    assert one._stays_behind("lost")
+    eyes.now_s, eyes.captured_s = 11.0, 9.0 + SEEN_S
+    assert one._stays_behind("lost")
+    assert one._seen_for(2.5)
+    assert (one.phase, one.attempts) == ("carry", 1), "the picture is not yet of the time since"
+    eyes.captured_s += 0.01
+    assert one._stays_behind("lost")
+    assert (one.phase, one.attempts) == ("back_off", 2)
+
+
+def test_a_soft_body_is_held_between_the_fingers_and_stowed_within_all_walls(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = stower(monkeypatch)
+    for away_m, held in ((0.0, True), (0.1, False)):
+        one.eyes._vertices = {index: Seen(((away_m, 0.0, 0.0), IDENTITY_QUAT), 0.0) for index in CORNERS["rose"]}
+        assert one._holding() == held
+    x, y, z = BOX_INSIDE
+    for sign in (1.0, -1.0):
+        assert one._inside((sign * 0.9 * x, sign * 0.9 * y, 0.9 * z))
+        assert not one._inside((sign * 1.1 * x, 0.0, 0.0))
+        assert not one._inside((0.0, sign * 1.1 * y, 0.0))
+    assert not one._inside((0.0, 0.0, 1.1 * z))
 
 
 def test_the_rig_moves_deformables_as_a_whole() -> None:

@@ -62,6 +62,58 @@ def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Pat
     assert p == pytest.approx((0.4, 0.0, 0.0))
 
 
+def test_what_is_fixed_on_what_is_fixed_on_something_that_moves_goes_with_it(tmp_path: Path) -> None:
+    """Both are turned, so that their order tells."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="arm" pos="0 0 1" euler="20 30 0"><freejoint/><geom size=".1"/>
+        <body name="wrist" pos=".1 .2 0" euler="90 0 20"><body name="hand" pos="0 .3 .1" euler="0 40 0">
+        <geom size=".1" pos=".1 0 0"/></body></body></body></worldbody></mujoco>"""
+    )
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+    reader = scene.SceneReader(spec, store, [body for body in infos(model) if body.name == "arm"])
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    frame, T_arm_visual = reader.place(spec.visuals[1])
+    assert frame == "arm"
+    T_world_arm = (tuple(data.xpos[1].tolist()), tuple(data.xquat[1].tolist()))
+    assert apply(T_world_arm, T_arm_visual[0]) == pytest.approx(tuple(data.geom_xpos[1]))
+
+
+def test_one_shape_under_two_cubes_is_cut_for_each(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><texture name="c" type="cube" builtin="checker" rgb1="1 0 0" width="60" height="60"/>
+        <material name="along" texture="c"/><material name="uniform" texture="c" texuniform="true"/></asset><worldbody>
+        <geom type="ellipsoid" size="1 .5 .2" material="along"/>
+        <geom type="ellipsoid" size="1 .5 .2" material="uniform"/></worldbody></mujoco>"""
+    )
+    store = AssetStore(tmp_path)
+    spec = parse_mujoco(model, store).spec
+
+    def worn(reader: scene.SceneReader, visual: int) -> bytes:
+        uv = reader.form(spec.visuals[visual]).uv
+        assert uv is not None
+        return uv.tobytes()
+
+    both = scene.SceneReader(spec, store, [])
+    found = [worn(both, visual) for visual in (0, 1)]
+    assert found == [worn(scene.SceneReader(spec, store, []), visual) for visual in (0, 1)]
+    assert found[0] != found[1]
+
+
+def test_a_tall_texture_is_taken_as_small_as_a_wide_one(tmp_path: Path) -> None:
+    builder = SceneBuilder()
+    pixels = np.random.default_rng(1).integers(0, 255, (2 * scene.TEXTURE_SIDE, scene.TEXTURE_SIDE, 3), np.uint8)
+    corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
+    for shown in (pixels, pixels.transpose(1, 0, 2)):
+        builder.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=np.ascontiguousarray(shown))
+    store = AssetStore(tmp_path)
+    spec = builder.build(store).spec
+    reader = scene.SceneReader(spec, store, [])
+    found = [reader.texture(visual.material) for visual in spec.visuals]
+    assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 2
+
+
 @pytest.mark.parametrize("path", ["aloha/scene.xml", "kuka_iiwa_14/scene.xml"])
 def test_every_geom_of_real_robots_is_where_mujoco_has_it(path: str, tmp_path: Path) -> None:
     """In another configuration than the one that the specification was made in."""

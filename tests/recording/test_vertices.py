@@ -38,5 +38,5 @@ def test_a_new_scene_is_seen_at_once() -> None:
     assert pace.take("a", 100_000, 0)
     assert not pace.take("a", 100_000, S)
     pace.reset()
-    assert pace.take("a", 100, S)
-    assert pace.take("a", 100, S + PERIOD_NS), "the rate is that of the new one"
+    assert pace.take("b", 100, S)
+    assert pace.take("b", 100, S + PERIOD_NS), "the rate is that of the new one"

@@ -135,6 +135,16 @@ def test_a_floating_link_that_takes_others_too_far_away_changes_nothing() -> Non
     assert pose(draft, "arm/upper")[0] == 0.0
 
 
+def test_a_root_that_takes_its_bodies_too_far_away_stays_where_it_was(draft: SceneDraft) -> None:
+    draft.set_joints("arm", {"turn": 0.5})
+    before = everything(draft)
+    with pytest.raises(PublishError, match="more than 1,000 km away"):
+        draft.set_pose("arm", (1e6, 0.0, 0.0), UNIT)
+    assert everything(draft) == before
+    draft.set_joints("arm", {})
+    assert everything(draft) == before, "nor does it go there with the next joint that is set"
+
+
 def test_many_bodies_at_once_are_as_one_after_the_other(draft: SceneDraft) -> None:
     other = SceneDraft(composed())
     names = ["blue", "red"]

@@ -29,6 +29,7 @@ from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.runtime.cadence import SILENT_NS
 from iris_session.runtime.resume_note import note_path
+from iris_session.runtime.scene_publisher import AHEAD_NS, _capture
 from iris_session.runtime.verification import verify_recording
 from iris_session.scene import AssetStore
 
@@ -140,6 +141,15 @@ def test_a_time_that_goes_back_is_a_new_scene_epoch(session: ScenePublisher) -> 
     session.reset()
     session.publish(4.5)
     session.run(until=lambda: kinds(session).count(SceneChanged) == before + 2, seconds=30.0)
+    session.publish(5.0)
+    session.run(until=lambda: session.status().sim_time == 5.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 2, "a reset is one"
+
+
+def test_what_is_captured_a_moment_ahead_of_the_clock_is_captured_now() -> None:
+    assert _capture(7_000 + AHEAD_NS, 7_000) == 7_000
+    with pytest.raises(PublishError, match="ahead of"):
+        _capture(7_001 + AHEAD_NS, 7_000)
 
 
 def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: ScenePublisher) -> None:

@@ -54,6 +54,18 @@ def test_looks_that_were_replaced_are_not_kept(world: World, tmp_path: Path, mon
     scenes.close()
 
 
+def test_the_scene_before_is_held_too_and_patches_on_one_visual_count_once(world: World, tmp_path: Path) -> None:
+    scenes = SharedScenes(tmp_path, "test")
+    scenes.take(scenes.make(world))
+    looks = [scenes.take(scenes.patch([SetVisual(0, rgba=(i / 4, 0.0, 0.0, 1.0))])).scene_hash for i in range(3)]
+    store = AssetStore(tmp_path)
+    removed = [store.discard(address, store.used_at(address)) for address in looks]
+    assert removed == [True, False, False], "the front still serves the one before"
+    assert scenes.newest is not None
+    assert len(scenes.newest.patches) == 1
+    scenes.close()
+
+
 def test_a_disk_that_is_full_does_not_undo_a_scene(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -181,6 +181,9 @@ def test_tables_that_do_not_fit_are_refused() -> None:
     twice = struct.pack("<BBHIIIII", 1, ROWS, 1, 2, 1, 2, 0, 0) + np.array([1, 1], "<u4").tobytes()
     with pytest.raises(StreamError, match="each once"):
         DeformableTopology.from_bytes(twice)
+    beyond = struct.pack("<BBHIIIII", 1, ROWS, 0, 2, 1, 2, 1, 0) + np.array([0, 1, 2], "<u4").tobytes()
+    with pytest.raises(StreamError, match="names vertex 2 of 2"):
+        DeformableTopology.from_bytes(beyond)
     with pytest.raises(StreamError, match="header asks"):
         DeformableTopology.from_bytes(struct.pack("<BBHIIIII", 1, ROWS, 0, 2**18, 1, 2**18, 2**20, 2**20))
 
