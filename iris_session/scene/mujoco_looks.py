@@ -3,10 +3,12 @@ their defaults."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Final
 
 import mujoco
+import numpy as np
 
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.scene import Camera, Environment, Headlight, Light
@@ -30,6 +32,10 @@ _FOLLOW: Final = {
     4: Follow.TARGET_BODY_COM,
 }
 _ORTHOGRAPHIC: Final = 1
+#: Values of `_FOLLOW` for what moves with a body and does not turn with it.
+_TRACKING: Final = frozenset({1, 2})
+#: What differs by less [m, and parts of unit vectors] is where the model says, to the bit.
+_SAME: Final = 1e-6
 
 
 def rgb(values: Any) -> Rgb:
@@ -82,15 +88,61 @@ def materials(model: mujoco.MjModel) -> tuple[Material, ...]:
     )
 
 
-def lights(model: mujoco.MjModel) -> tuple[Light, ...]:
-    """All lights, by id."""
+def tracked(model: mujoco.MjModel, data: Any) -> Any | None:
+    """A copy of `data` with places of lights and cameras, if any moves with its body and does not turn with it: where
+    such a one stands in its body's frame depends on the state. `None`: all stand as the model says."""
+    if data is None or not {*model.light_mode.tolist(), *model.cam_mode.tolist()} & _TRACKING:
+        return None
+    own = copy.copy(data)
+    mujoco.mj_kinematics(model, own)
+    mujoco.mj_comPos(model, own)
+    mujoco.mj_camlight(model, own)
+    return own
+
+
+def _into_body(at: Any, body: int, v_world: Any) -> Any:
+    """A vector of the world in the frame of a body."""
+    q_body_world, v_body = np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(q_body_world, at.xquat[body])
+    mujoco.mju_rotVecQuat(v_body, v_world, q_body_world)
+    return v_body
+
+
+def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
+    """Place and direction in the frame of its body. `at`: of `tracked`."""
+    rigid = vec3(model.light_pos[i]), vec3(model.light_dir[i])
+    if at is None or int(model.light_mode[i]) not in _TRACKING:
+        return rigid
+    body = int(model.light_bodyid[i])
+    p_body = _into_body(at, body, at.light_xpos[i] - at.xpos[body])
+    found = vec3(p_body), vec3(_into_body(at, body, at.light_xdir[i]))
+    return rigid if np.allclose(rigid, found, rtol=0, atol=_SAME) else found
+
+
+def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
+    """T_body_camera. `at`: of `tracked`."""
+    rigid = pose(model.cam_pos[i], model.cam_quat[i])
+    if at is None or int(model.cam_mode[i]) not in _TRACKING:
+        return rigid
+    body, q_world, q_body_world, q_body = int(model.cam_bodyid[i]), np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_mat2Quat(q_world, at.cam_xmat[i])
+    mujoco.mju_negQuat(q_body_world, at.xquat[body])
+    mujoco.mju_mulQuat(q_body, q_body_world, q_world)
+    found = pose(_into_body(at, body, at.cam_xpos[i] - at.xpos[body]), q_body)
+    near = abs(np.dot(rigid.q, found.q)) >= 1.0 - _SAME**2 and np.allclose(rigid.p, found.p, rtol=0, atol=_SAME)
+    return rigid if near else found
+
+
+def lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
+    """All lights, by id. `at`: of `tracked`."""
+    places = [_light_place(model, i, at) for i in range(model.nlight)]
     return tuple(
         Light(
             name=label(model, "light", i),
             kind=_light_kind(model, i),
             body=int(model.light_bodyid[i]),
-            p_body=vec3(model.light_pos[i]),
-            direction_body=vec3(model.light_dir[i]),
+            p_body=places[i][0],
+            direction_body=places[i][1],
             ambient=rgb(model.light_ambient[i]),
             diffuse=rgb(model.light_diffuse[i]),
             specular=rgb(model.light_specular[i]),
@@ -116,8 +168,8 @@ def _light_kind(model: mujoco.MjModel, index: int) -> str:
     return LightKind.DIRECTIONAL if model.light_directional[index] else LightKind.SPOT  # before MuJoCo 3.3.3
 
 
-def cameras(model: mujoco.MjModel) -> tuple[Camera, ...]:
-    """All cameras, by id."""
+def cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
+    """All cameras, by id. `at`: of `tracked`."""
     found = []
     for i in range(model.ncam):
         width, height = (int(n) for n in model.cam_resolution[i])
@@ -132,7 +184,7 @@ def cameras(model: mujoco.MjModel) -> tuple[Camera, ...]:
             Camera(
                 name=label(model, "camera", i),
                 body=int(model.cam_bodyid[i]),
-                T_body_camera=pose(model.cam_pos[i], model.cam_quat[i]),
+                T_body_camera=_camera_place(model, i, at),
                 fovy=float(model.cam_fovy[i]),
                 orthographic=_projection(model, i) == _ORTHOGRAPHIC,
                 focal=focal,

@@ -28,7 +28,7 @@ from iris_session.protocol.scene_names import AssetEncoding, GeometryKind
 from iris_session.scene.build import Builder, EncodeOptions
 from iris_session.scene.mujoco_assets import hfields, meshes, textures
 from iris_session.scene.mujoco_deformables import deformables
-from iris_session.scene.mujoco_looks import cameras, drawn_rgba, environment, lights, materials, pose
+from iris_session.scene.mujoco_looks import cameras, drawn_rgba, environment, lights, materials, pose, tracked
 from iris_session.scene.mujoco_names import label
 from iris_session.scene.store import AssetStore
 from iris_session.scene.totals import with_totals
@@ -77,6 +77,7 @@ def parse_mujoco(
     `data`: the initial state, with kinematics; else the model's default one. `sites`, `tendons`: list them too (tendons
     bring the sites they run through).
     """
+    at = tracked(model, data)
     if data is None:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -96,8 +97,8 @@ def parse_mujoco(
         textures=found_textures,
         meshes=meshes(model, builder),
         hfields=hfields(model, builder),
-        lights=lights(model),
-        cameras=cameras(model),
+        lights=lights(model, at),
+        cameras=cameras(model, at),
         sites=tuple(_site(model, i) for i in range(model.nsite) if sites or i in needed),
         tendons=cables,
         deformables=deformables(model, data, builder),

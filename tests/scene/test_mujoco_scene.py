@@ -19,6 +19,7 @@ from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
 from iris_session.scene.mujoco_scene import Parsed, parse_mujoco
+from iris_session.scene.parts import matrix_of
 from tests.scene.models import every_shape, flexes
 
 
@@ -371,3 +372,31 @@ def test_specifications_of_anybody(data: bytes) -> None:
             decode_scene(candidate)
         except SceneError:
             continue
+
+
+def test_what_tracks_a_body_stands_where_it_does_at_first(tmp_path: Path) -> None:
+    """It does not turn with its body, so its place in the body's frame depends on the state in which all begins."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="t" pos="1 2 3" euler="10 20 30"><freejoint/><geom size=".1"/>
+        <geom size=".1" pos="1 0 0"/>
+        <camera mode="track" pos="0 -3 0" xyaxes="1 0 0 0 0 1"/><camera mode="trackcom" pos="0 -3 0" euler="0 50 0"/>
+        <camera pos="1 2 3"/><light mode="trackcom" pos="0 0 2" dir="1 0 -1"/><light mode="track" pos="0 0 2"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    plain = parse_mujoco(model, AssetStore(tmp_path))
+    assert parse_mujoco(model, AssetStore(tmp_path), data=data).scene_hash == plain.scene_hash
+    data.qpos[:] = (0, 0, 1, 0.5, 0.5, 0.5, 0.5)
+    mujoco.mj_kinematics(model, data)
+    spec = parse_mujoco(model, AssetStore(tmp_path), data=data).spec
+    mujoco.mj_forward(model, data)
+    T_world = {body.id: matrix_of(body.T_world_body) for body in spec.bodies}
+    for k, camera in enumerate(spec.cameras):
+        T = T_world[camera.body] @ matrix_of(camera.T_body_camera)
+        np.testing.assert_allclose(T[:3, 3], data.cam_xpos[k], atol=1e-9)
+        np.testing.assert_allclose(T[:3, :3], data.cam_xmat[k].reshape(3, 3), atol=1e-9)
+    for k, light in enumerate(spec.lights):
+        T = T_world[light.body]
+        np.testing.assert_allclose((T @ [*light.p_body, 1.0])[:3], data.light_xpos[k], atol=1e-9)
+        np.testing.assert_allclose(T[:3, :3] @ light.direction_body, data.light_xdir[k], atol=1e-9)
