@@ -32,6 +32,9 @@ DEFAULT_TIMEOUT_S: Final = 60.0
 #: again [s]; each is twice the one before.
 REFUSED_S: Final = 2.0
 FIRST_PAUSE_S: Final = 0.01
+#: How long a scene that is here, and was patched meanwhile, is brought up to date before it is returned as it is: one
+#: may be patched faster than a specification comes over a network.
+CATCH_UP_S: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -58,16 +61,18 @@ def fetch_scene(
 ) -> FetchedScene:
     """Fetches the present scene and waits for it; what the cache of this machine has does not travel.
 
-    A scene that is replaced meanwhile is left for the new one, of which only what is new comes. After `scene_changed`,
-    call it again when `client.mirror.scene_hash` is another. Raises `NotConnectedError` when it takes longer than
+    A scene that is replaced meanwhile is left for the new one, of which only what is new comes. One that is patched
+    without end comes as it was after one of the patches. After `scene_changed`, and at once, call it again when
+    `client.mirror.scene_hash` is not that of what you have. Raises `NotConnectedError` when it takes longer than
     `timeout_s`, or the session shares no specification; `AssetError` for a specification that the session says for
     `REFUSED_S` not to have; `ClientError` for one that this package does not read.
     """
     until = time.monotonic() + timeout_s
     refused = _Refused()
+    whole: tuple[int, float] | None = None  # scene epoch of the first that was here, and when it was
     made: Mapping[str, MeshArrays | Pixels] = {}
     while True:
-        scene_hash = client.mirror.scene_hash
+        scene_hash, epoch = client.mirror.scene_hash, client.mirror.scene_epoch
         try:
             scene, made = _fetch(client, scene_hash, budget, until, on_progress, made)
         except ClientError as error:
@@ -78,7 +83,11 @@ def fetch_scene(
             if not replaced:
                 client.wait_for(_named_another(scene_hash), min(refused.pause_s, until - now))
             continue
-        if client.mirror.scene_hash == scene_hash:
+        now = time.monotonic()
+        if whole is None or whole[0] != epoch:
+            whole = epoch, now
+        patched = client.mirror.scene_epoch == epoch and now - whole[1] > CATCH_UP_S
+        if client.mirror.scene_hash == scene_hash or patched:
             return scene
 
 

@@ -159,3 +159,36 @@ def test_a_scene_that_is_replaced_meanwhile_is_left_for_the_newest_which_gets_wh
     asked = [fetch.addresses for fetch in fetches]
     assert asked == [(parsed.scene_hash,), asked[1], (refused,), (newest,), ()]
     assert len(asked[1]) == 2, "a mesh and a texture, which are not fetched and decoded again"
+
+
+@pytest.mark.parametrize("cause", ["patch", "new_scene"])
+def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does_not(
+    store: AssetStore,
+    join: Callable[..., Client],
+    sessions: list[LiveSession],
+    monkeypatch: pytest.MonkeyPatch,
+    cause: str,
+) -> None:
+    parsed = parse_mujoco(mujoco.MjModel.from_xml_string(SCENE), store)
+    client = join(parsed.scene_hash, *parsed.addresses)
+    looks = [store.put(encode_scene(msgspec.structs.replace(parsed.spec, name=str(n)))) for n in range(20)]
+    shown = [parsed.scene_hash]
+    wait = fetched_scene._wait
+
+    def replaced_meanwhile(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
+        result = wait(client, fetch, until)
+        if fetch.addresses == (shown[-1],) and len(shown) < len(looks):
+            shown.append(looks[len(shown)])
+            sessions[0].show(shown[-1], (shown[-1], *parsed.addresses), cause)
+            assert client.wait_for(lambda c: c.mirror.synced and c.mirror.scene_hash == shown[-1], DEADLINE_S)
+        return result
+
+    monkeypatch.setattr(fetched_scene, "_wait", replaced_meanwhile)
+    monkeypatch.setattr(fetched_scene, "CATCH_UP_S", 0.0)
+    scene = fetch_scene(client, timeout_s=DEADLINE_S)
+    assert scene.meshes.keys() == {0}
+    if cause == "patch":
+        assert len(shown) == 3, "what is here is returned after a while"
+        assert scene.scene_hash == shown[1]
+    else:
+        assert scene.scene_hash == shown[-1] == looks[-1], "of another scene nothing is of use"
