@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from iris_session.client import AssetCache, Client
-from iris_session.client.deformables import MAX_ASSET_BYTES, Deformables, _Mesh, keys
+from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, keys
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
 from iris_session.protocol.scene_names import ArrayKind
@@ -291,4 +292,27 @@ def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
     assert both[0].feed is feed
     shapes._use([], "3" * 64)
     assert client._feeds == {}
+    client.close()
+
+
+def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after_a_pause(tmp_path: Path) -> None:
+    client = Client("127.0.0.1:1", role="observer", name="screen")
+    client.asset_cache = AssetCache(tmp_path)
+    shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
+    shapes._use([], one)
+    shapes._follow(one, ("a", 1))
+    shapes._follow(two, ("a", 2))
+    assert shapes._parked
+    shapes._follow(one, ("a", 3))
+    assert (shapes._parked, shapes._fetch) == (False, None)
+    shapes._follow(two, ("a", 3))
+    client.mirror.scene_hash = three
+    shapes._failed(AssetError("of a scene that is no more"))
+    assert shapes.fault == ""
+    client.mirror.scene_hash = two
+    for pause_s in (FIRST_PAUSE_S, 2 * FIRST_PAUSE_S):
+        before = time.monotonic()
+        shapes._failed(AssetError("unknown"))
+        assert shapes._retry_s >= before + pause_s
+    assert shapes.fault == "unknown"
     client.close()

@@ -314,6 +314,25 @@ def test_ctrl_c_within_a_step_ends_the_session_and_the_journal_before_it(rig: Ri
     assert rig.recorder.rows[-1].digest != CRASHED, "nothing of the step is at fault"
 
 
+def test_what_was_shown_is_not_sent_again_when_something_newer_has_just_come(rig: Rig) -> None:
+    rig.now_ns += PERIOD_NS
+    rig.publish(1.0)
+    wait_for(lambda: rig.xs()[-1] == 1.0)
+    step, publishers = rig.stepper.step, [threading.Thread(target=rig.publish, args=(2.0,))]
+
+    def meanwhile(n_ticks: int, plant: bytes = b"", *, publish: bool = True) -> None:
+        if n_ticks == 0 and publishers:
+            publisher = publishers.pop()
+            publisher.start()
+            publisher.join()  # it finds the lock taken, and leaves its frame
+        step(n_ticks, plant, publish=publish)
+
+    rig.stepper.step = meanwhile  # type: ignore[method-assign,assignment]
+    rig.now_ns += REPEAT_NS
+    wait_for(lambda: rig.xs()[-1] == 2.0)
+    assert rig.xs() == [0.0, 1.0, 2.0]
+
+
 def test_what_stops_the_helper_is_raised_where_it_is_seen(rig: Rig) -> None:
     def broken() -> list[Entry]:
         raise RuntimeError("the link is broken")

@@ -10,6 +10,7 @@ import pytest
 from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget, choose_levels
+from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import report, tree
 from iris_session.scene.totals import with_totals
@@ -75,6 +76,15 @@ def test_the_smallest_are_left_out_first(spec: SceneSpec) -> None:
     sides = [max(b - a for a, b in zip(mesh.low, mesh.high, strict=True)) for mesh in spec.meshes]
     largest = sides.index(max(sides))
     assert not any(visual.geometry.mesh == largest for visual in spec.visuals if visual.id in choice.hidden)
+
+
+def test_a_capsule_is_as_long_as_with_its_caps(tmp_path: Path) -> None:
+    scene = SceneBuilder()
+    scene.add_capsule("longer", radius=0.5, half_length=0.8)
+    scene.add_box("shorter", half_size=(1.0, 0.1, 0.1))
+    found = scene.build(AssetStore(tmp_path)).spec
+    (hidden,) = choose_levels(found, Budget(objects=1)).hidden
+    assert found.visuals[hidden].name == "shorter"
 
 
 def test_the_report_says_what_is_heavy(spec: SceneSpec) -> None:

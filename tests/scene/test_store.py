@@ -7,6 +7,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -82,6 +83,18 @@ def test_room_is_made_from_what_was_used_longest_ago(tmp_path: Path) -> None:
     fresh = store.put(b"x" * 1_000)
     assert [a in store for a in (first, second, third, fresh)] == [True, False, True, True]
     assert store.evicted == 1
+
+
+def test_what_is_recalled_is_used(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path, limit_bytes=2_000)
+    keys = [f"{k:064x}" for k in range(2)]
+    for k, key in enumerate(keys):
+        store.remember(key, b"n" * 1_000)
+        at = time.time() - GRACE_S - 300 + 100 * k
+        os.utime(tmp_path / "index" / key[:2] / key, (at, at))
+    assert store.recall(keys[0]) is not None
+    store.put(b"x" * 1_000)
+    assert [store.recall(key) is not None for key in keys] == [True, False]
 
 
 def test_what_is_held_or_fresh_stays(tmp_path: Path) -> None:

@@ -242,6 +242,18 @@ def test_escapes_out_of_order_or_range_are_refused() -> None:
     for wrong in (8, 9, 2**32 - 1):
         with pytest.raises(StreamError, match="ascending"):
             DeformableDecoder(topology).decode(payload[:HEADER] + struct.pack("<I", wrong) + payload[HEADER + 4 :])
+    second = HEADER + 16  # of two escapes of 16 bytes
+    beyond = payload[:second] + struct.pack("<I", topology.n_vertices) + payload[second + 4 :]
+    with pytest.raises(StreamError, match="in range"):
+        DeformableDecoder(topology).decode(beyond)
+
+
+def test_numbers_of_five_bytes_are_refused() -> None:
+    topology, vertices = MESHES["rope"]
+    head = bytearray(full(topology, vertices)[:HEADER])
+    head[1:3] = b"\0\5"  # not packed, five planes
+    with pytest.raises(StreamError, match="5 planes"):
+        DeformableDecoder(topology).decode(bytes(head) + bytes(3 * topology.n_vertices * 5))
 
 
 @pytest.mark.parametrize("bad", [{"bound_m": 0.0}, {"bound_m": math.nan}, {"bound_m": 2.0}, {"repeat_after": 0}])
