@@ -105,7 +105,8 @@ class SharedScenes:
                 f"{len(merging)} operations since the scene was loaded, at most {MAX_PATCHES}, of which those on one "
                 "visual count once: load the scene anew"
             )
-        return _stored(self._store, patched(newest.spec, ops), newest.info, merging)._replace(notes=newest.notes)
+        info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
+        return _stored(self._store, patched(newest.spec, ops), info, merging)._replace(notes=newest.notes)
 
     def take(self, shown: Shown) -> SceneInfo:
         """It is the newest from now on; its files stay, and those of the one before, which the front still serves.

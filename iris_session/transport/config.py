@@ -62,7 +62,8 @@ class FrontLimits(msgspec.Struct, frozen=True):
 
 class SceneInfo(msgspec.Struct, frozen=True):
     """What the front adds to every `Snapshot`. `poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, little-endian,
-    used until the first state frame. `tick_period_ns`: simulated time of one tick.
+    used until the first state frame. `tick_period_ns`: simulated time of one tick. `patches`: how often it was drawn
+    otherwise since it was loaded; its bodies stay where they are then.
 
     `asset_root`: folder of a store (`ROOT/ab/abcd...`) that holds the `assets`, by address, which clients may fetch as
     long as this scene or the next one is the present one, and the specification for moments more; empty for none.
@@ -75,6 +76,7 @@ class SceneInfo(msgspec.Struct, frozen=True):
     asset_root: str = ""
     assets: tuple[str, ...] = ()
     tick_period_ns: int = 2 * MILLISECOND
+    patches: int = 0
 
 
 class FrontConfig(msgspec.Struct, frozen=True):

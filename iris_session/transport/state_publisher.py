@@ -42,7 +42,8 @@ class StatePublisher:
         #: those that are sent again while their source is silent.
         self._delays: deque[tuple[int, int]] = deque(maxlen=300)
         self._shown_ns = -1
-        self.set_scene(scene)
+        self.scene = scene
+        self._begin()
 
     @property
     def newest_delay_ns(self) -> int:
@@ -67,9 +68,14 @@ class StatePublisher:
             self._state.get(zmq.EVENTS)
 
     def set_scene(self, scene: SceneInfo) -> None:
-        """Takes over another scene: later frames have its bodies."""
-        self.scene = scene
-        self._encoder = RigidEncoder(len(scene.bodies), self._next_seq)
+        """Takes over another scene: later frames have its bodies. A patch of the present one moves none of them."""
+        before, self.scene = self.scene, scene
+        if scene.patches and scene.bodies == before.bodies:
+            return
+        self._begin()
+
+    def _begin(self) -> None:
+        self._encoder = RigidEncoder(len(self.scene.bodies), self._next_seq)
         self._published = False
 
     def publish(self, header: bytes, poses: bytes) -> bool:

@@ -63,6 +63,8 @@ def test_the_scene_before_is_held_too_and_patches_on_one_visual_count_once(world
     assert removed == [True, False, False], "the front still serves the one before"
     assert scenes.newest is not None
     assert len(scenes.newest.patches) == 1
+    assert scenes.newest.info.patches == 3, "so the front knows that no body has moved"
+    assert scenes.make(world).info.patches == 0
     scenes.close()
 
 
