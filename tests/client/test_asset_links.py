@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import socket
 import threading
 import time
@@ -13,7 +14,9 @@ import msgspec
 import pytest
 
 from iris_session.client import AssetCache, Client, asset_loading
+from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
+from tests.client.test_assets import Liar, chunk
 from tests.transport.asset_rig import noise, put
 
 MIB = 1 << 20
@@ -137,3 +140,30 @@ def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: Liv
     assert not closing.is_alive()
     assert fetch.failed[address].reason == "closed"
     assert seen == [(300_000, {})]
+
+
+def test_a_connection_without_answers_is_made_anew(
+    live: LiveSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 100_000_000)
+    data, asked = b"asset", []
+
+    def answers(request: AssetRequest) -> list[list[bytes]]:
+        asked.append(request.request_id)
+        return [chunk(request, len(data), data)] if len(asked) > 1 else []
+
+    client = Client(live.address, role="observer", alignment="not_needed")
+    client.asset_cache = AssetCache(tmp_path / "cache")
+    client.connect(DEADLINE_S)
+    other, welcome = Liar(answers), client.connection.welcome
+    assert welcome is not None
+    endpoints = msgspec.structs.replace(welcome.endpoints, assets=other.port)
+    client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
+    try:
+        fetch = client.fetch_assets([hashlib.sha256(data).hexdigest()])
+        assert client.wait_for(lambda _: fetch.done, DEADLINE_S)
+        fetch.check()
+        assert len(asked) > 1
+    finally:
+        client.close()
+        other.close()

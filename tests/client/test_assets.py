@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import signal
 import threading
@@ -363,23 +362,6 @@ def test_lies_end_with_a_reason_and_leave_nothing_under_a_name(
     again = honest.fetch_assets([address])
     until_done(honest, again)
     assert again.read(address) == store.data[address], "what the liar left in the cache does no harm"
-
-
-def test_a_connection_without_answers_is_made_anew(
-    turn_to: Callable[..., tuple[Client, Liar]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(asset_loading, "PATIENCE_NS", 100_000_000)
-    data, asked = b"asset", []
-
-    def answers(request: AssetRequest) -> list[list[bytes]]:
-        asked.append(request.request_id)
-        return [chunk(request, len(data), data)] if len(asked) > 1 else []
-
-    client, _ = turn_to(answers)
-    fetch = client.fetch_assets([hashlib.sha256(data).hexdigest()])
-    until_done(client, fetch)
-    assert fetch.failed == {}
-    assert len(asked) > 1
 
 
 def test_a_frame_larger_than_any_is_not_taken_into_memory(

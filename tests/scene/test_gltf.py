@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from pathlib import Path
@@ -355,35 +354,6 @@ def test_damaged_documents_are_refused(tmp_path: Path, change: dict[str, object]
     document.json.update(change)
     with pytest.raises(SceneBuildError, match=text):
         SceneBuilder().add_file(document.write(tmp_path / "a.glb"))
-
-
-def test_bounds_are_those_of_a_whole_file(tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    document = Document()
-    for _ in range(3):
-        document.square()
-    path = document.write(tmp_path / "a.glb")
-    with monkeypatch.context() as few:
-        few.setattr("iris_session.scene.gltf.MAX_TRIANGLES", 5)
-        with pytest.raises(SceneBuildError, match="more than 5 triangles"):
-            built(path, store)
-    places = base64.b64encode(np.tile(SQUARE[:3], (100, 1)).tobytes()).decode()
-    text = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"byteLength": 3_600, "uri": f"data:;base64,{places}"} for _ in range(3)],
-        "bufferViews": [{"buffer": k, "byteLength": 3_600} for k in range(3)],
-        "accessors": [{"bufferView": k, "componentType": 5126, "count": 300, "type": "VEC3"} for k in range(3)],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": k}}]} for k in range(3)],
-        "nodes": [{"mesh": k} for k in range(3)],
-    }
-    (tmp_path / "b.gltf").write_text(json.dumps(text))
-    size = (tmp_path / "b.gltf").stat().st_size
-    for most, fits in ((size + 3 * 3_600, True), (size + 3 * 3_600 - 2, False)):
-        monkeypatch.setattr("iris_session.scene.gltf_data.MAX_FILE_BYTES", most // 2 + most % 2)
-        if fits:
-            built(tmp_path / "b.gltf", store)
-        else:
-            with pytest.raises(SceneBuildError, match="draws in more than"):
-                built(tmp_path / "b.gltf", store)
 
 
 def test_cut_files_are_refused(tmp_path: Path, store: AssetStore) -> None:

@@ -178,35 +178,6 @@ def test_flexes_become_deformables_without_their_bodies(tmp_path: Path) -> None:
     assert decode_arrays(store.get(spec.deformables[0].address), "deformable")["uv"].shape == (24, 3, 2)
 
 
-#: A mesh and a flex, and what they may differ in when all else is the same.
-ALIKE = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/></asset>
-    <worldbody><geom type="mesh" mesh="m"/></worldbody>
-    <deformable><flex name="f" dim="2" body="world" radius=".01" vertex="{0}" element="0 1 2 2 1 3"
-        texcoord="{1}"/></deformable></mujoco>"""
-OBJ = """v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 .5\nvt 0 0\nvt 1 0\nvt 0 1\nvt {0} 1\nvn 0 0 1\nvn 0 {1}
-f {2} 2/2/1 3/3/1\nf 3/3/1 2/2/1 4/4/2"""
-DIFFERENT = {
-    "": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/1/1"),
-    "texture coordinates of the mesh": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", ".5", ".6 .8", "1/1/1"),
-    "its normals": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".8 .6", "1/1/1"),
-    "which corner wears which coordinate": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/4/1"),
-    "vertices of the flex": ("0 0 1 1 0 1 0 1 1 1 1 2", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/1/1"),
-    "its texture coordinates": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 .5", "1", ".6 .8", "1/1/1"),
-}
-
-
-def test_nothing_that_is_remembered_of_a_model_is_taken_for_another(tmp_path: Path) -> None:
-    hashes = set()
-    for number, (vertex, texcoord, *obj) in enumerate(DIFFERENT.values()):
-        model = mujoco.MjModel.from_xml_string(
-            ALIKE.format(vertex, texcoord), assets={"m.obj": OBJ.format(*obj).encode()}
-        )
-        parsed = parse_mujoco(model, AssetStore(tmp_path / "one for all"))
-        assert parsed.spec == parse_mujoco(model, AssetStore(tmp_path / str(number))).spec
-        hashes.add(parsed.scene_hash)
-    assert len(hashes) == len(DIFFERENT)
-
-
 def test_sites_and_tendons_on_request(tmp_path: Path) -> None:
     xml = """<mujoco><worldbody><body><joint/><geom size=".1"/><site name="a" size=".01"/></body>
     <site name="b" pos="1 0 0" type="box" size=".01 .02 .03"/><site name="c"/></worldbody>
