@@ -1,16 +1,16 @@
-"""What bends in the session's scene, as a client sees it: the newest vertices of every deformable.
+"""What bends in the session's scene, as a client sees it: the newest vertices of every deformable, and its triangles.
 
 shapes = Deformables(client)
 while True:
     client.poll(0.01)
     for name in shapes.tend():
-        print(name, shapes.vertices[name][0])  # p_world of vertex 0 [m]
+        corners = shapes.vertices[name][shapes.meshes[name].faces]  # p_world (m, 3, 3) [m]; of a rope: edges (k, 2, 3)
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
+from iris_session.client.deformable_mesh import DeformableMesh, read_mesh
 from iris_session.client.errors import ClientError
 from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.protocol.scene_names import ArrayKind
-from iris_session.scene.arrays import decode_arrays, require
+from iris_session.protocol.scene_names import ArrayKind, ArrayName
+from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.errors import AssetError
 from iris_session.streams.deformable import DeformableDecoder
-from iris_session.streams.deformable_topology import MAX_VERTICES, DeformableTopology
+from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
 
 #: A scene whose assets did not come is asked for again after so long [s], then after twice that, at most the second.
@@ -47,27 +48,26 @@ class _Mesh:
         topology = DeformableTopology.from_bytes(arrays["plan"].tobytes())
         self.key, self.stream, self.address = key, spec.stream, spec.address
         self.decoder = DeformableDecoder(topology)
-        self.numbers = arrays.get("vertex")
-        if self.numbers is not None:
-            self.numbers = require(arrays, "vertex", "u2 u4", (topology.n_vertices,))
-            if int(self.numbers.max(initial=0)) >= MAX_VERTICES:
-                raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
+        self.shape = read_mesh(spec, arrays, topology.n_vertices)
+        self.numbered = ArrayName.VERTEX in arrays
         self.seq = -1
         self.fault = ""
 
     def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
         """By number in the model; what is inside of a solid is not a number."""
-        if self.numbers is None:
+        if not self.numbered:
             return p_world
-        everywhere = np.full((int(self.numbers.max()) + 1, 3), np.nan, np.float32)
-        everywhere[self.numbers] = p_world
+        everywhere = np.full((int(self.shape.rows.max()) + 1, 3), np.nan, np.float32)
+        everywhere[self.shape.rows] = p_world
         return everywhere
 
 
 class Deformables:
-    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. One without a
-    name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at which they were there,
-    by the same names. What is at rest comes once a second: older than that is not known, but what was there then.
+    """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. Those inside
+    of a soft body, which nobody sees, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
+    others. One without a name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at
+    which they were there, by the same names. What is at rest comes once a second: older than that is not known, but
+    what was there then. `meshes`: triangles, lines and looks, by the same names, each there before its first vertices.
 
     `scene_hash`: of the scene they are of. After a patch they go on as they are until the new specification is here,
     and what is the same in both goes on after it. `fault`: why something cannot be seen, empty while all is well.
@@ -87,6 +87,10 @@ class Deformables:
         self._fetch: AssetFetch | None = None
         self._fault = ""
         self._pause_s = self._retry_s = 0.0
+
+    @property
+    def meshes(self) -> Mapping[str, DeformableMesh]:
+        return {} if self._parked else {mesh.key: mesh.shape for mesh in self._meshes}
 
     @property
     def fault(self) -> str:
@@ -161,6 +165,8 @@ class Deformables:
         for key, part in zip(keys(parts), parts, strict=True):
             mesh = here.get(_identity(key, part))
             found.append(_Mesh(key, part, fetch.view(part.address)) if mesh is None else mesh)
+        for mesh, part in zip(found, parts, strict=True):  # nothing of it has failed
+            mesh.shape = mesh.shape.looking(part)
         return found
 
     def _use(self, meshes: list[_Mesh], scene_hash: str) -> None:

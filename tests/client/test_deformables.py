@@ -95,6 +95,73 @@ def test_deformables_of_one_name_or_none_are_told_apart(shared: Shared, joined: 
         live.close()
 
 
+def test_what_is_drawn_of_each_comes_with_it(shared: Shared, joined: list[Client], tmp_path: Path) -> None:
+    """Triangles and lines name rows of the vertices; those inside of a soft body are rows that nothing names."""
+    parts = shared.spec.deformables
+    live = shared.begin(list(parts))
+    try:
+        client, shapes = watch(live, joined, tmp_path / "cache")
+        assert client.wait_for(lambda _: (shapes.tend(), shapes.scene_hash)[1] != "", DEADLINE_S), shapes.fault
+        assert {name: mesh.look for name, mesh in shapes.meshes.items()} == {part.name: part for part in parts}
+        rests = {part.name: (part.stream, *shared.rest(part)) for part in parts}
+
+        def told(_: Client) -> bool:
+            for stream, encoder, rest in rests.values():
+                encoder.reset()
+                frames = encoder.encode(rest)
+                assert frames is not None
+                live.front.publish_media(stream, frames, live.now_ns, 1, MediaEncoding.DEFORMABLE)
+            shapes.tend()
+            return len(shapes.vertices) == len(parts)
+
+        assert client.wait_for(told, DEADLINE_S), shapes.fault
+        cloth, rope, soft = (shapes.meshes[name] for name in ("cloth", "rope", "soft"))
+        assert (cloth.faces.shape, cloth.edges.shape, rope.faces.shape, rope.edges.shape) == (
+            (24, 3),
+            (0, 2),
+            (0, 3),
+            (5, 2),
+        )
+        assert cloth.uv is not None
+        assert (cloth.uv.shape, rope.uv, soft.uv) == ((24, 3, 2), None, None)
+        points = shapes.vertices["rope"][rope.edges]
+        assert np.allclose(np.linalg.norm(points[:, 1] - points[:, 0], axis=1), 0.1, atol=0.002), "its spacing"
+        a, b, c = np.moveaxis(shapes.vertices["cloth"][cloth.faces], 1, 0)
+        assert np.isclose(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, 0.4 * 0.3, atol=0.002), "its area"
+        # 4 x 4 x 4 vertices, 2 x 2 x 2 of them inside
+        drawn = np.flatnonzero(np.isfinite(shapes.vertices["soft"]).all(axis=1))
+        assert shapes.vertices["soft"].shape == (64, 3)
+        assert len(soft.rows) == 56
+        assert drawn.tolist() == soft.rows.tolist() == np.unique(soft.faces).tolist()
+        a, b, c = np.moveaxis(shapes.vertices["soft"][soft.faces].astype(np.float64), 1, 0)
+        assert np.isclose(np.einsum("ij,ij->i", np.cross(a, b), c).sum() / 6, 0.3**3, atol=0.002), "outside is outside"
+        for mesh in shapes.meshes.values():
+            with pytest.raises(ValueError, match="read-only"):
+                mesh.rows[0] = 0
+    finally:
+        live.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("elements", None),
+        ("elements", np.array([[0, 1, 20]], np.uint32)),  # it has 20 vertices
+        ("elements", np.zeros((4, 2), np.uint32)),
+        ("uv", np.zeros((3, 3, 2), np.float32)),
+    ],
+    ids=["none", "beyond the vertices", "lines of a cloth", "uv of other triangles"],
+)
+def test_triangles_that_cannot_be_are_refused(tmp_path: Path, name: str, values: np.ndarray | None) -> None:
+    store = AssetStore(tmp_path)
+    part = parse_mujoco(flexes(), store).spec.deformables[0]
+    arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
+    kept = [Stored(key, array) for key, array in arrays.items() if key != name]
+    bad = encode_arrays(ArrayKind.DEFORMABLE, kept if values is None else [*kept, Stored(name, values)])
+    with pytest.raises((AssetError, ValueError), match=f"{name}|vertices"):
+        _Mesh("cloth", part, memoryview(bad))
+
+
 class Play:
     """A session whose deformables go up, and a client that looks at them."""
 
@@ -152,7 +219,8 @@ def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Pl
     feeds = {part.stream: play.client.media(part.stream) for part in play.parts}
     kept = {mesh.key: mesh for mesh in play.shapes._meshes}
     renamed = msgspec.structs.replace(play.parts[1], name="other")
-    address, assets = shared.of([play.parts[0], renamed], "patched")
+    recoloured = msgspec.structs.replace(play.parts[0], rgba=(0.5, 0.0, 1.0, 1.0))
+    address, assets = shared.of([recoloured, renamed], "patched")
     seen_ns = dict(play.shapes.capture_ns)
     play.live.show(address, assets)
 
@@ -167,6 +235,7 @@ def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Pl
     assert not {second, third} & play.shapes.vertices.keys(), "they are gone"
     play.until_moved({first, "other"})
     assert [mesh is kept.get(mesh.key) for mesh in play.shapes._meshes] == [True, False]
+    assert {name: mesh.look for name, mesh in play.shapes.meshes.items()} == {first: recoloured, "other": renamed}
     assert play.client.media(play.parts[0].stream) is feeds[play.parts[0].stream]
     assert play.client._feeds.keys() == {part.stream for part in play.parts[:2]}
     assert play.faults == {""}
@@ -209,7 +278,7 @@ def test_of_another_scene_nothing_is_shown_before_it_is_known(play: Play, shared
     play.live.show(address, assets[1:], "new_scene")
     play.until(lambda: play.client.mirror.synced and play.client.mirror.scene_epoch == 2)
     play.until(lambda: "unknown_asset" in play.shapes.fault)
-    assert (play.shapes.vertices, play.shapes.capture_ns) == ({}, {})
+    assert (play.shapes.vertices, play.shapes.capture_ns, play.shapes.meshes) == ({}, {}, {})
     assert not play.client._feeds
     play.live.show(address, assets, "")
     play.until(lambda: play.shapes.scene_hash == address)
