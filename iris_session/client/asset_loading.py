@@ -90,6 +90,7 @@ class AssetLoader:
         self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
         self._busy: dict[str, int] = {}  # in the hands of the workers
         self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
+        self._anew: set[str] = set()  # whose part was thrown away because the session has less: once
         self._asked: dict[int, tuple[Ask, int]] = {}  # with the time
         self._chunk_bytes = CHUNK_BYTES
         self._unstored = 0
@@ -124,13 +125,16 @@ class AssetLoader:
     def missing(self, address: str, offset: int) -> None:
         """It is not in the cache, but its first `offset` bytes are."""
         if address in self._busy:
-            self._items[address] = _Item(address, offset, self._busy.pop(address))
+            item = self._items[address] = _Item(address, offset, self._busy.pop(address))
+            item.anew = address in self._anew
 
     def again(self, address: str) -> bool:
-        """The bytes that came were not those of the asset: from the beginning. False: that was the second time."""
+        """The bytes that came were not those of the asset: from the beginning. False: that was the second time. Does
+        nothing for one that was let go of meanwhile."""
         item = self._items.get(address)
-        self._busy.pop(address, None)
-        if item is not None and item.anew:
+        if item is None:
+            return True
+        if item.anew:
             self.drop(address)
             return False
         fresh = self._items[address] = _Item(address, 0, -1)
@@ -141,6 +145,7 @@ class AssetLoader:
         """It is there, or will not come."""
         for table in (self._wanted, self._busy, self._items):
             table.pop(address, None)
+        self._anew.discard(address)
 
     def requests(self, now_ns: int) -> Iterator[Ask]:
         """What is to be asked now, in the order of the assets. What was yielded counts as asked."""
@@ -235,6 +240,7 @@ class AssetLoader:
         self.drop(ask.address)
         if refused.reason == AssetRefusal.BAD_RANGE and item.got and not item.anew:
             self._busy[ask.address] = -1  # our part is longer than the asset: it was of something else
+            self._anew.add(ask.address)
             return ask.address
         text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
         return Failed(ask.address, refused.reason, text)

@@ -131,12 +131,16 @@ class AssetHub:
 
     def _reader(self, route: bytes, descriptor: int, number: int, now_ns: int) -> Reader | None:
         reader = self._readers.get(route)
-        if reader is not None and (reader.descriptor, reader.number) == (descriptor, number):
-            return reader
-        if reader is not None:
+        if reader is not None and reader.descriptor != descriptor:
             self.forget(route)
+            reader = None
+        if reader is not None and reader.number == number:
+            return reader
         if sum(one.number == number for one in self._readers.values()) >= MAX_READERS_EACH:
             return None
+        if reader is not None:  # a gateway that asks for several: nothing that waits is lost
+            reader.number = number
+            return reader
         reader = self._readers[route] = Reader(route, descriptor, number, now_ns)
         return reader
 

@@ -246,6 +246,40 @@ def test_wrong_bytes_are_asked_for_once_more() -> None:
     assert loader.idle
 
 
+def test_a_part_is_thrown_away_once_whatever_comes_then() -> None:
+    """A session that gives something and then says that there is less, for as long as somebody believes it."""
+    loader = started("a", offset=1000)
+    (ask,) = loader.requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+    loader.missing("a", 0)
+    (ask,) = loader.requests(0)
+    assert answer(loader, ask, 10**9, 1000) is True
+    failed = refuse(loader, next(iter(loader.requests(0))), AssetRefusal.BAD_RANGE)
+    assert isinstance(failed, Failed)
+    assert failed.reason == AssetRefusal.BAD_RANGE
+    assert loader.want("a"), "who asks anew begins anew"
+    assert list(loader.to_look()) == ["a"]
+    loader.missing("a", 1000)
+    (ask,) = loader.requests(0)
+    assert refuse(loader, ask, AssetRefusal.BAD_RANGE) == "a"
+
+
+def test_wrong_bytes_of_what_was_let_go_of_are_not_asked_for_again() -> None:
+    loader = started("a")
+    (ask,) = loader.requests(0)
+    assert answer(loader, ask, 5) is True
+    loader.drop("a")  # cancelled while it is hashed
+    assert loader.again("a")
+    assert loader.idle
+    assert list(loader.requests(0)) == []
+    loader.want("a")
+    assert list(loader.to_look()) == ["a"]
+    assert loader.again("a"), "the one before"
+    assert list(loader.requests(0)) == [], "how much of it is there is still looked for"
+    loader.missing("a", 3)
+    assert [ask.offset for ask in loader.requests(0)] == [3]
+
+
 def test_a_session_that_contradicts_itself() -> None:
     loader = started("a", "b", "c")
     a, b, c = loader.requests(0)

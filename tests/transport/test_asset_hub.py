@@ -206,3 +206,23 @@ def test_whatever_happens_turns_and_windows_stay_in_step() -> None:
         assert len(one._ring) == len(waiting)
         for reader in waiting:
             assert reader.queued_bytes == sum(wanted.length for wanted in reader.queue) <= MAX_ASSET_WINDOW_BYTES
+
+
+def test_one_connection_that_asks_for_several_participants_loses_nothing_and_gains_nothing() -> None:
+    """As that of a gateway. Each request is answered, in their order, and the limits are those of one connection."""
+    one = AssetHub(SIZES.get)
+    one.allow({1: "gateway", 2: "gateway", 3: "gateway"})
+    asked = [1, 1, 2, 3, 2, 1]
+    for request_id, number in enumerate(asked):
+        request = AssetRequest(1, number, request_id, "small", 0, 10)
+        assert one.ask(b"route", 100, "gateway", request, 0) == ""
+    answered = []
+    while (reader := one.turn(0)) is not None:
+        answered.append(reader.queue[0].request_id)
+        one.sent(reader)
+    assert answered == list(range(len(asked)))
+    refused = Counter(
+        one.ask(b"route", 100, "gateway", AssetRequest(1, 1 + n % 3, n, "nothing", 0, 10), 0)
+        for n in range(REQUEST_BURST)
+    )
+    assert refused[AssetRefusal.RATE] == len(asked), "another name is no other allowance"
