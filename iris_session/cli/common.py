@@ -176,6 +176,8 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         "--curve-clients", default="", metavar="DIR", help="public certificates to let in instead of the allow-list"
     )
     group.add_argument("--no-record", action="store_true", help="record nothing")
+    group.add_argument("--sites", action="store_true", help="clients are told of the model's sites too")
+    group.add_argument("--tendons", action="store_true", help="and of its spatial tendons")
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), default=None, help="who gets which robot")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
 

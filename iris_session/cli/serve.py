@@ -109,6 +109,8 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
         curve=arguments.curve,
         curve_key=arguments.curve_key,
         curve_clients=arguments.curve_clients,
+        sites=arguments.sites,
+        tendons=arguments.tendons,
         authority=authority,
     )
 

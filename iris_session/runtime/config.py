@@ -37,6 +37,7 @@ class SessionConfig:
     allow-list of the user's home of keys, or with the ZeroMQ certificate `curve_key` and the folder of certificates
     `curve_clients`.
     `assets`: meshes and textures for clients, kept in the user's cache of assets or in that folder; False: none.
+    `sites`, `tendons`: clients are told of those of a MuJoCo model too (tendons bring the sites they run through).
     `adapt_media`: clients on slow links get fewer media streams, so that their state stays fresh.
     `keyframe_s`: distance of the recording's keyframes [s]. `realtime`: `run()` asks for a real-time priority and goes
     on without when refused. `resume`: a recording (or its folder) of our loop to go on from; scene, robots, name,
@@ -59,6 +60,8 @@ class SessionConfig:
     curve_clients: str = ""
     keyframe_s: float = 5.0
     assets: bool | str | Path = True
+    sites: bool = False
+    tendons: bool = False
     adapt_media: bool = True
     realtime: bool = True
     resume: str | Path | None = None

@@ -97,7 +97,8 @@ class SessionProcesses:
         self._keeper: NoteKeeper | None = None
         self._core = core
         self._bending = None if composed is None else composed.bending
-        self.scenes = SharedScenes(config.assets, config.name, None if composed is None else composed.scene)
+        scene = None if composed is None else composed.scene
+        self.scenes = SharedScenes(config.assets, config.name, scene, sites=config.sites, tendons=config.tendons)
         self.state_period_ns = round(1e9 / config.state_hz)
         self.recorder: RecorderProcess | None = None
         self.feed: RecorderFeed | None = None

@@ -46,14 +46,24 @@ class SharedScenes:
     `where`: True for the store of this user, a folder for another one, False for none: clients then get bodies and
     poses, nothing to draw them with. `lock`: held while a scene or patch takes its place in the order of both, which is
     short; `newest`: the last one that did. `composed`: the scene of every world, which then is not read off its model.
+    `sites`, `tendons`: those of a model are in its specification too.
     """
 
-    def __init__(self, where: bool | str | Path, name: str, composed: ComposedScene | None = None) -> None:
+    def __init__(
+        self,
+        where: bool | str | Path,
+        name: str,
+        composed: ComposedScene | None = None,
+        *,
+        sites: bool = False,
+        tendons: bool = False,
+    ) -> None:
         self._said: list[str] = []  # of the store, whatever the scene
         self.lock = threading.RLock()
         self.newest: Shown | None = None
         self._name = name
         self._composed = composed
+        self._sites, self._tendons = sites, tendons
         self._holds: list[Hold] = []
         self._looks: deque[_Look] = deque()  # of patches, the oldest first
         self._closed = False
@@ -84,7 +94,12 @@ class SharedScenes:
             return Shown(plain)
         try:
             parsed = self._composed or parse_mujoco(
-                world.model, store, data=world.initial_data(initial_state), name=self._name
+                world.model,
+                store,
+                data=world.initial_data(initial_state),
+                name=self._name,
+                sites=self._sites,
+                tendons=self._tendons,
             )
             shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture

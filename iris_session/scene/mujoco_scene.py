@@ -244,11 +244,11 @@ def _unasked(model: mujoco.MjModel, *, sites: bool, tendons: bool) -> Iterator[s
     if not sites:
         marks = (_site(model, i) for i in range(model.nsite))
         if n := sum(mark.group in shown and mark.rgba[3] > 0 for mark in marks):
-            yield f"{n} sites: what people shall see is a geom"
+            yield f"{n} sites: serve --sites, or SessionConfig(sites=True), shares them"
     if not tendons:
         cables = (cable for cable in _tendons(model) if cable.group in shown)
         if n := sum(cable.width > 0 and cable.rgba[3] > 0 for cable in cables):
-            yield f"{n} tendons: a cable that people shall see is a flex of dim 1, or geoms"
+            yield f"{n} tendons: serve --tendons, or SessionConfig(tendons=True), shares them"
 
 
 def _own_forms(spec: SceneSpec) -> Iterator[str]:

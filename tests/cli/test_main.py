@@ -174,6 +174,14 @@ def test_assigned_robots_reach_the_configuration() -> None:
     assert (plain.authority.policy, plain.authority.assignments) == ("join-order", {})
 
 
+def test_sites_and_tendons_are_asked_for() -> None:
+    parser = build_parser()
+    config = session_config(parser.parse_args(["serve", "scene.xml", "--sites", "--tendons"]), "scene")
+    assert (config.sites, config.tendons) == (True, True)
+    plain = session_config(parser.parse_args(["demo", "handover"]), "scene")
+    assert (plain.sites, plain.tendons) == (False, False)
+
+
 def test_serve_json_is_one_object_and_the_file_is_verified_as_text_and_json(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from iris_session.physics import World
@@ -12,7 +14,9 @@ from iris_session.protocol.scene import SceneError
 from iris_session.protocol.scene_looks import Mesh, MeshLevel
 from iris_session.protocol.scene_patch import AddMesh, SetVisual
 from iris_session.runtime import shared_scene
+from iris_session.runtime.config import SessionConfig
 from iris_session.runtime.scene_change import prepare
+from iris_session.runtime.session import Session
 from iris_session.runtime.shared_scene import SharedScenes
 from iris_session.scene import AssetStore
 from tests.runtime.play import make_core
@@ -128,3 +132,25 @@ def test_what_bends_in_the_next_scene_is_prepared_with_it() -> None:
     scene = prepare(make_core(), SharedScenes(False, "test"), model, b"", None, None)
     assert [mesh.stream for mesh in scene.bending] == ["flex-0", "flex-1", "flex-2"]
     assert all(len(mesh.vertices()) == mesh.topology.n_vertices for mesh in scene.bending)
+
+
+def test_sites_and_tendons_are_shared_on_request_and_else_told_of(tmp_path: Path) -> None:
+    xml = """<mujoco><worldbody><body name="arm"><joint/><geom size=".1"/><site name="end" pos="0 0 .2"/></body>
+    <site name="hook" pos="0 0 1"/></worldbody>
+    <tendon><spatial name="rope" width=".01"><site site="end"/><site site="hook"/></spatial></tendon></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    plain = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False, assets=tmp_path)
+    with Session(model, config=plain) as session:
+        newest = session.processes.scenes.newest
+        assert newest is not None
+        assert newest.spec is not None
+        assert (newest.spec.sites, newest.spec.tendons) == ((), ())
+        assert any("2 sites: serve --sites" in note for note in session.notes)
+        assert any("1 tendons: serve --tendons" in note for note in session.notes)
+    with Session(model, config=replace(plain, sites=True, tendons=True)) as session:
+        newest = session.processes.scenes.newest
+        assert newest is not None
+        assert newest.spec is not None
+        assert {site.name for site in newest.spec.sites} == {"end", "hook"}
+        assert [tendon.name for tendon in newest.spec.tendons] == ["rope"]
+        assert not any("sites" in note or "tendons" in note for note in session.notes)
