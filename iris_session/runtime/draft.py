@@ -57,7 +57,7 @@ class SceneDraft:
         self._roots = {name: one.T_world_root for name, one in scene.articulations.items()}
         self._joints: dict[str, dict[str, float]] = {name: {} for name in scene.articulations}
         self._loose = {  # bodies on floating and planar joints: of which articulation
-            part.body: name for name, one in scene.articulations.items() for part in one.parts if part.loose
+            body: name for name, one in scene.articulations.items() for body in one.loose.values()
         }
         self._moved: dict[str, dict[str, Pose]] = {name: {} for name in scene.articulations}  # where those were put
         self._beyond: dict[tuple[str, str], str] = {}  # joints that are, and what is said of them

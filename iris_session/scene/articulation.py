@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from anchors.pose import compose, quat_from_rotvec
@@ -35,7 +35,6 @@ class Part(NamedTuple):
     `T_parent_joint`: of the joint in the parent's frame; at position 0 the body's frame is there. `axis`: unit vector
     in the joint's frame. `sliding`: along the axis, else around it; a `joint` of -1 is fixed. The position is that of
     `joint` (by its place in `Articulation.joints`) times `multiplier` plus `offset`: 1 and 0 unless it mimics another.
-    `loose`: its joint is floating or planar; it stands at position 0 until somebody says where it is.
     """
 
     body: str
@@ -46,7 +45,6 @@ class Part(NamedTuple):
     joint: int = -1
     multiplier: float = 1.0
     offset: float = 0.0
-    loose: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,8 @@ class Articulation:
     """`name`: as it was added; the root is moved under it. `T_world_root`: its first pose.
 
     `parts`: parents first. `joints`: those that can be set. `mimics`: joints that follow another, by name, and which:
-    they cannot be set.
+    they cannot be set. `loose`: floating and planar joints, and the body on each: it stands where the file has it until
+    somebody says where it is.
     """
 
     name: str
@@ -62,6 +61,7 @@ class Articulation:
     parts: tuple[Part, ...]
     joints: tuple[Joint, ...]
     mimics: Mapping[str, str]
+    loose: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -98,6 +98,11 @@ class Articulation:
         for name, value in q.items():
             if name in self.mimics:
                 raise SceneBuildError(f"joint {name!r} of {self.name!r} follows {self.mimics[name]!r}: set that one")
+            if name in self.loose:
+                body = self.loose[name]
+                raise SceneBuildError(
+                    f"joint {name!r} of {self.name!r} has no position: set_pose({body!r}, ...) moves it"
+                )
             if name not in known:
                 names = ", ".join(joint.name for joint in self.joints) or "none"
                 raise SceneBuildError(f"{self.name!r} has no joint {name!r} that can be set. Joints: {names}")

@@ -130,6 +130,7 @@ class _Reader:
         links = {link.name: link for link in self._robot.links}
         parts = [Part(f"{self._name}/{root}")]
         items: list[Item] = []
+        loose: dict[str, str] = {}
         waiting: list[tuple[str, int, Matrix]] = [(root, 0, np.eye(4))]
         while waiting:
             name, part, T_part_link = waiting.pop()
@@ -141,9 +142,9 @@ class _Reader:
                     continue
                 body = f"{self._name}/{joint.child}"
                 if joint.type in _LOOSE:
-                    self._skip(f"joint {joint.name} is {joint.type}: {body} stays where it is until set_pose moves it")
                     at = pose_of(T_part_child[:3, :3], T_part_child[:3, 3])
-                    parts.append(Part(body, part, at, loose=True))
+                    parts.append(Part(body, part, at))
+                    loose[joint.name] = body
                     waiting.append((joint.child, len(parts) - 1, np.eye(4)))
                     continue
                 drive = table.drives[joint.name]
@@ -163,7 +164,7 @@ class _Reader:
         if not items:
             other = "visuals: leave out collisions=True" if self._collisions else "collisions: give collisions=True"
             self._skip(f"nothing of it is drawn; what it may have are {other}")
-        articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics)
+        articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics, loose)
         return Robot(articulation, tuple(items), tuple(self._skipped))
 
     # --- what is drawn ------------------------------------------------------------------------------------------------

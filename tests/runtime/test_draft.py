@@ -93,8 +93,9 @@ def on_a_floating_base() -> SceneDraft:
     scene = composed()
     robot = scene.articulations["arm"]
     base, _, fore = robot.parts
-    parts = (base, Part("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT), loose=True), fore)
-    return SceneDraft(replace(scene, articulations={"arm": replace(robot, parts=parts)}))
+    parts = (base, Part("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT)), fore)
+    floating = replace(robot, parts=parts, loose={"fly": "arm/upper"})
+    return SceneDraft(replace(scene, articulations={"arm": floating}))
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -113,6 +114,11 @@ def test_what_is_on_a_floating_joint_stays_where_it_was_put(many: bool) -> None:
     assert pose(draft, "arm/base")[:3] == [7.0, 0.0, 0.0]
     assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
     assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
+
+
+def test_a_floating_joint_has_no_position() -> None:
+    with pytest.raises(PublishError, match=r"joint 'fly' of 'arm' has no position: set_pose\('arm/upper', ...\)"):
+        on_a_floating_base().set_joints("arm", {"fly": 1.0})
 
 
 def test_links_that_are_named_with_the_floating_one_are_where_they_are_said_to_be() -> None:
