@@ -98,12 +98,12 @@ class Deformables:
 
     def tend(self) -> list[str]:
         """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
-        if not self._client.mirror.synced:  # it may have heard of another scene, and not yet of which
+        now = self._client.scene_now  # the thread of `start` may be about to hear of another
+        if now is None:  # it has heard of one, and not yet of which
             return []
         if self._client.ready:
-            welcome = self._client.connection.welcome
-            session = "" if welcome is None else welcome.session_id
-            self._follow(self._client.mirror.scene_hash, (session, self._client.mirror.scene_epoch))
+            session, scene_hash, epoch = now
+            self._follow(scene_hash, (session, epoch))
         if self._fetch is not None and self._fetch.done:
             self._take(self._fetch)
         return [] if self._parked else [mesh.key for mesh in self._meshes if self._show(mesh)]

@@ -39,6 +39,16 @@ class SceneView:
         return self.connection.mirror
 
     @property
+    def scene_now(self) -> tuple[str, str, int] | None:
+        """Session id, scene hash and scene epoch, all of one moment; `None` while they are not known, as between
+        hearing of another scene and its snapshot."""
+        with self._lock:
+            welcome, mirror = self.connection.welcome, self.connection.mirror
+            if welcome is None or not mirror.synced:
+                return None
+            return welcome.session_id, mirror.scene_hash, mirror.scene_epoch
+
+    @property
     def state(self) -> SceneState | None:
         """The newest scene: header, poses (n, 7) in the world, age where it was handed over."""
         return self._state

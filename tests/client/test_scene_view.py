@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Callable
 
-from iris_session.client import Client, SceneState
+import pytest
+
+from iris_session.client import Client, SceneState, SessionMirror
+from iris_session.client.deformables import Deformables
+from iris_session.protocol.server_messages import Event, SceneChanged, Snapshot
 from tests.client.harness import BODIES, LiveSession, scene
 
 ORDERS = list(itertools.permutations(BODIES))[1:]
@@ -64,3 +69,47 @@ def test_after_a_reset_bodies_are_where_they_were_until_the_next_state(
         return state is not None and state.header.scene_epoch == client.mirror.scene_epoch == 2
 
     assert client.wait_for(both, 30.0)
+
+
+class Slow(SessionMirror):
+    """Another thread is let in whenever the hash is read, and has time."""
+
+    meanwhile: Callable[[], None] | None = None
+    _hash = ""
+
+    @property
+    def scene_hash(self) -> str:  # type: ignore[override]
+        seen, meanwhile, self.meanwhile = self._hash, self.meanwhile, None
+        if meanwhile is not None:
+            thread = threading.Thread(target=meanwhile, daemon=True)
+            thread.start()
+            thread.join(0.2)
+        return seen
+
+    @scene_hash.setter
+    def scene_hash(self, scene_hash: str) -> None:
+        self._hash = scene_hash
+
+
+def test_hash_and_epoch_of_a_scene_go_together_whatever_the_thread_of_start_hears(
+    session: LiveSession, join: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = join()
+    mirror, changed = Slow(), threading.Event()
+    mirror.apply_snapshot(Snapshot(0, 0, 1, 0, "first", 0, 0.0, 0, (), ()))
+    client.connection.mirror = mirror
+
+    def hear() -> None:
+        with client._lock:  # as `poll` does
+            mirror.apply_event(Event(1, 0, 0, SceneChanged(2, 0, "new_scene")))
+            mirror.apply_snapshot(Snapshot(0, 1, 2, 0, "second", 0, 0.0, 0, (), ()))
+        changed.set()
+
+    followed: list[tuple[str, int]] = []
+    shapes = Deformables(client)
+    monkeypatch.setattr(shapes, "_follow", lambda scene_hash, epoch: followed.append((scene_hash, epoch[1])))
+    mirror.meanwhile = hear
+    shapes.tend()
+    assert changed.wait(30.0)
+    shapes.tend()
+    assert followed == [("first", 1), ("second", 2)]
