@@ -104,7 +104,7 @@ class SharedScenes:
             shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
             return Shown(plain, notes=(f"{NOTHING_TO_SEE}: {error}",))
-        return shown._replace(notes=tuple(f"clients do not see {what}" for what in parsed.skipped))
+        return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
 
     def patch(self, ops: Sequence[PatchOp]) -> Shown:
         """The newest scene with `ops`. Raises `SceneError`, `OSError`. Hold `lock` until `take`."""
