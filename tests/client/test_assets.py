@@ -99,6 +99,7 @@ def test_everything_comes_and_a_second_time_nothing(store: Store, join: Callable
     assert {address: fetch.read(address) for address in store.addresses} == store.data
     assert fetch.decoded == sizes
     assert fetch.bytes_done == fetch.bytes_total == fetch.bytes_received == store.bytes
+    assert fetch.cached == 0
     assert seen == sorted(seen)
     assert seen[-1] == store.bytes
     assert client.assets_malformed == 0
@@ -175,6 +176,8 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
     with pytest.raises(InvalidMessageError, match="no address"):
         client.fetch_assets(["../../etc/passwd"])
     path.write_bytes(store.data[damaged])
+    folder = client.asset_cache.folder
+    assert client.wait_for(lambda _: not list(folder.glob("??/*.part")), DEADLINE_S), "of those nothing is kept open"
     client.close()
     with pytest.raises(NotConnectedError):
         client.fetch_assets([good])

@@ -105,13 +105,13 @@ def test_a_tall_texture_is_taken_as_small_as_a_wide_one(tmp_path: Path) -> None:
     builder = SceneBuilder()
     pixels = np.random.default_rng(1).integers(0, 255, (2 * scene.TEXTURE_SIDE, scene.TEXTURE_SIDE, 3), np.uint8)
     corners, uvs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [0, 1]]
-    for shown in (pixels, pixels.transpose(1, 0, 2)):
+    for shown in (pixels, pixels.transpose(1, 0, 2), np.concatenate([pixels, pixels], axis=1)):
         builder.add_mesh(vertices=corners, triangles=[[0, 1, 2]], uvs=uvs, texture=np.ascontiguousarray(shown))
     store = AssetStore(tmp_path)
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
     found = [reader.texture(visual.material) for visual in spec.visuals]
-    assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 2
+    assert [max(one.shape) for one in found if one is not None] == [scene.TEXTURE_SIDE] * 3
 
 
 @pytest.mark.parametrize("path", ["aloha/scene.xml", "kuka_iiwa_14/scene.xml"])

@@ -8,8 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh
+from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
+from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.simplify import simplified
 from tests.scene.models import many_objects
 from tests.scene.test_images import picture
 from tests.scene.test_meshes import ball
@@ -136,3 +138,33 @@ def test_nothing_that_is_remembered_of_a_model_is_taken_for_another(tmp_path: Pa
         assert parsed.spec == parse_mujoco(model, AssetStore(tmp_path / str(number))).spec
         hashes.add(parsed.scene_hash)
     assert len(hashes) == len(DIFFERENT)
+
+
+def test_a_cloth_with_other_texture_coordinates_is_another(tmp_path: Path) -> None:
+    addresses = set()
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    for uvs in ([[0, 0], [1, 0], [0, 1]], [[0, 0], [2, 0], [0, 2]]):
+        scene = SceneBuilder()
+        scene.add_deformable("cloth", corners, [[0, 1, 2]], uvs=uvs, texture=np.zeros((4, 4, 3), np.uint8))
+        addresses.add(scene.build(AssetStore(tmp_path)).spec.deformables[0].address)
+    assert len(addresses) == 2
+
+
+def test_what_is_seen_through_is_no_jpeg(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store, EncodeOptions(texture_encoding="jpeg"))
+    pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
+    (note,) = builder.run([builder.texture(pixels, "2d")])
+    assert note.levels[0].encoding == "png"
+    np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)
+
+
+def test_the_stated_error_of_a_level_is_that_of_both_steps(tmp_path: Path) -> None:
+    mesh = ball(4)
+    builder = Builder(AssetStore(tmp_path))
+    (note,) = builder.run([builder.mesh([mesh.position, mesh.index], lambda: mesh)])
+    coarse = simplified(mesh, mesh.triangles // 4)
+    assert coarse is not None
+    rounding = encode_mesh_quantised(coarse[0])[1]
+    assert rounding > 0
+    assert note.levels[1].max_error_m == pytest.approx(coarse[1] + rounding, rel=1e-12)

@@ -68,14 +68,14 @@ def test_meshes_by_their_vertices(tmp_path: Path) -> None:
 def test_of_a_model(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 2 0.5 0.25" elevation="0 0 0 0 1 0 0 0 0"/></asset>'
-        '<worldbody><geom type="plane" size="9 9 1"/><geom type="hfield" hfield="h" pos="0 0 1"/>'
+        '<worldbody><geom type="plane" size="9 9 1"/><geom type="hfield" hfield="h" pos="0 0 -3"/>'
         '<geom size="5" group="4"/><body pos="0 3 0"><joint/><geom size="0.5"/></body></worldbody></mujoco>'
     )
     store = AssetStore(tmp_path)
     found = extent_of(parse_mujoco(model, store).spec, store)
     assert found is not None
-    np.testing.assert_allclose(found.low, (-1, -2, -0.5))
-    np.testing.assert_allclose(found.high, (1, 3.5, 1.5))
+    np.testing.assert_allclose(found.low, (-1, -2, -3.25))
+    np.testing.assert_allclose(found.high, (1, 3.5, 0.5))
 
 
 def test_nothing_has_no_extent(tmp_path: Path) -> None:

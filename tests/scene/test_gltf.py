@@ -103,6 +103,9 @@ def test_hierarchy_and_looks(tmp_path: Path, store: AssetStore) -> None:
     parents = {body.name: spec.bodies[body.parent].name for body in spec.bodies[1:]}
     assert (parents["leg"], parents["top"], parents["table"], parents["ball"]) == ("table", "table", "hall", "hall")
     assert not any(body.moving for body in spec.bodies)
+    for body in spec.bodies[1:]:
+        above = matrix_of(spec.bodies[body.parent].T_world_body)
+        np.testing.assert_allclose(above @ matrix_of(body.T_parent_body), matrix_of(body.T_world_body), atol=1e-9)
     looks = {material.name: material for material in spec.materials}
     assert looks["plain"].metallic == 0.5
     assert looks["plain"].roughness == 0.25
@@ -225,6 +228,16 @@ def test_textures_as_the_material_has_them(tmp_path: Path, store: AssetStore) ->
         np.testing.assert_allclose(corner[x, y, z], [3 * v + 0.25, -2 * u + 0.5], atol=1e-6)
     again = built(_again(tmp_path / "a.glb", tmp_path / "b.glb", store), store)
     assert [t.channels for t in again.textures] == [t.channels for t in spec.textures], "alpha comes back"
+
+
+def test_one_picture_of_colours_and_of_normals_is_two_textures(tmp_path: Path, store: AssetStore) -> None:
+    document = Document()
+    use = {"index": document.image(PIXELS)}
+    document.json["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": use}, "normalTexture": use}]
+    document.square(0, TEXCOORD_0=document.accessor(SQUARE_UV))
+    spec = built(document.write(tmp_path / "a.glb"), store)
+    spaces = {use.role: spec.textures[use.texture].colorspace for use in spec.materials[0].textures}
+    assert spaces == {"rgb": "auto", "normal": "linear"}
 
 
 def test_both_sides_of_what_is_open(tmp_path: Path, store: AssetStore) -> None:

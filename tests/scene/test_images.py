@@ -72,6 +72,14 @@ def test_too_large_is_refused_by_what_the_file_says(encoding: str) -> None:
         decode_image(encode_image(picture(), encoding).data, encoding, max_bytes=1_000)
 
 
+@pytest.mark.parametrize("encoding", ["png", "jpeg"])
+def test_four_bytes_count_for_every_pixel(encoding: str) -> None:
+    data = encode_image(picture(6, 8), encoding).data
+    assert decode_image(data, encoding, 4 * 6 * 8).shape == (6, 8, 3)
+    with pytest.raises(AssetError, match="at most"):
+        decode_image(data, encoding, 4 * 6 * 8 - 1)
+
+
 def test_a_jpeg_cannot_hide_its_size_behind_fill_bytes() -> None:
     """Bytes of 255 before a marker are skipped by every decoder: who reads a length in them is led astray."""
     good = encode_image(picture(), "jpeg").data
