@@ -114,6 +114,17 @@ def test_normals_are_those_of_the_triangles_around(world: World) -> None:
     assert normals == pytest.approx(np.broadcast_to(expected, normals.shape), abs=0.02)
 
 
+def test_vertices_that_are_nowhere_are_numbers_in_the_file(world: World) -> None:
+    vertices = world.vertices(0)
+    vertices[[0, 7]] = (np.nan, np.inf, -np.inf)
+    world.state(0)
+    world.publish(8, 0, vertices)
+    world.state(8)
+    drawn = world.read()[CLOTH]
+    for name in ("positions", "normals"):
+        assert np.isfinite(np.array(told(drawn, f"Mesh3D:vertex_{name}")[8])).all()
+
+
 def test_normals_of_what_is_crumpled_are_means_by_area(world: World) -> None:
     rng = np.random.default_rng(2)
     vertices = world.vertices(0) + rng.uniform(-0.03, 0.03, (20, 3))

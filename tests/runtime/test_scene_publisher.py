@@ -146,6 +146,14 @@ def test_a_time_that_goes_back_is_a_new_scene_epoch(session: ScenePublisher) -> 
     assert kinds(session).count(SceneChanged) == before + 2, "a reset is one"
 
 
+def test_two_states_may_be_of_one_moment(session: ScenePublisher) -> None:
+    moment = session.clock()
+    for time_s in (6.0, 7.0):
+        session.publish(time_s, capture_ns=moment)
+    session.run(until=lambda: session.status().sim_time == 7.0, seconds=30.0)
+    assert session.status().sim_time == 7.0
+
+
 def test_what_is_captured_a_moment_ahead_of_the_clock_is_captured_now() -> None:
     assert _capture(7_000 + AHEAD_NS, 7_000) == 7_000
     with pytest.raises(PublishError, match="ahead of"):

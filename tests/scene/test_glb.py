@@ -139,7 +139,8 @@ def test_lights_that_are_out_leave_nothing_and_a_flat_view_is_as_high_as_it_is(
     )
     found = exported(parse_mujoco(model, store).spec, store, tmp_path)
     assert {"on", "off"} & {node["name"] for node in found["nodes"]} == {"on"}
-    assert len(found["extensions"]["KHR_lights_punctual"]["lights"]) == 1
+    (lamp,) = found["extensions"]["KHR_lights_punctual"]["lights"]
+    assert lamp["intensity"] == 1.0, "where the scene does not say"
     (camera,) = found["cameras"]
     assert (camera["orthographic"]["ymag"], camera["orthographic"]["xmag"]) == (4.5, 9.0), "half of 9 m, twice as wide"
 

@@ -115,6 +115,15 @@ def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
     assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
 
 
+def test_a_joint_without_end_has_no_limits_whatever_the_file_says(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous"><parent link="a"/>'
+        '<child link="b"/><axis xyz="0 0 1"/><limit lower="0" upper="0" effort="1" velocity="1"/></joint></robot>'
+    )
+    (joint,) = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"].joints
+    assert (joint.low, joint.high) == (-float("inf"), float("inf"))
+
+
 def test_meshes_in_millimetres_are_that_small(tmp_path: Path) -> None:
     trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.3mf")  # which counts in them
     (tmp_path / "a.urdf").write_text(
