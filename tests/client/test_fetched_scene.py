@@ -192,3 +192,11 @@ def test_a_scene_that_is_patched_without_end_comes_and_one_that_is_replaced_does
         assert scene.scene_hash == shown[1]
     else:
         assert scene.scene_hash == shown[-1] == looks[-1], "of another scene nothing is of use"
+
+
+def test_what_did_not_come_in_time_is_not_fetched_any_more(join: Callable[..., Client]) -> None:
+    client = join("1" * 64)
+    fetch = client.fetch_assets(["2" * 64])
+    with pytest.raises(NotConnectedError, match="has not come in time"):
+        fetched_scene._wait(client, fetch, time.monotonic() - 1.0)
+    assert fetch.failed["2" * 64].reason == "cancelled"
