@@ -88,9 +88,9 @@ def prose(page: Path) -> str:
 
 
 @contextlib.contextmanager
-def served(folder: Path, *options: str) -> Iterator[str]:
-    """Address of a session of the handover scene, a process of its own."""
-    command = [sys.executable, "-m", "iris_session.cli.main", "serve", "handover", "--no-record", *options]
+def served(folder: Path, *options: str, scene: str = "handover") -> Iterator[str]:
+    """Address of a session of a scene, a process of its own."""
+    command = [sys.executable, "-m", "iris_session.cli.main", "serve", scene, "--no-record", *options]
     process = subprocess.Popen(
         [*command, "--control-port", "0", "--state-port", "0"],
         cwd=folder,
@@ -113,6 +113,12 @@ def served(folder: Path, *options: str) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with served(tmp_path_factory.mktemp("serve")) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def serve_cloth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with served(tmp_path_factory.mktemp("serve"), scene="cloth") as address:
         yield address
 
 
@@ -140,10 +146,11 @@ def run_python(tmp_path: Path) -> Callable[..., str]:
 @pytest.mark.e2e
 @pytest.mark.parametrize("block", PYTHON, ids=lambda block: block.name)
 def test_python_block_runs(block: Block, run_python: Callable[..., str], request: pytest.FixtureRequest) -> None:
-    text = block.text
+    text, bends = block.text, "Deformables(client)" in block.text
     if ADDRESS in text:
-        text = text.replace(ADDRESS, request.getfixturevalue("serve"))
-    run_python(text)
+        text = text.replace(ADDRESS, request.getfixturevalue("serve_cloth" if bends else "serve"))
+    shown = run_python(text)
+    assert not bends or "cloth" in shown, "something that bends was seen"
 
 
 def _network_page(part: str) -> str:

@@ -35,6 +35,8 @@ STALE_PART_S: Final = 7 * 86_400.0
 TRIM_EVERY: Final = 64 << 20
 PART: Final = ".part"
 ADDRESS_DIGITS: Final = 64
+#: What to do when the folder cannot be used, for error texts.
+ANOTHER: Final = "name another folder: client.asset_cache = AssetCache(folder), or set XDG_CACHE_HOME"
 
 
 def default_folder() -> Path:
@@ -117,7 +119,8 @@ class AssetCache:
                 self._trimming, self._held = False, held + self._unlooked
         if self._held > most:
             text = f"the cache of assets {self.folder} is full: {self._held >> 20} MiB were used in the last minutes"
-            raise AssetError("", "cache", f"{text}; give another folder, or more than {self.max_bytes >> 20} MiB")
+            more = f"or allow more than {self.max_bytes >> 20} MiB: AssetCache(max_bytes=...)"
+            raise AssetError("", "cache", f"{text}; {ANOTHER}, {more}")
 
     def trim(self) -> int:
         """Takes away what is too much, the longest unused first. The bytes that stay."""
@@ -252,4 +255,4 @@ def _is_written(path: Path) -> bool:
 
 def _unusable(folder: Path, error: OSError | ValueError) -> AssetError:
     why = getattr(error, "strerror", None) or error
-    return AssetError("", "cache", f"the cache of assets {folder} cannot be used: {why}; give another folder")
+    return AssetError("", "cache", f"the cache of assets {folder} cannot be used: {why}; {ANOTHER}")
