@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from iris_session.cli.common import CommandError, add_json, open_scene, print_json
-from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, path_of, unit_advice
+from iris_session.cli.scene_files import (
+    add_file_options,
+    builder_of,
+    check_file_options,
+    file_of,
+    notes_on_model,
+    path_of,
+)
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
@@ -17,12 +24,12 @@ if TYPE_CHECKING:
 
 
 class _Found(NamedTuple):
-    """`path`: of a file that MuJoCo does not read."""
+    """A scene. `skipped`: what clients will not see. `notes`: what looks like a mistake."""
 
     spec: SceneSpec
     scene_hash: str
     skipped: tuple[str, ...]
-    path: Path | None = None
+    notes: tuple[str, ...]
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -76,16 +83,15 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
     parsed, store = _parse(arguments)
     extent = extent_of(parsed.spec, store)
-    advice = unit_advice(parsed.spec, extent, parsed.path)
     found = report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     if arguments.json:
-        print_json({**msgspec.to_builtins(found), "unit_hint": advice})
+        print_json({**msgspec.to_builtins(found), "notes": parsed.notes})
     else:
-        _print_report(parsed.spec, found, advice)
+        _print_report(parsed.spec, found, parsed.notes)
     return 0
 
 
-def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
+def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> None:
     from iris_session.scene.extent import coordinates, size_text
     from iris_session.scene.report import tree
 
@@ -100,8 +106,8 @@ def _print_report(spec: SceneSpec, found: SceneReport, advice: str) -> None:
         box = found.extent
         low, high = (", ".join(coordinates(box, corner)) for corner in (box.low, box.high))
         print(f"extent: {size_text(box)} along x, y, z, from ({low}) to ({high}), planes not counted")
-    if advice:
-        print(f"size: {advice}")
+    for text in notes:
+        print(f"note: {text}")
     print(
         f"{_size(totals.asset_bytes)} of assets: {_size(totals.mesh_bytes)} meshes and {_size(totals.texture_bytes)} "
         f"textures, the rest coarser levels; {_size(totals.texture_memory)} of textures on a graphics card"
@@ -143,9 +149,11 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None
     simplified = not_in_glb(parsed.spec)
     if arguments.json:
-        lists = {"skipped": parsed.skipped, "simplified": simplified}
+        lists = {"skipped": parsed.skipped, "simplified": simplified, "notes": parsed.notes}
         print_json({"file": str(out), "bytes": size, "scene_hash": parsed.scene_hash, **lists})
         return 0
+    for text in parsed.notes:
+        print(f"note: {text}", file=sys.stderr)
     for text in parsed.skipped:
         print(f"left out: {text}", file=sys.stderr)
     for text in simplified:
@@ -196,7 +204,7 @@ def _parse_model(scene: str, store: AssetStore) -> _Found:
     model = open_scene(scene).model
     beginning = World(model, (), ()).initial_data()  # as a session begins: in the keyframe `home`, if there is one
     parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
-    return _Found(parsed.spec, parsed.scene_hash, parsed.skipped)
+    return _Found(parsed.spec, parsed.scene_hash, parsed.skipped, notes_on_model(parsed.spec))
 
 
 def _compose(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _Found:
@@ -207,7 +215,7 @@ def _compose(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _F
         made = builder.build(store)
     except SceneBuildError as error:
         raise CommandError(str(error)) from None
-    return _Found(made.spec, made.scene_hash, made.skipped, path)
+    return _Found(made.spec, made.scene_hash, made.skipped, made.notes)
 
 
 def _size(n_bytes: int) -> str:

@@ -17,14 +17,12 @@ from iris_session.cli.common import CommandError
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
     from iris_session.scene.compose import SceneBuilder
-    from iris_session.scene.extent import Extent
 
 #: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 _ROBOT: Final = ".urdf"
-#: How what is drawn too large or too small is mended: of a file as a whole, or of the meshes in a model.
-_OF_FILE: Final = "--scale {factor}"
-_OF_MESHES: Final = 'scale="{factor} {factor} {factor}" at its <mesh>'
+#: How meshes in a model that are too large or too small are mended.
+_OF_MESHES: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
 #: From when on it is told that something takes its time: about a second.
 _LARGE_BYTES: Final = 5_000_000
 _MANY_TRIANGLES: Final = 100_000
@@ -138,16 +136,12 @@ def _tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def unit_advice(spec: SceneSpec, extent: Extent | None, path: Path | None) -> str:
-    """What is to be done where lengths seem to be no metres; empty where they do not. `path`: see `file_of`.
+def notes_on_model(spec: SceneSpec) -> tuple[str, ...]:
+    """What is to be done where lengths of a model of MuJoCo seem to be no metres; nothing where they do not.
 
-    Of robots and models the largest mesh is judged: their places are in metres, and halls may be large.
+    Its largest mesh is judged: its places are in metres, and halls may be large.
     """
     from iris_session.scene.extent import largest_mesh, unit_hint
 
-    if extent is None:
-        return ""
-    if path is None or path.suffix.lower() == _ROBOT:
-        hint = unit_hint(largest_mesh(spec), _OF_MESHES)
-        return f"its largest mesh is {hint}" if hint else ""
-    return unit_hint(max(extent.size), _OF_FILE)
+    hint = unit_hint(largest_mesh(spec), _OF_MESHES)
+    return (f"its largest mesh is {hint}",) if hint else ()

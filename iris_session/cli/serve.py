@@ -20,7 +20,7 @@ from iris_session.cli.common import (
     print_json,
     scene_names,
 )
-from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of, unit_advice
+from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _showing(session: Session | ScenePublisher, path: Path) -> str:
-    """What is shown, and what is likely wrong with its size."""
+    """What is shown, how large it is, and which of its meshes are better simplified."""
     from iris_session.scene import AssetStore, SceneBuildError
     from iris_session.scene.extent import extent_of, size_text
     from iris_session.scene.report import large_meshes
@@ -213,8 +213,7 @@ def _showing(session: Session | ScenePublisher, path: Path) -> str:
         extent = None
     if extent is not None:
         what += f"; its extent is {size_text(extent)}"
-    advice = unit_advice(spec, extent, path)
-    return "\n".join((what, *([f"size: {advice}"] if advice else []), *large_meshes(spec)))
+    return "\n".join((what, *large_meshes(spec)))
 
 
 def _serve(

@@ -16,8 +16,8 @@ from __future__ import annotations
 import operator
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Final, NoReturn
 
 from numpy.typing import ArrayLike
@@ -63,6 +63,7 @@ class ScenePublisher(Owner):
         self.origin_ns = time.monotonic_ns()
         self.clock = session_clock(self.origin_ns)
         self._builder = scene
+        self._shown: frozenset[str] = frozenset()  # names that the builder had as the session began
         self._stop = threading.Event()
         self._draft: SceneDraft | None = None
         self._loop: PublishLoop | None = None
@@ -89,6 +90,7 @@ class ScenePublisher(Owner):
         where = self.config.assets
         try:
             store = AssetStore(None if isinstance(where, bool) else where)
+            self._shown = self._builder.names
             composed = self._builder.build(store)
             carrier = Carrier(composed.moving, composed.poses)
         except (SceneBuildError, PhysicsError) as error:
@@ -103,6 +105,7 @@ class ScenePublisher(Owner):
         vertices = ShownVertices(composed)
         processes = SessionProcesses(self.config, core, self.origin_ns, composed=Composed(composed, vertices.bending))
         processes.start()
+        processes.notes += composed.notes
         self._processes = processes
         try:
             self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
@@ -148,19 +151,23 @@ class ScenePublisher(Owner):
 
         One whose length is off by up to 0.001 is normalised. Raises `PublishError`.
         """
-        self._started()[0].set_pose(name, position, quaternion)
+        with self._telling(name):
+            self._started()[0].set_pose(name, position, quaternion)
 
     def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
         """`set_pose` for many bodies at once: (n, 3) and (n, 4). All or none: raises `PublishError`."""
-        self._started()[0].set_poses(names, positions, quaternions)
+        with self._telling(*(names if isinstance(names, list | tuple) else ())):
+            self._started()[0].set_poses(names, positions, quaternions)
 
     def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
         """Positions [rad] or [m] of joints of an articulation, by name; others stay. Raises `PublishError`."""
-        self._started()[0].set_joints(name, positions)
+        with self._telling(name):
+            self._started()[0].set_joints(name, positions)
 
     def set_vertices(self, name: str, vertices: ArrayLike) -> None:
         """Vertices (n, 3) of a deformable [m], world frame, in the order it was added with. Raises `PublishError`."""
-        self._started()[0].set_vertices(name, vertices)
+        with self._telling(name):
+            self._started()[0].set_vertices(name, vertices)
 
     def publish(self, time_s: float | None = None, *, capture_ns: int | None = None) -> None:
         """Everything as it is set now is one state of the world.
@@ -242,6 +249,19 @@ class ScenePublisher(Owner):
         raise OwnershipError("load_scene: end this session and begin another with the other scene")
 
     # --- inside ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _telling(self, *names: object) -> Iterator[None]:
+        """What is refused because it was added after the session had begun, told as that."""
+        try:
+            yield
+        except PublishError as error:
+            late = [name for name in names if isinstance(name, str) and name in self._builder.names - self._shown]
+            if not late:
+                raise
+            raise PublishError(
+                f"{late[0]!r} was added after the session had begun, and is not shown: add everything before `with`"
+            ) from error
 
     def _queue(self, patch: NextPatch) -> None:
         self._started()[1].check()

@@ -99,6 +99,7 @@ def assemble(
         articulations=dict(world.articulations),
         deformables={source.name: source for source in sources},
         skipped=tuple(world.skipped),
+        notes=tuple(world.notes),
         built=builder.built,
         recalled=builder.recalled,
     )

@@ -68,11 +68,12 @@ class World:
     skybox: Picture | None = None
     names: set[str] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @contextmanager
     def whole(self) -> Iterator[None]:
         """What is added within is added whole, or, where something is raised, not at all."""
-        lists: tuple[list[Any], ...] = (self.things, self.items, self.lights, self.cameras, self.skipped)
+        lists: tuple[list[Any], ...] = (self.things, self.items, self.lights, self.cameras, self.skipped, self.notes)
         lengths, names = [len(one) for one in lists], self.names.copy()
         try:
             yield
@@ -86,6 +87,10 @@ class World:
         """What clients will not see, each line once."""
         self.skipped += dict.fromkeys(text for text in texts if text not in self.skipped)
 
+    def note(self, texts: tuple[str, ...]) -> None:
+        """What looks like a mistake, each line once."""
+        self.notes += dict.fromkeys(text for text in texts if text not in self.notes)
+
     def add_robot(self, robot: Robot) -> None:
         """An articulation with its bodies, at rest."""
         articulation = robot.articulation
@@ -96,6 +101,7 @@ class World:
         self.articulations[articulation.name] = articulation
         self.names.update((articulation.name, *articulation.bodies))
         self.skip(robot.skipped)
+        self.note(robot.notes)
 
     def add_nodes(self, loaded: Loaded, body: int, T_body_file: Matrix, look: Look | None, *, flat: bool) -> None:
         """A file on `body`. `flat`: everything on that one, else nodes with something on or below them become bodies.

@@ -36,6 +36,7 @@ from iris_session.scene.given import (
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
 from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
+from iris_session.scene.units import file_question, side_of
 from iris_session.scene.urdf import read_urdf
 from iris_session.streams.deformable_topology import MAX_VERTICES
 
@@ -78,6 +79,11 @@ class SceneBuilder:
     def triangles(self) -> int:
         """Of all meshes that were added: preparing them takes some seconds for each million, once."""
         return sum(item.mesh.triangles for item in self._world.items if item.mesh is not None)
+
+    @property
+    def names(self) -> frozenset[str]:
+        """What moves or bends so far, links of articulations too."""
+        return frozenset(self._world.names)
 
     # --- shapes -------------------------------------------------------------------------------------------------------
 
@@ -173,6 +179,8 @@ class SceneBuilder:
         with self._world.whole(), np.errstate(all="ignore"):  # places that are not finite are refused
             body, T_body_thing = self._place(name, options, named=True)
             self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
+            placed = [(one.mesh, T_thing_file @ node.matrix) for node in loaded.nodes for one in node.surfaces]
+            self._world.note(file_question(where.name, side_of(placed), factors))
         return name
 
     @takes()

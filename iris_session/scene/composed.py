@@ -39,7 +39,8 @@ class ComposedScene:
     `moving`: names of the bodies that are streamed, each once; body `i + 1` is `moving[i]`. `poses`: their first poses,
     T_world_body, in the same order. `articulations`, `deformables`: by the name they were added under. Bodies of an
     articulation are in `moving` too; its root is moved by `Articulation.name`. `skipped`: what clients will not see, a
-    line each. `built`, `recalled`: pieces of work that were done, and that the store remembered.
+    line each. `notes`: what looks like a mistake of units, a line each, with what would be right. `built`, `recalled`:
+    pieces of work that were done, and that the store remembered.
     """
 
     spec: SceneSpec
@@ -49,6 +50,7 @@ class ComposedScene:
     articulations: Mapping[str, Articulation]
     deformables: Mapping[str, DeformableSource]
     skipped: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     built: int = 0
     recalled: int = 0
 

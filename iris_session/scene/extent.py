@@ -92,16 +92,23 @@ def largest_mesh(spec: SceneSpec) -> float:
     return max((b - a for box in boxes for a, b in zip(box.low, box.high, strict=True)), default=0.0)
 
 
-def unit_hint(side_m: float, remedy: str) -> str:
-    """What is likely wrong with something whose longest side this is; empty where nothing is. `remedy`: what to do,
-    with `{factor}` where the factor stands."""
+def unit_mistake(side_m: float) -> tuple[float, str] | None:
+    """What is likely wrong with something whose longest side this is: the factor that mends it, and in words; `None`
+    where nothing is."""
     if side_m > LARGEST_M:
-        factor, what = "0.001", "in millimetres where metres are meant?"
-    elif 0.0 < side_m < SMALLEST_M:
-        factor, what = "1000", "divided by 1,000 once too often?"
-    else:
+        return 1e-3, "in millimetres where metres are meant?"
+    if 0.0 < side_m < SMALLEST_M:
+        return 1e3, "divided by 1,000 once too often?"
+    return None
+
+
+def unit_hint(side_m: float, remedy: str) -> str:
+    """The same as a line, empty where nothing is wrong. `remedy`: what to do, with `{factor}` where that stands."""
+    mistake = unit_mistake(side_m)
+    if mistake is None:
         return ""
-    return f"{length(side_m)} large: {what} {remedy.format(factor=factor)} makes it {length(side_m * float(factor))}"
+    factor, what = mistake
+    return f"{length(side_m)} large: {what} {remedy.format(factor=f'{factor:g}')} makes it {length(side_m * factor)}"
 
 
 def size_text(extent: Extent) -> str:

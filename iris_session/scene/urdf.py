@@ -24,6 +24,7 @@ from iris_session.scene.files import ENDINGS, ROBOTS, ending, guarded, load_file
 from iris_session.scene.parts import Item, Loaded, Look, Matrix, Picture, cut, pose_of
 from iris_session.scene.pictures import PixelBudget, read_pixels
 from iris_session.scene.references import References, read_bounded
+from iris_session.scene.units import Drawn, colour_question, degrees_question, reach_of, robot_question, side_of
 from iris_session.scene.urdf_joints import read_joints, root_link
 from iris_session.scene.urdf_xml import parsed
 
@@ -33,11 +34,13 @@ _LOOSE: Final = frozenset({"floating", "planar"})
 
 @dataclass(frozen=True)
 class Robot:
-    """A URDF: `items` are on `articulation.parts`, by their places. `skipped`: a line for each thing left out."""
+    """A URDF: `items` are on `articulation.parts`, by their places. `skipped`: a line for each thing left out;
+    `notes`: for each that looks like a mistake."""
 
     articulation: Articulation
     items: tuple[Item, ...]
     skipped: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def read_urdf(
@@ -64,7 +67,7 @@ def read_urdf(
 
     def read() -> Robot:  # yourdfpy raises whatever the missing attribute leads to
         robot, skipped = parsed(path, data)
-        return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root)
+        return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root, scale)
 
     found: Robot = guarded(path, "urdf", read)
     return found if scale == 1.0 else _scaled(found, scale)
@@ -112,6 +115,9 @@ class _Reader:
         self._skipped = skipped
         self._collisions = collisions
         self._files: dict[Path, Loaded] = {}
+        self._notes: dict[str, None] = {}
+        self._sizes: list[Drawn] = []
+        self._measured: set[tuple[Path, tuple[float, float, float]]] = set()
         self._looks: dict[str, Look | None] = {}
         self._pictures: dict[Path, Picture] = {}
         self._budget = PixelBudget(path.name)
@@ -121,7 +127,8 @@ class _Reader:
             if material is not None and material.name and (material.color is not None or material.texture is not None):
                 self._materials.setdefault(material.name, material)
 
-    def robot(self, T_world_root: Pose) -> Robot:
+    def robot(self, T_world_root: Pose, scale: float) -> Robot:
+        """`scale`: by which it will be drawn."""
         root = root_link(self._path.name, self._robot)
         table = read_joints(self._path.name, self._robot)
         below: dict[str, list[Any]] = {}
@@ -165,7 +172,9 @@ class _Reader:
             other = "visuals: leave out collisions=True" if self._collisions else "collisions: give collisions=True"
             self._skip(f"nothing of it is drawn; what it may have are {other}")
         articulation = Articulation(self._name, T_world_root, tuple(parts), table.joints, table.mimics, loose)
-        return Robot(articulation, tuple(items), tuple(self._skipped))
+        units = robot_question(self._path.name, reach_of(self._robot.joints, root), self._sizes, scale)
+        notes = (*units, *degrees_question(self._path.name, table.joints), *self._notes)
+        return Robot(articulation, tuple(items), tuple(self._skipped), notes)
 
     # --- what is drawn ------------------------------------------------------------------------------------------------
 
@@ -180,6 +189,7 @@ class _Reader:
                 found += self._mesh(geometry.mesh, part, name, matrix, look)
                 continue
             kind, size = _shape(self._path.name, geometry)
+            self._sizes.append(Drawn(f"shape, a {kind} of {cut(link.name)},", 2.0 * max(size)))
             found.append(Item(part, name, matrix, look or Look(), kind=kind, size=size))
         return found
 
@@ -194,13 +204,21 @@ class _Reader:
             if any(node.lights or node.cameras for node in self._files[path].nodes):
                 self._skip(f"lights and cameras in {path.name}")
         loaded = self._files[path]
-        scale = np.eye(4)
-        scale[:3, :3] *= loaded.unit * np.broadcast_to(1.0 if mesh.scale is None else mesh.scale, 3)
+        x, y, z = (float(v) for v in np.broadcast_to(1.0 if mesh.scale is None else mesh.scale, 3))
+        scale = np.diag([loaded.unit * x, loaded.unit * y, loaded.unit * z, 1.0])
+        self._measure(path, loaded, (x, y, z), scale)
         return [
             Item(part, name, matrix @ scale @ node.matrix, surface.look or look or Look(), surface.mesh)
             for node in loaded.nodes
             for surface in node.surfaces
         ]
+
+    def _measure(self, path: Path, loaded: Loaded, given: tuple[float, float, float], scale: Matrix) -> None:
+        """How large a mesh is, by the scale at its `<mesh>`; once for each that it is drawn with."""
+        if (path, given) not in self._measured:
+            self._measured.add((path, given))
+            placed = [(surface.mesh, scale @ node.matrix) for node in loaded.nodes for surface in node.surfaces]
+            self._sizes.append(Drawn(f"mesh, {path.name},", side_of(placed), given))
 
     def _look(self, material: Any) -> Look | None:
         """Of a material of the URDF; one without colour refers to another of its name."""
@@ -222,6 +240,7 @@ class _Reader:
         values = (1.0,) * 4 if material.color is None else tuple(float(v) for v in material.color.rgba)
         if len(values) != 4 or not all(map(math.isfinite, values)):
             raise SceneBuildError(f"{self._path.name}: material {material.name!r} needs rgba of four finite numbers")
+        self._notes |= dict.fromkeys(colour_question(self._path.name, cut(material.name or ""), values))
         red, green, blue, alpha = (min(max(v, 0.0), 1.0) for v in values)
         return red, green, blue, alpha
 

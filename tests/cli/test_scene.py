@@ -88,13 +88,14 @@ def test_inspect_says_how_large_it_is(tmp_path: Path, capsys: pytest.CaptureFixt
     assert run("scene", "inspect", box, *assets) == 0
     shown = capsys.readouterr().out
     assert "extent: 30 x 20 x 10 m along x, y, z, from (-15, -10, 0) to (15, 10, 10), planes not counted" in shown
-    assert "size: 30 m large: in millimetres where metres are meant? --scale 0.001 makes it 30 mm" in shown
+    assert "note: box.stl is 30 m large: in millimetres where metres are meant? scale=0.001 (--scale 0.001)" in shown
     assert run("scene", "inspect", box, *assets, "--scale", "0.001", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["extent"]["size"] == pytest.approx([0.03, 0.02, 0.01])
-    assert found["unit_hint"] == ""
+    assert found["notes"] == []
     assert run("scene", "inspect", box, *assets, "--scale", "0.00001", "--json") == 0
-    assert "--scale 1000 makes it 0.3 m" in json.loads(capsys.readouterr().out)["unit_hint"]
+    (note,) = json.loads(capsys.readouterr().out)["notes"]
+    assert "(--scale 0.01) in place of the present one makes it 0.3 m" in note
 
 
 def test_meshes_in_millimetres_are_noticed_in_robots_and_models(
@@ -107,7 +108,7 @@ def test_meshes_in_millimetres_are_noticed_in_robots_and_models(
     (tmp_path / "model.xml").write_text(f"<mujoco>{geom}</mujoco>")
     ground = '<geom type="box" size="30 30 .1"/>'
     (tmp_path / "hall.xml").write_text(f"<mujoco><worldbody>{ground}</worldbody></mujoco>")
-    wanted = 'size: its largest mesh is 300 m large: in millimetres where metres are meant? scale="0.001 0.001 0.001"'
+    wanted = '300 m large: in millimetres where metres are meant? scale="0.001 0.001 0.001" at its <mesh>'
     for name in ("arm.urdf", "model.xml", "hall.xml"):
         assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") == 0
         assert (wanted in capsys.readouterr().out) == (name != "hall.xml")

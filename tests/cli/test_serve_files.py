@@ -82,7 +82,7 @@ def test_a_file_is_shown_until_the_end(name: str, tmp_path: Path, capfd: pytest.
     assert f"session '{path.stem}' on 127.0.0.1:" in errors
     extent = "0.2 x 0.2 x 0.2 m" if name.endswith("urdf") else "1 x 1 x 0 m"
     assert f"showing {name}, which nobody drives; its extent is {extent}" in errors
-    assert "size:" not in errors
+    assert "metres are meant" not in errors
 
 
 def test_a_file_in_millimetres_is_noticed_and_scaled(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -90,13 +90,13 @@ def test_a_file_in_millimetres_is_noticed_and_scaled(tmp_path: Path, capfd: pyte
     path.write_text(TRIANGLE.replace("1 0 0", "120 0 0").replace("0 1 0", "0 40 0"))
     assert main(["serve", str(path), "--seconds", "0.1", *QUIET]) == 0
     assert (
-        "size: 120 m large: in millimetres where metres are meant? --scale 0.001 makes it 0.12 m"
+        "part.off is 120 m large: in millimetres where metres are meant? scale=0.001 (--scale 0.001) makes it 0.12 m"
         in capfd.readouterr().out
     )
     assert main(["serve", str(path), "--scale", "0.001", "--seconds", "0.1", *QUIET]) == 0
     out = capfd.readouterr().out
     assert "its extent is 0.12 x 0.04 x 0 m" in out
-    assert "size:" not in out
+    assert "metres are meant" not in out
 
 
 @pytest.mark.parametrize("given", ["0", "-1", "nan", "inf", "small"])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from iris_session import (
     Client,
@@ -256,6 +257,27 @@ def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
             ScenePublisher(builder, config)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="cannot be built"):
         ScenePublisher(broken, CONFIG).start()
+
+
+def test_what_looks_like_a_mistake_or_comes_late_is_told(tmp_path: Path) -> None:
+    """A part in millimetres; a box that is added when the scene is shared already."""
+    builder = scene()
+    trimesh.creation.icosphere(radius=50).export(tmp_path / "ball_mm.stl")
+    builder.add_file(tmp_path / "ball_mm.stl", movable=True)
+    with ScenePublisher(builder, replace(CONFIG, assets=tmp_path)) as session:
+        assert [note for note in session.notes if "ball_mm.stl is 100 m large: in millimetres" in note]
+        session.set_pose("ball_mm", (0, 0, 0))
+        builder.add_box("late", half_size=(1, 1, 1), movable=True)
+        for say in (
+            lambda: session.set_pose("late", (0, 0, 0)),
+            lambda: session.set_poses(["box", "late"], np.zeros((2, 3)), [(1, 0, 0, 0)] * 2),
+            lambda: session.set_joints("late", {}),
+            lambda: session.set_vertices("late", [(0, 0, 0)]),
+        ):
+            with pytest.raises(PublishError, match="'late' was added after the session had begun"):
+                say()
+        with pytest.raises(PublishError, match="nearest: 'box'"):
+            session.set_pose("boxx", (0, 0, 0))
 
 
 def test_a_store_without_locks_is_no_reason_not_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
