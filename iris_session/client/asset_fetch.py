@@ -15,6 +15,7 @@ class AssetFetch:
 
     `decoded`: what `decode` made of each. `bytes_total`: of all assets, as far as their sizes are known; `bytes_done`:
     of those, that are here; `bytes_received`: of those, that came over the network. `cached`: assets that were here.
+    `put_off`: why the session does not answer requests yet, in its words; empty while it does.
     """
 
     def __init__(
@@ -31,6 +32,7 @@ class AssetFetch:
         self.pending = dict.fromkeys(self.addresses)
         self.failed: dict[str, AssetError] = {}
         self.decoded: dict[str, Any] = {}
+        self.put_off = ""
         self.bytes_received = 0
         self.cached = 0
         self._cache = cache

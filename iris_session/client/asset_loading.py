@@ -87,6 +87,8 @@ class AssetLoader:
     """`now_ns` are of one monotonic clock."""
 
     def __init__(self) -> None:
+        #: Why the session puts requests off, in its words; empty while bytes come.
+        self.put_off = ""
         self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
         self._busy: dict[str, int] = {}  # in the hands of the workers
         self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
@@ -175,7 +177,7 @@ class AssetLoader:
         if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
             return False
         self._overtake(ask.request_id)
-        self._progress_ns, self._pause_ns = now_ns, 0
+        self._progress_ns, self._pause_ns, self.put_off = now_ns, 0, ""
         self._suit(ask, size, now_ns - asked_ns)
         item = self._items.get(ask.address)
         if item is None or chunk.offset != item.got:
@@ -234,6 +236,7 @@ class AssetLoader:
         if item is None:
             return ""
         if refused.reason in AssetRefusal.PASSING:
+            self.put_off = f"{refused.reason}: {refused.advice}"
             self._pause(now_ns, self._pause_ns)
             item.asked = max(item.got, min(item.asked, ask.offset))
             return ""

@@ -160,6 +160,8 @@ class Assets:
         loader = self._loader
         if len(frames) != _CHUNK_FRAMES:
             outcome = loader.refused(decode_asset_refused(frames[0]), now_ns)
+            for fetch in self._fetches:
+                fetch.put_off = loader.put_off
             if isinstance(outcome, Failed):
                 self._fail(outcome.address, AssetError(*outcome))
             elif outcome:
@@ -176,6 +178,7 @@ class Assets:
             return
         workers.write(chunk.address, data)
         for fetch in self._fetches:
+            fetch.put_off = ""
             fetch.has(chunk.address, chunk.offset + len(data), chunk.total, len(data))
         self._tell(chunk.address)
         if loader.whole(chunk.address):

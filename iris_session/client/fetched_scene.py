@@ -162,5 +162,8 @@ def _wait(client: Client, fetch: AssetFetch, until: float) -> AssetFetch:
     if not client.wait_for(lambda _: fetch.done, max(0.0, until - time.monotonic())):
         client.cancel_assets(fetch)
         megabytes = (fetch.bytes_done * 1e-6, fetch.bytes_total * 1e-6)
-        raise NotConnectedError(f"the scene has not come in time: {megabytes[0]:.1f} of {megabytes[1]:.1f} MB are here")
+        said = f"; the session says {fetch.put_off}" if fetch.put_off else ""
+        raise NotConnectedError(
+            f"the scene has not come in time: {megabytes[0]:.1f} of {megabytes[1]:.1f} MB are here{said}"
+        )
     return fetch

@@ -169,10 +169,12 @@ def test_refusals_that_pass_are_waited_out_longer_and_longer() -> None:
     for pause_ns in (FIRST_PAUSE_NS, 2 * FIRST_PAUSE_NS, 4 * FIRST_PAUSE_NS):
         (ask,) = loader.requests(now_ns)
         assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
+        assert loader.put_off == "busy: advice"
         assert list(loader.requests(now_ns + pause_ns - 1)) == []
         now_ns += pause_ns
     (ask,) = loader.requests(now_ns)
     assert answer(loader, ask, CHUNK_BYTES + 5) is True
+    assert loader.put_off == "", "it comes"
     (ask,) = loader.requests(now_ns)
     assert refuse(loader, ask, AssetRefusal.BUSY, now_ns) == ""
     (ask,) = loader.requests(now_ns + FIRST_PAUSE_NS)  # the short pause again, after something came

@@ -14,12 +14,15 @@ import pytest
 from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError, fetched_scene
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
+from iris_session.protocol.assets import AssetRefused, AssetRequest
+from iris_session.protocol.codec import encode_asset_header
 from iris_session.protocol.names import AssetRefusal
 from iris_session.protocol.scene import MAX_SCENE_BYTES, encode_scene
 from iris_session.scene import AssetStore
 from iris_session.scene.budget import Budget
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.client.harness import LiveSession
+from tests.client.test_assets import Liar
 
 pytestmark = pytest.mark.e2e
 
@@ -200,3 +203,20 @@ def test_what_did_not_come_in_time_is_not_fetched_any_more(join: Callable[..., C
     with pytest.raises(NotConnectedError, match="has not come in time"):
         fetched_scene._wait(client, fetch, time.monotonic() - 1.0)
     assert fetch.failed["2" * 64].reason == "cancelled"
+
+
+def test_who_is_put_off_all_the_time_is_told_why(join: Callable[..., Client]) -> None:
+    def put_off(request: AssetRequest) -> list[list[bytes]]:
+        refused = AssetRefused(1, request.request_id, request.address, AssetRefusal.NOT_ALLOWED, "join first")
+        return [[encode_asset_header(refused)]]
+
+    client, session = join("1" * 64), Liar(put_off)
+    try:
+        welcome = client.connection.welcome
+        assert welcome is not None
+        endpoints = msgspec.structs.replace(welcome.endpoints, assets=session.port)
+        client.connection.welcome = msgspec.structs.replace(welcome, endpoints=endpoints)
+        with pytest.raises(NotConnectedError, match="MB are here; the session says not_allowed: join first"):
+            fetch_scene(client, timeout_s=2.0)
+    finally:
+        session.close()
