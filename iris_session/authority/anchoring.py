@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from iris_session.authority import alignment, corrections, telling
-from iris_session.authority.context import Context, some
+from iris_session.authority.context import Context, no_such, some
 from iris_session.authority.state import HOST_ID, Alarmed, Compared, Participant
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import Denial, Pose
@@ -65,9 +65,7 @@ def _start(ctx: Context, p: Participant) -> None:
 def move_anchor(ctx: Context, p: Participant, m: MoveAnchor) -> None:
     """A director says where an anchor is: what was measured to its old place counts no more."""
     if m.anchor_id not in ctx.state.anchors:
-        known = f"anchors: {some(ctx.state.anchors) or 'none'}"
-        denial = Denial(DenialReason.UNKNOWN_TARGET, f"no anchor {m.anchor_id}", known, m.anchor_id)
-        return ctx.deny(p, m.request_id, denial)
+        return ctx.deny(p, m.request_id, no_such("anchor", m.anchor_id, ctx.state.anchors))
     if not alignment.is_pose(ctx, m.T_world_anchor):
         text = f"the pose is not finite with a unit quaternion, or further than {ctx.config.reach_m:g} m away"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "", m.anchor_id))

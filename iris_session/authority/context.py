@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from iris_session.authority.config import AuthorityConfig
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Grant, LeaseState, Participant, State
 from iris_session.protocol.common import Denial, Lease
-from iris_session.protocol.names import LeaseMode, Role, TargetKind
+from iris_session.protocol.names import DenialReason, LeaseMode, Role, TargetKind
 from iris_session.protocol.server_messages import (
     Event,
     EventKind,
@@ -167,6 +167,16 @@ class Context:
         """Every target that `p` holds, robots first, in the order of the specification."""
         held = [*self.state.robots.values(), *self.held_objects]
         return [lease for lease in held if any(g.participant == p.id for g in lease.grants)]
+
+
+def no_such(kind: str, name: str, known: Iterable[str]) -> Denial:
+    """For a robot, an object or an anchor that the scene does not have; `known` are those that it has."""
+    return Denial(DenialReason.UNKNOWN_TARGET, f"no {kind} {name!r}", listed(f"{kind}s", known), name)
+
+
+def listed(kinds: str, names: Iterable[str]) -> str:
+    """`robots: left, right`, or `robots: none`."""
+    return f"{kinds}: {some(names) or 'none'}"
 
 
 def some(names: Iterable[str], most: int = 6) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iris_session.authority import engagement
-from iris_session.authority.context import Context, find_grant, some
+from iris_session.authority.context import Context, find_grant, no_such
 from iris_session.authority.state import KEPT, Grant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Release
 from iris_session.protocol.common import Denial
@@ -103,8 +103,8 @@ def release(ctx: Context, p: Participant, m: Release) -> None:
             known = f"kinds: {TargetKind.ROBOT}, {TargetKind.OBJECT}"
             return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown kind {t.kind}", known))
         if lease is None:
-            known = some((*ctx.robots, *ctx.objects))
-            return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_TARGET, f"{t.name}: no such target", known))
+            there = ctx.robots if t.kind == TargetKind.ROBOT else ctx.objects
+            return ctx.deny(p, m.request_id, no_such(t.kind, t.name, there))
         if not grants:
             text, holder = f"you do not hold {t.name}", ctx.holder(lease)
             return ctx.deny(p, m.request_id, Denial(DenialReason.NOT_HOLDER, text, "", t.name, holder))

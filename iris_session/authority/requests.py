@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.authority import assignment, engagement, leases
-from iris_session.authority.context import HUMAN, Context, find_grant, some
+from iris_session.authority.context import HUMAN, Context, find_grant, no_such, some
 from iris_session.authority.leases import held_by_other
 from iris_session.authority.state import KEPT, NO_CONNECTION, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode
@@ -53,10 +53,10 @@ def _acquire_denial(
         return denial
     for name in robots:
         if name not in ctx.robots:
-            return Denial(DenialReason.UNKNOWN_TARGET, f"no robot {name}", f"robots: {some(ctx.robots)}", name)
+            return no_such("robot", name, ctx.robots)
     for name in objects:
         if name not in ctx.objects:
-            return Denial(DenialReason.UNKNOWN_TARGET, f"no object {name}", f"objects: {some(ctx.objects)}", name)
+            return no_such("object", name, ctx.objects)
     if not MIN_WEIGHT <= m.weight <= 1.0 / MIN_WEIGHT:
         text = f"weight {m.weight} is not between {MIN_WEIGHT} and {1.0 / MIN_WEIGHT:g}"
         return Denial(DenialReason.INVALID, text, "use 1.0")
@@ -279,8 +279,7 @@ def grasp(ctx: Context, p: Participant, m: Grasp) -> None:
     denial = _role_denial(p)
     lease = ctx.state.objects.get(m.object)
     if denial is None and lease is None:
-        text, known = f"no object {m.object}", f"objects: {some(ctx.objects)}"
-        denial = Denial(DenialReason.UNKNOWN_TARGET, text, known, m.object)
+        denial = no_such("object", m.object, ctx.objects)
     if denial is None and m.device not in Device.ALL:
         known = f"devices: {', '.join(sorted(Device.ALL))}"
         denial = Denial(DenialReason.UNKNOWN_VALUE, f"unknown device {m.device}", known)
@@ -304,8 +303,7 @@ def assign(ctx: Context, p: Participant, m: Assign) -> None:
     denial = _role_denial(person) if person is not None else None
     unknown = next((name for name in m.robots if name not in ctx.robots), None)
     if unknown is not None:
-        known = f"robots: {some(ctx.robots)}"
-        denial = Denial(DenialReason.UNKNOWN_TARGET, f"no robot {unknown}", known, unknown)
+        denial = no_such("robot", unknown, ctx.robots)
     if denial is not None:
         return ctx.deny(p, m.request_id, denial)
     chosen = [ctx.state.robots[name] for name in dict.fromkeys(m.robots)]
@@ -325,9 +323,7 @@ def set_mode(ctx: Context, p: Participant, m: SetMode) -> None:
     """A director changes the mode of a robot. Of several holders only the one in charge stays, unless it is shared."""
     lease = ctx.state.robots.get(m.robot)
     if lease is None:
-        known = f"robots: {some(ctx.robots)}"
-        denial = Denial(DenialReason.UNKNOWN_TARGET, f"no robot {m.robot}", known, m.robot)
-        return ctx.deny(p, m.request_id, denial)
+        return ctx.deny(p, m.request_id, no_such("robot", m.robot, ctx.robots))
     if m.mode not in LeaseMode.ALL:
         known = f"modes: {', '.join(sorted(LeaseMode.ALL))}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown mode {m.mode}", known))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from iris_session.authority.context import Context, some
+from iris_session.authority.context import Context, no_such
 from iris_session.authority.state import Grant, LeaseState, Participant
 from iris_session.protocol.client_messages import SetScale
 from iris_session.protocol.common import Denial
@@ -47,7 +47,7 @@ def _denial(ctx: Context, p: Participant, names: Sequence[str]) -> Denial | None
     for name in names:
         lease = ctx.state.robots.get(name)
         if lease is None:
-            return Denial(DenialReason.UNKNOWN_TARGET, f"no robot {name}", f"robots: {some(ctx.robots)}", name)
+            return no_such("robot", name, ctx.robots)
         if not _meant(ctx, p, lease):
             holder = ctx.holder(lease)
             held_by = ctx.state.participants[holder].name if holder else "nobody"

@@ -7,7 +7,7 @@ waited for ends with its scene.
 from __future__ import annotations
 
 from iris_session.authority import leases, stops
-from iris_session.authority.context import Context, some
+from iris_session.authority.context import Context, listed, some
 from iris_session.authority.state import HOST_ID, KEPT, LeaseState, Pending
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import SceneLoaded, ScenePatched
@@ -80,4 +80,4 @@ def _end_request(ctx: Context, pending: Pending) -> None:
     p = ctx.state.participants[pending.participant]
     if pending.request_id != KEPT and p.id != HOST_ID:
         text = f"another scene was loaded, which has no {some(gone)}"
-        ctx.deny(p, pending.request_id, Denial(DenialReason.UNKNOWN_TARGET, text, f"robots: {some(ctx.robots)}"))
+        ctx.deny(p, pending.request_id, Denial(DenialReason.UNKNOWN_TARGET, text, listed("robots", ctx.robots)))

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.authority import AuthorityConfig
+from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.state import Pending
-from iris_session.protocol.client_messages import Acquire, Assign, Consent, Control, Grasp, Heartbeat, Release, SetMode
-from iris_session.protocol.common import Target
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Assign,
+    Consent,
+    Control,
+    Grasp,
+    Heartbeat,
+    Release,
+    SetMode,
+    SetScale,
+)
+from iris_session.protocol.common import Message, Target
 from iris_session.protocol.entries import Lost
 from iris_session.protocol.server_messages import (
     ConsentRequested,
@@ -136,6 +146,29 @@ def test_lost_waiters_leave_the_queue() -> None:
 def test_typed_denials(message: Acquire, reason: str) -> None:
     t = Table()
     assert t.join().denied(message) == reason
+
+
+@pytest.mark.parametrize(
+    ("message", "text", "there_are"),
+    [
+        (Acquire(1, ("lift",)), "no robot 'lift'", "robots: none"),
+        (Acquire(1, (), ("axe",)), "no object 'axe'", "objects: none"),
+        (Acquire(1, ("",)), "no robot ''", "robots: none"),
+        (Grasp(1, "axe", "hand/left"), "no object 'axe'", "objects: none"),
+        (Release(1, (Target("lift", 1),)), "no robot 'lift'", "robots: none"),
+        (Assign(1, ("lift",)), "no robot 'lift'", "robots: none"),
+        (SetMode(1, "lift", "shared"), "no robot 'lift'", "robots: none"),
+        (SetScale(1, ("lift",), 0.5), "no robot 'lift'", "robots: none"),
+    ],
+)
+def test_what_the_scene_has_not_is_quoted_and_nothing_is_called_none(
+    message: Message, text: str, there_are: str
+) -> None:
+    t = Table()
+    t.authority = Authority(AuthorityConfig(), (), ())
+    denial = t.join("director").asks(message).denial
+    assert denial is not None
+    assert (denial.message, denial.advice) == (text, there_are)
 
 
 def test_observers_hold_nothing() -> None:
@@ -467,7 +500,8 @@ def test_waiting_for_seconds_keeps_the_reply_for_the_end() -> None:
 def test_denials_fit_the_wire_in_a_scene_of_many_objects() -> None:
     t = Table(objects=[f"a rather long name of object number {i}" for i in range(300)])
     anna = t.join()
-    for message in (Acquire(1, (), ("nothing",)), Release(1, (Target("nothing", 1),)), Grasp(1, "nothing", "head")):
+    release = Release(1, (Target("nothing", 1, "object"),))
+    for message in (Acquire(1, (), ("nothing",)), release, Grasp(1, "nothing", "head")):
         denial = anna.asks(message).denial
         assert denial is not None
         assert len(denial.message) <= 512
