@@ -96,7 +96,8 @@ class Tree:
         return moving
 
     def flex_vertex_bodies(self) -> frozenset[int]:
-        """Bodies that MuJoCo made for the vertices or nodes of a flex: three slides, and nothing on them or below.
+        """Bodies that MuJoCo made for the vertices or nodes of a flex: one each on one to three slides (`dof` of a
+        flexcomp), and nothing on them or below.
 
         Pinned and rigid vertices belong to ordinary bodies, which are not among them. What a light or camera looks at
         is not either.
@@ -107,7 +108,8 @@ class Tree:
         listed: set[int] = set()
         for array in ("flex_vertbodyid", "flex_nodebodyid"):
             if model.nflex and hasattr(model, array):
-                listed.update(np.unique(getattr(model, array)).tolist())
+                bodies, points = np.unique(getattr(model, array), return_counts=True)
+                listed.update(bodies[points == 1].tolist())
         return frozenset(
             b
             for b in listed
@@ -115,6 +117,11 @@ class Tree:
             and b not in used
             and not self.children[b]
             and int(model.body_geomnum[b]) == 0
-            and int(model.body_jntnum[b]) == 3
-            and len(self.scalar_joints_of(b)) == 3
+            and 1 <= int(model.body_jntnum[b]) <= 3
+            and self._slides(b)
         )
+
+    def _slides(self, body: int) -> bool:
+        """Whether all joints of a body are slides."""
+        first, n = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
+        return bool((self.model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())

@@ -38,7 +38,6 @@ _KINDS: Final = {
     for kind in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 }
 _WRAP_SITE: Final = int(mujoco.mjtWrap.mjWRAP_SITE)
-_HINGE_OR_SLIDE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,8 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
     listed: set[int] = set()
     for field in ("flex_vertbodyid", "flex_nodebodyid"):
         if model.nflex and hasattr(model, field):
-            listed.update(np.unique(getattr(model, field)).tolist())
+            bodies, points = np.unique(getattr(model, field), return_counts=True)
+            listed.update(bodies[points == 1].tolist())
     used = {
         *model.body_parentid.tolist(),
         *model.light_bodyid.tolist(),
@@ -152,12 +152,15 @@ def _flex_vertex_bodies(model: mujoco.MjModel) -> frozenset[int]:
         if body > 0
         and body not in used
         and int(model.body_geomnum[body]) == 0
-        and int(model.body_jntnum[body]) == 3
-        and all(
-            int(model.jnt_type[joint]) in _HINGE_OR_SLIDE
-            for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + 3)
-        )
+        and 1 <= int(model.body_jntnum[body]) <= 3
+        and _slides(model, body)
     )
+
+
+def _slides(model: mujoco.MjModel, body: int) -> bool:
+    """Whether all joints of a body are slides."""
+    first, n = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    return bool((model.jnt_type[first : first + n] == mujoco.mjtJoint.mjJNT_SLIDE).all())
 
 
 def _visual(model: mujoco.MjModel, index: int) -> Visual:
