@@ -8,6 +8,7 @@ for visual in scene.spec.visuals:
 
 from __future__ import annotations
 
+import reprlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -42,7 +43,8 @@ class FetchedScene:
     """`spec`: what is where; `meshes`, `textures`: by their place in `spec.meshes` and `spec.textures`. Vertices are in
     the visual's frame [m], pixels (height, width, channels), top row first.
 
-    `hidden`: ids of visuals that the budget leaves out. `failed`: what cannot be drawn, and why, by address.
+    `hidden`: ids of visuals that the budget leaves out: whoever draws leaves them out too. `failed`: what cannot be
+    drawn, and why, by address.
     """
 
     scene_hash: str
@@ -65,8 +67,13 @@ def fetch_scene(
     without end comes as it was after one of the patches. After `scene_changed`, and at once, call it again when
     `client.mirror.scene_hash` is not that of what you have. Raises `NotConnectedError` when it takes longer than
     `timeout_s`, or the session shares no specification; `AssetError` for a specification that the session says for
-    `REFUSED_S` not to have; `ClientError` for one that this package does not read.
+    `REFUSED_S` not to have; `ClientError` for one that this package does not read; `TypeError` for what is no budget.
     """
+    if not isinstance(budget, Budget):
+        raise TypeError(
+            f"budget is {reprlib.repr(budget)}: a Budget is expected, as QUEST_3 of iris_session.scene.budget, or "
+            "Budget(triangles=100_000)"
+        )
     until = time.monotonic() + timeout_s
     refused = _Refused()
     whole: tuple[int, float] | None = None  # scene epoch of the first that was here, and when it was

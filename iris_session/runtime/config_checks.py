@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import reprlib
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 import mujoco
 import numpy as np
 
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.runtime.errors import ConfigError
 
+_Spec = TypeVar("_Spec", RobotSpec, ObjectSpec)
+#: What is expected of robots and objects that somebody gives, for error texts.
+_ROBOTS: Final = (
+    "a list of RobotSpec is expected; load_robots_toml(file, model) of iris_session.physics reads one from a robots "
+    "file, and without robots= they are found in the model"
+)
+_OBJECTS: Final = (
+    'a list of ObjectSpec is expected, as [ObjectSpec(name="hammer", body="hammer")] of iris_session.protocol.specs; '
+    "without objects= they are found in the model"
+)
 #: Annotations of `SessionConfig`, and what may stand there. A bool is no number.
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "str": (str,),
@@ -89,6 +101,35 @@ def check_timestep(model: mujoco.MjModel) -> None:
             f"the model has a timestep of {timestep:g} s, run() takes {SHORTEST_TICK_S:g} to {LONGEST_TICK_S:g} s: "
             '<option timestep="0.002"/>'
         )
+
+
+def check_robots(given: object) -> tuple[RobotSpec, ...] | None:
+    """As they are given, None for those of the model. Raises `ConfigError` for what are none."""
+    return None if given is None else _specs("robots", given, RobotSpec, _ROBOTS)
+
+
+def check_objects(given: object) -> tuple[ObjectSpec, ...] | None:
+    """As they are given, None for those of the model. Raises `ConfigError` for what are none."""
+    return None if given is None else _specs("objects", given, ObjectSpec, _OBJECTS)
+
+
+def _specs(what: str, given: object, kind: type[_Spec], expected: str) -> tuple[_Spec, ...]:
+    if isinstance(given, str | bytes | Path | Mapping) or not isinstance(given, Iterable):
+        raise ConfigError(f"{what} is {_brief(given)}: {expected}")
+    specs = tuple(given)
+    for place, spec in enumerate(specs):
+        if not isinstance(spec, kind):
+            raise ConfigError(f"{what}[{place}] is {_brief(spec)}: {expected}")
+        try:
+            msgspec.msgpack.decode(msgspec.msgpack.encode(spec), type=kind)
+        except (TypeError, ValueError) as error:  # as the journal could not hold it
+            raise ConfigError(f"{what}[{place}] is a {kind.__name__} with a wrong field: {error}") from error
+    return specs
+
+
+def _brief(given: object) -> str:
+    """On one line, however large it is."""
+    return " ".join(reprlib.repr(given).split())
 
 
 def check_arguments(model: object, data: object, config: object) -> None:

@@ -52,7 +52,7 @@ from iris_session.recording.paths import resume_path, split_part, split_resume
 from iris_session.recording.verify import Models
 from iris_session.recording.versions import boot_id
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.config_checks import check_arguments
+from iris_session.runtime.config_checks import check_arguments, check_objects, check_robots
 from iris_session.runtime.core import CoreConfig, CoreState, SessionCore
 from iris_session.runtime.errors import ConfigError, ResumeError
 from iris_session.runtime.resume_note import ResumeNote, read_note
@@ -234,8 +234,9 @@ def begin(
     if not isinstance(config, SessionConfig) or config.resume is None:
         check_arguments(model, data, config)
         assert isinstance(model, mujoco.MjModel)
-        found = tuple(find_robots(model) if robots is None else robots)
-        return None, config, (model, found, tuple(find_objects(model) if objects is None else objects))
+        named, things = check_robots(robots), check_objects(objects)
+        found = tuple(find_robots(model)) if named is None else named
+        return None, config, (model, found, tuple(find_objects(model)) if things is None else things)
     past = Continuation(Path(config.resume))
     try:
         return past, *past.take(config, model, data, robots, objects)

@@ -21,7 +21,7 @@ from iris_session.protocol.scene_patch import PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.config_checks import check_arguments, check_timestep
+from iris_session.runtime.config_checks import check_arguments, check_objects, check_robots, check_timestep
 from iris_session.runtime.core import SessionCore, make_plant, plant_state
 from iris_session.runtime.deformables import flexes
 from iris_session.runtime.errors import ConfigError, OwnershipError
@@ -102,8 +102,9 @@ class SceneChanges(ScenePatches):
         that no loop can keep. It may be another one than the session's: ticks are of that length from then on, and
         clients are told.
 
-        Raises `OwnershipError` at once in a user's loop, whose model is not ours, and before `run()`; `TypeError` for
-        what is no model.
+        Call it once `run()` has begun: from another thread, from `until`, or between two of them (the next takes the
+        scene). Raises at once: `OwnershipError` in a user's loop, whose model is not ours, and before the first
+        `run()`; `TypeError` for what is no model; `ConfigError` for what are no robots or objects.
         """
         if self._user_loop is not None:
             raise OwnershipError("load_scene: your own loop owns the model; end this session and begin another with it")
@@ -111,10 +112,13 @@ class SceneChanges(ScenePatches):
             check_arguments(model, data, self.config)
         stepper = self._stepper
         if stepper is None:
-            raise OwnershipError("load_scene needs a session that runs: call it while run() is under way")
+            raise OwnershipError(
+                "load_scene needs a session that has begun to run: call it after the first run(), or during it; "
+                "what a session begins with is given to Session(model)"
+            )
         done: Future[None] = Future()
         scenes = self._live().scenes
-        known = None if robots is None else tuple(robots), None if objects is None else tuple(objects)
+        known = check_robots(robots), check_objects(objects)
         begun = copy.copy(data)  # the caller may go on with theirs
 
         def work() -> None:

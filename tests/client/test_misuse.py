@@ -12,6 +12,7 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
+from iris_session.client.fetched_scene import fetch_scene
 from iris_session.client.values import checked_bytes, names_of, numbers, pose_of, text_of
 from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
 from iris_session.protocol.codec import decode_client
@@ -225,3 +226,13 @@ def test_a_message_reads_back_as_what_was_said() -> None:
     observation = Observation("table", "qr", pose_of("T", [list(HERE[0]), list(HERE[1])]), 1, 0)
     assert decode_client(checked_bytes(observation)).message == observation
     assert numbers("q", range(3)) == (0.0, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("budget", ["QUEST_3", 100_000, None])
+def test_what_is_no_budget_is_told_in_one_line(budget: object) -> None:
+    client = Client("127.0.0.1:1", role="observer", name="screen")
+    with pytest.raises(
+        TypeError, match=r"^budget is .*: a Budget is expected, as QUEST_3 of iris_session\.scene\.budget"
+    ):
+        fetch_scene(client, budget)  # type: ignore[arg-type]
+    client.close()

@@ -13,6 +13,7 @@ import pytest
 
 from iris_session import ConfigError, Session, SessionConfig, SessionError, StartError
 from iris_session.control import ControlConfig
+from iris_session.protocol.specs import RobotSpec
 
 
 @pytest.mark.parametrize(
@@ -96,6 +97,29 @@ def test_what_is_no_scene_says_what_is_right() -> None:
     ):
         with pytest.raises(error, match=text):
             Session(*arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"objects": ["hammer"]}, r"^objects\[0\] is 'hammer': a list of ObjectSpec .*ObjectSpec\(name="),
+        ({"objects": "hammer"}, "^objects is 'hammer': a list of ObjectSpec is expected"),
+        (
+            {"objects": [RobotSpec("left", (), (), "tcp", "base")]},
+            r"^objects\[0\] is RobotSpec.*ObjectSpec is expected",
+        ),
+        ({"robots": ["left"]}, r"^robots\[0\] is 'left': a list of RobotSpec is expected; load_robots_toml"),
+        ({"robots": "robots.toml"}, "^robots is 'robots.toml': .*load_robots_toml"),
+        ({"robots": Path("robots.toml")}, "^robots is .*load_robots_toml"),
+        ({"robots": {"name": "left"}}, "^robots is .*a list of RobotSpec is expected"),
+        ({"robots": 5}, "^robots is 5: a list of RobotSpec is expected"),
+        ({"robots": [RobotSpec("left", "joint1", (), "tcp", "base")]}, r"^robots\[0\] is a RobotSpec .*joints"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_are_no_robots_or_objects_says_what_is_right(given: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError, match=text) as caught:
+        Session(mujoco.MjModel.from_xml_string("<mujoco/>"), **given)
+    assert "\n" not in str(caught.value)
 
 
 def test_recording_without_rerun_is_said_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import pytest
 
-from iris_session import Session
+from iris_session import Session, SessionConfig
 from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
 from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
 from iris_session.physics.scenes import n_arms_scene, scene_path
@@ -207,8 +207,19 @@ def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
 
 def test_only_a_session_that_runs_takes_another_scene() -> None:
     session = Session(str(scene_path("handover")))
-    with pytest.raises(OwnershipError, match="while run\\(\\) is under way"):
+    with pytest.raises(OwnershipError, match=r"call it after the first run\(\), or during it"):
         session.load_scene(bench_scene())
+    ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+    with Session(str(scene_path("handover")), config=ports) as run:
+        run.run(seconds=0.01)
+        with pytest.raises(ConfigError, match=r"objects\[0\] is 'hammer': a list of ObjectSpec is expected"):
+            run.load_scene(bench_scene(), objects=["hammer"])  # type: ignore[list-item]
+        with pytest.raises(ConfigError, match=r"robots is 'robots\.toml': a list of RobotSpec is expected"):
+            run.load_scene(bench_scene(), robots="robots.toml")  # type: ignore[arg-type]
+        change = run.load_scene(bench_scene())  # between two runs
+        change.result(timeout=60)
+        run.run(seconds=0.05)
+        assert run.objects == find_objects(bench_scene())
     model: Any = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
     with Session(model, mujoco.MjData(model)) as mine:
         mine.begin_tick()
