@@ -1,8 +1,9 @@
 """What trimesh takes without a word, or calls by names of its own: files that are cut, and vertices that are not there.
 
 Of OBJ also corners that count from the end, which mean another vertex in every line and trimesh takes from the end of
-the file, and those with 0 for a texture coordinate or normal that they do not have, as some exporters write. Each check
-is given the file's name and bytes, and returns the bytes to be read.
+the file, and those with 0 for a texture coordinate or normal that they do not have, as some exporters write. Names and
+comments may be in any encoding, numbers are ASCII. Each check is given the file's name and bytes, and returns the bytes
+to be read.
 """
 
 from __future__ import annotations
@@ -20,6 +21,12 @@ _PLY_HEAD: Final = 1 << 16
 #: A corner of a face, of an OBJ line, that is 0 or negative.
 _ODD_CORNER: Final = re.compile(rb"^[ \t]*f(?=[ \t])[^\n]*?[ \t/](?:-|0+(?:[/ \t\r\n]|$))", re.MULTILINE)
 _NO_NORMAL: Final = re.compile(rb"^[ \t]*f[ \t][^\n]*?/[^ \t\n/]*/0+(?=[ \t\r\n]|$)", re.MULTILINE)
+#: Lines of an OBJ with numbers. A comment behind them; one with bytes that are no text of numbers, or that begins so;
+#: a face with fewer than three corners.
+_BEHIND: Final = re.compile(rb"^([ \t]*(?:v[tnp]?|f)[ \t][^\n#]*)#[^\n]*", re.MULTILINE)
+_NO_TEXT: Final = re.compile(rb"^[ \t]*(?:(?:v[tnp]?|f)[ \t][^\n]*)?[\x00\x80-\xff]", re.MULTILINE)
+_FEW_CORNERS: Final = re.compile(rb"^[ \t]*f(?:[ \t]+\S+){0,2}[ \t]*\r?$", re.MULTILINE)
+_BOM: Final = b"\xef\xbb\xbf"
 _OBJ_LISTS: Final = (b"v", b"vt", b"vn")
 #: Of what is no corner, in the error text [characters].
 _SHOWN: Final = 60
@@ -62,6 +69,8 @@ def off(name: str, data: bytes) -> bytes:
     first one trimesh reads all but a line twice."""
     if b"#" in data:
         data = b"\n".join(line.partition(b"#")[0] for line in data.splitlines())
+    if not _plain(data):
+        raise SceneBuildError(f"{name} is damaged, or no OFF: not all of it is text; export or download it again")
     rows = [row for line in data.partition(b"OFF")[2].splitlines() if (row := line.split())]
     try:
         vertices, faces = (int(word) for word in rows[0][:2])
@@ -78,8 +87,24 @@ def off(name: str, data: bytes) -> bytes:
 
 
 def obj(name: str, data: bytes) -> bytes:
-    """Corners count from 1, and forward."""
-    return absolute_corners(name, data) if _ODD_CORNER.search(_one_line_each(data)) else data
+    """Faces have at least three corners, which count from 1, and forward. Without comments behind them, which trimesh
+    takes for corners. Numbers are text: what is none it leaves out."""
+    data = data.removeprefix(_BOM).removesuffix(b"\0")
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    if b"#" in data:
+        data = _BEHIND.sub(rb"\1", data)
+    if not _plain(data) and (found := _NO_TEXT.search(data)):
+        where = _place(name, data, found.end() - 1)
+        raise SceneBuildError(f"{where}: not all of it is text: the file is damaged, or no OBJ; export it again")
+    text = _one_line_each(data)
+    if few := _FEW_CORNERS.search(text):
+        where = _place(name, text, few.start())
+        raise SceneBuildError(f"{where}: a face with fewer than three corners: the file is cut; export it again")
+    if _cut_corner(text):
+        where = _place(name, text, len(text))
+        raise SceneBuildError(f"{where}: its last corner is not whole: the file is cut; export it again")
+    return absolute_corners(name, data) if _ODD_CORNER.search(text) else data
 
 
 CHECKS: Final[Mapping[str, Callable[[str, bytes], bytes]]] = {"stl": stl, "ply": ply, "off": off, "obj": obj}
@@ -104,6 +129,23 @@ def absolute_corners(name: str, data: bytes) -> bytes:
         else:
             out.append(line)
     return b"\n".join(out) + (b"\nvt 0 0\n" if total[1] else b"")
+
+
+def _plain(data: bytes) -> bool:
+    """Whether it is ASCII; with zeros a disk that was full has filled up what it had lost."""
+    return data.isascii() and b"\0" not in data
+
+
+def _place(name: str, data: bytes, at: int) -> str:
+    number = data.count(b"\n", 0, at) + 1
+    return f"{name}, line {number}"
+
+
+def _cut_corner(text: bytes) -> bool:
+    """Whether an OBJ ends, without an end of its line, in a corner of a face that has fewer parts than the others."""
+    words = text[text.rfind(b"\n") + 1 :].split()
+    kinds = {tuple(map(bool, word.split(b"/"))) for word in words[1:]}
+    return words[:1] == [b"f"] and len(kinds) > 1
 
 
 def _one_line_each(data: bytes) -> bytes:

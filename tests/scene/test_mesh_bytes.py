@@ -52,6 +52,18 @@ def binary_stl(said: int, there: bytes, head: bytes = b"") -> bytes:
         ("a.obj", f"{CORNERS}vt 0 0\nf 1/1 2/-2 3/1\n", "names texture coordinate -2 of 1"),
         ("a.obj", f"{CORNERS}f 1 -x 3\n", "'-x' is no corner of a face"),
         ("a.obj", f"{CORNERS}f 1 2 {'-' * 9999}\n", "line 4: '-{60}' is no corner of a face"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf 3//1", r"a\.obj, line 5: a face with fewer than three corners"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf 3 2 # and 1\nf 1 2 3\n", r"a\.obj, line 5: a face with fewer than three"),
+        ("a.obj", f"{CORNERS}f 1 2 3\nf", r"a\.obj, line 5: a face with fewer than three"),
+        ("a.obj", f"{CORNERS}vn 0 0 1\nf 1//1 2//1 3", r"a\.obj, line 5: its last corner is not whole"),
+        ("a.obj", CORNERS.encode() + b"v 0 1 1\xff\xff\xff 2\nf 1 2 3\n", r"a\.obj, line 4: not all of it is text"),
+        ("a.obj", CORNERS.encode() + b"f 1 2 3\n\xff\xfe\xff\nf 1 2 3\n", r"a\.obj, line 5: not all of it is text"),
+        ("a.obj", CORNERS.encode() + b"f 1 2 3\n" + bytes(99), r"a\.obj, line 5: not all of it is text"),
+        (
+            "a.off",
+            OFF.format(1).replace("1 0 0", "1 0 \xff0") + "3 0 1 2\n",
+            "damaged, or no OFF: not all of it is text",
+        ),
     ],
 )
 def test_what_is_cut_or_not_there_is_told(tmp_path: Path, name: str, content: str | bytes, text: str) -> None:
@@ -69,6 +81,10 @@ def test_what_is_cut_or_not_there_is_told(tmp_path: Path, name: str, content: st
         ("a.ply", PLY.format(1) + "3 0 1 2", 1),
         ("a.off", OFF.format(2) + "\n3 0 1 2 # first\n3 0 2 1 255 0 0", 2),
         ("a.off", "C" + OFF.format(1) + "3 0 1 2", 1),
+        ("a.obj", f"\ufeff# maß\no Größe\n{CORNERS}s off\nl 1 2\np 1\nf 1 2 3 # ja\nf 3 2 \\\n1\ncurv 0 1 1 2\n", 2),
+        ("a.obj", f"# Gr\xf6\xdfe\ng \xff\n{CORNERS}xyz 1\nf 1 2 3\n\x1a\0".encode("latin-1"), 1),
+        ("a.obj", f"{CORNERS}f 1 2 3 \nf 3 2 1".replace("\n", "\r"), 2),
+        ("a.obj", f"{CORNERS}vn 0 0 1\nf 1//1 2//1 3//1\nf 1 2 3".replace("\n", "\r\n"), 2),
     ],
 )
 def test_what_is_whole_is_read(tmp_path: Path, name: str, content: str | bytes, triangles: int) -> None:
