@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from iris_session.physics.errors import ModelInvalidError, ModelNotFoundError, one_line
+from iris_session.physics.told import caught_warnings
 
 TEXT_SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
 _BUFFER_NAME: Final = "model.mjb"
@@ -33,15 +34,24 @@ def load_model(path: str | Path) -> mujoco.MjModel:
             f"model file {path.name!r} must end in one of {', '.join((*TEXT_SUFFIXES, '.mjb'))}; other files are "
             "shown, not simulated: ScenePublisher with SceneBuilder.add_file"
         )
-    read = mujoco.MjModel.from_binary_path if suffix == ".mjb" else mujoco.MjModel.from_xml_path
     try:
-        model = read(str(path))
+        model = _binary(str(path)) if suffix == ".mjb" else mujoco.MjModel.from_xml_path(str(path))
         bytes(model.names).decode()
     except UnicodeDecodeError as error:  # MuJoCo takes any bytes, and then cannot give the name
         raise ModelInvalidError(f"{path.name}: a name in it is not UTF-8: save the file as UTF-8") from error
     except (ValueError, mujoco.FatalError) as error:
-        raise ModelInvalidError(f"{path.name}: {one_line(error)}") from error
+        advice = f"; damaged, or not of MuJoCo {mujoco.__version__}: save it again" if suffix == ".mjb" else ""
+        raise ModelInvalidError(f"{path.name}: {one_line(error)}{advice}") from error
     return model
+
+
+def _binary(name: str, assets: dict[str, bytes] | None = None) -> mujoco.MjModel:
+    """Raises `ValueError` with the reason, which MuJoCo itself gives as a warning beside its error."""
+    with caught_warnings() as why:
+        try:
+            return mujoco.MjModel.from_binary_path(name, assets)
+        except (ValueError, mujoco.FatalError) as error:
+            raise ValueError("; ".join(why) or one_line(error)) from error
 
 
 def _siblings(path: Path) -> str:
@@ -67,7 +77,7 @@ def model_bytes(model: mujoco.MjModel) -> bytearray:
 def model_from_bytes(data: bytes | bytearray) -> mujoco.MjModel:
     """Inverse of `model_bytes`. Raises `ModelInvalidError` for bytes of another format or MuJoCo version."""
     try:
-        return mujoco.MjModel.from_binary_path(_BUFFER_NAME, assets={_BUFFER_NAME: bytes(data)})
+        return _binary(_BUFFER_NAME, {_BUFFER_NAME: bytes(data)})
     except (ValueError, mujoco.FatalError) as error:
         raise ModelInvalidError(
             f"these {len(data)} bytes are no model of MuJoCo {mujoco.__version__}: {one_line(error)}"

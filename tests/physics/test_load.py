@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 from iris_session.physics import ModelInvalidError, ModelNotFoundError, load_model, model_bytes, model_from_bytes
+from iris_session.physics.told import caught_warnings
 from tests.physics.models import clutter
 
 XML = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
@@ -51,6 +54,58 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(ModelInvalidError, match="these 4 bytes are no model of MuJoCo"):
         model_from_bytes(b"nope")
+
+
+def test_a_damaged_binary_is_one_line_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo prints a warning, and writes it into a file in the current folder."""
+    good = bytes(model_bytes(clutter()))
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    heard: list[str] = []
+    mujoco.set_mju_user_warning(heard.append)  # somebody else's
+    try:
+        for data, reason in (
+            (b"no model at all", "incomplete header|missing header"),
+            (bytes(1000), "Model missing header ID"),
+            (good[:-100], "Truncated model file"),
+            (b"", "failed to load"),
+            (good[:12] + b"\xff" + good[13:], "different MuJoCo version"),
+        ):
+            (tmp_path / "damaged.mjb").write_bytes(data)
+            with pytest.raises(ModelInvalidError, match=rf"^damaged.mjb: .*({reason}).*: save it again$") as caught:
+                load_model(tmp_path / "damaged.mjb")
+            assert "\n" not in str(caught.value)
+            with pytest.raises(ModelInvalidError, match=reason):
+                model_from_bytes(data)
+        assert heard == []
+        assert mujoco.get_mju_user_warning() == heard.append
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert capfd.readouterr() == ("", "")
+    assert list(here.iterdir()) == []
+
+
+def test_warnings_of_other_threads_are_not_caught(capfd: pytest.CaptureFixture[str]) -> None:
+    """A simulation that goes on while another thread loads a model."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    data.qpos[0] = np.nan
+    with caught_warnings() as caught:
+        stepping = threading.Thread(target=mujoco.mj_step, args=(model, data))
+        stepping.start()
+        stepping.join()
+        assert caught == []
+        data = mujoco.MjData(model)  # of one state MuJoCo warns once
+        data.qpos[0] = np.nan
+        mujoco.mj_step(model, data)
+        assert [text.startswith("Nan") for text in caught] == [True]
+    assert mujoco.get_mju_user_warning() is None
+    shown = capfd.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("WARNING: Nan")
 
 
 def test_names_that_are_not_text_are_said_at_once(tmp_path: Path) -> None:
