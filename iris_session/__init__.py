@@ -8,7 +8,8 @@ Public API, nothing else is public:
 - `ScenePublisher`: share such a scene, moved by another simulator or a real robot. Error: `PublishError`.
 - `Client`: join a session from any process. Errors: `ClientError` and its subclasses. `find_sessions`: those on this
   network, as `FoundSession`.
-- `fetch_scene`: what a client needs to draw the scene, as `FetchedScene`. `Deformables`: the vertices of what bends.
+- `fetch_scene`: what a client needs to draw the scene, as `FetchedScene`. `Deformables`: the vertices of what bends,
+  and what joins them.
 
 Names are imported on first use, so that a light client does not load MuJoCo.
 """
