@@ -33,6 +33,8 @@ ALONE_BYTES: Final = 16 << 20
 #: Meshes are made coarser by this factor, as long as as many triangles stay.
 _COARSER: Final = 4
 _FEWEST_TRIANGLES: Final = 500
+#: What a level may have of the triangles and bytes of the one before, to be worth fetching both.
+_SAVED: Final = 2 / 3
 #: Textures are halved down to this side.
 _SMALLEST_SIDE: Final = 256
 #: What files in a form of their own begin with. MuJoCo has each as one row of bytes that look like grey pixels.
@@ -166,12 +168,11 @@ class Builder:
             coarse = simplified(mesh, target)
             if coarse is None:
                 break
-            data, rounding = encode_mesh_quantised(coarse[0])
-            levels.append(self._mesh_level(coarse[0], data, coarse[1] + rounding))
             target //= _COARSER
-        if self.options.levels and len(levels) == 1 and mesh.triangles > _FEWEST_TRIANGLES:
-            data, error = encode_mesh_quantised(mesh)
-            levels.append(self._mesh_level(mesh, data, error))
+            data, rounding = encode_mesh_quantised(coarse[0])
+            finer = levels[-1]
+            if coarse[0].triangles <= _SAVED * finer.triangles and len(data) <= _SAVED * finer.bytes:
+                levels.append(self._mesh_level(coarse[0], data, coarse[1] + rounding))
         low, high = _box(mesh)
         return MeshNote(low, high, tuple(levels))
 

@@ -145,7 +145,7 @@ def _meshes(spec: SceneSpec) -> Iterator[Heavy]:
         if uses[i] != 1:
             why += f", drawn {uses[i]} times"
         if len(mesh.levels) == 1 and level.triangles > 5_000:
-            why += ", no coarser level: it has texture coordinates or colours"
+            why += ", no coarser level: it has texture coordinates or colours, or it would save little"
         yield Heavy("mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why)
 
 

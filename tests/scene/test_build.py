@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -10,6 +12,7 @@ import pytest
 
 from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
 from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.meshes import index_corners
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.simplify import simplified
 from tests.scene.models import many_objects
@@ -54,6 +57,25 @@ def test_levels_of_a_mesh(tmp_path: Path) -> None:
         assert level.max_error_m > fine.max_error_m
         assert decode_mesh(store.get(level.address)).triangles == level.triangles
     assert np.allclose((note.low, note.high), [(-1, -1, -1), (1, 1, 1)])
+
+
+def test_a_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
+    """Faces of their own normals; texture coordinates, for which nothing is coarser; quarters that are hardly fewer."""
+    builder = Builder(AssetStore(tmp_path))
+    smooth = ball(3)
+    corners = smooth.position[smooth.index]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = index_corners(corners, np.repeat(across[:, None], 3, axis=1).astype(np.float32), None)
+    textured = replace(ball(4), uv=np.ascontiguousarray(ball(4).position[:, :2]))
+    notes = builder.run(
+        [builder.mesh([mesh.position, mesh.index], lambda mesh=mesh: mesh) for mesh in (flat, textured)]
+    )
+    assert [level.triangles for level in notes[0].levels][:1] == [1_280]
+    for note in notes:
+        for finer, level in itertools.pairwise(note.levels):
+            assert level.triangles <= 2 / 3 * finer.triangles
+            assert level.bytes <= 2 / 3 * finer.bytes
+    assert len(notes[1].levels) == 1
 
 
 @pytest.mark.parametrize("encoding", ["arrays", "png", "jpeg"])
