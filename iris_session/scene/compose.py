@@ -28,13 +28,14 @@ from iris_session.scene.given import (
     given_mesh,
     given_vertices,
     look_of,
+    number,
     numbers,
     path_of,
     takes,
+    texture_of,
     triangles_of,
 )
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
-from iris_session.scene.pictures import checked_pixels
 from iris_session.scene.store import AssetStore
 from iris_session.scene.units import file_question, side_of
 from iris_session.scene.urdf import read_urdf
@@ -95,7 +96,7 @@ class SceneBuilder:
     @takes(Options)
     def add_sphere(self, name: str = "", *, radius: float, **options: Unpack[Options]) -> str:
         """A sphere."""
-        return self._shape(GeometryKind.SPHERE, name, numbers("radius", [radius] * 3, 3, above=0.0), options)
+        return self._shape(GeometryKind.SPHERE, name, number("radius", radius, above=0.0) * 3, options)
 
     @takes(Options)
     def add_ellipsoid(self, name: str = "", *, half_size: Sequence[float], **options: Unpack[Options]) -> str:
@@ -137,7 +138,7 @@ class SceneBuilder:
         """`vertices` (n, 3) [m], `triangles` (m, 3), counter-clockwise seen from outside; of the vertices `normals`
         (n, 3), texture coordinates `uvs` (n, 2; v down), `colors` (n, 3 or 4) uint8. Without normals they are made.
         """
-        mesh = given_mesh(vertices, triangles, normals, uvs, colors)
+        mesh = given_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
         look = look_of(options) or Look(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else Look().rgba)
         body, matrix = self._place(name, options)
         self._world.items.append(Item(body, cut(name), matrix, look, mesh))
@@ -171,7 +172,10 @@ class SceneBuilder:
         if turn not in ("y", "z"):
             said = f"{where.name} says that {turn} is up" if up is None else f"up is {up!r}"
             raise SceneBuildError(f"{said}: give up='y' or up='z', or None for what the format means")
-        factors = numbers("scale", scale if array_of(scale, "scale").ndim else [scale] * 3, 3)
+        one = array_of(scale, "scale").ndim == 0
+        if one:
+            (factor,) = number("scale", scale, "a number, or three, is needed")
+        factors = (factor,) * 3 if one else numbers("scale", scale, 3)
         if 0.0 in factors:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
@@ -205,7 +209,7 @@ class SceneBuilder:
         name = name or where.stem[:_MAX_NAME]
         self._new_name(name)
         T_world_root = checked_pose(position, quaternion)
-        (factor,) = numbers("scale", [scale], 1, above=0.0)
+        (factor,) = number("scale", scale, above=0.0)
         robot = read_urdf(where, name, T_world_root, package_dirs, collisions=collisions, scale=factor)
         for body in robot.articulation.bodies:
             self._new_name(body)
@@ -237,15 +241,17 @@ class SceneBuilder:
             )
         if (triangles is None) == (edges is None):
             raise SceneBuildError(f"deformable {name!r} needs triangles (m, 3) or edges (m, 2): one of them")
-        points = given_vertices(vertices)
+        whose = f"deformable {name!r}"
+        points = given_vertices(f"vertices of {whose}", vertices)
         if len(points) > MAX_VERTICES:
             raise SceneBuildError(
                 f"deformable {name!r} has {len(points):,} vertices, at most {MAX_VERTICES:,}: make it coarser"
             )
-        elements = triangles_of(triangles if edges is None else edges, len(points), 3 if edges is None else 2)
-        (half,) = numbers("radius", [radius], 1, above=0.0)
+        what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
+        elements = triangles_of(f"{what} of {whose}", given, len(points), width)
+        (half,) = number("radius", radius, above=0.0)
         look = look_of(looks) or Look()
-        coordinates = None if uvs is None else given_vertices(uvs, 2, len(points))
+        coordinates = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))
         self._world.flexibles.append(Flexible(name, points, elements, coordinates, half, flat, look))
         self._world.names.add(name)
         return name
@@ -299,7 +305,7 @@ class SceneBuilder:
         on: str = "",
     ) -> str:
         """A camera that looks along -z of its frame, y up, with a vertical field of view of `fovy` degrees."""
-        (angle,) = numbers("fovy", [fovy], 1, above=0.0)
+        (angle,) = number("fovy", fovy, above=0.0)
         if angle >= 180.0:
             raise SceneBuildError(f"fovy is {fovy}: degrees below 180")
         camera = Camera(cut(name), 0, checked_pose(position, quaternion), angle, resolution=resolution)
@@ -307,8 +313,9 @@ class SceneBuilder:
         return name
 
     def set_skybox(self, pixels: Any) -> None:
-        """Around everything: six square faces below one another (6 n, n, 3) uint8, in the order of docs/scene.md."""
-        faces = checked_pixels(pixels, "skybox")
+        """Around everything: six square faces below one another, (6 n, n, 3) uint8 or the path of such a picture, in
+        the order of docs/scene.md."""
+        faces = texture_of(pixels, "skybox")
         if faces.shape[0] != 6 * faces.shape[1]:
             raise SceneBuildError(f"a skybox of {faces.shape[1]} x {faces.shape[0]}: six squares below one another")
         self._world.skybox = Picture(faces, "skybox", TextureKind.SKYBOX)

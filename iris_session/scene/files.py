@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -21,6 +22,7 @@ ROBOTS: Final = ("urdf",)
 #: What MuJoCo reads.
 MODELS: Final = ("mjb", "mjcf", "xml")
 ENDINGS: Final = tuple(sorted((*_GLTF, *MESHES, *ROBOTS, *MODELS)))
+_ADDRESS: Final = re.compile(r"(https?|ftp):[/\\]")
 _ROOM: Final = Path(__file__).parent
 #: Most files that an error text lists.
 _LISTED: Final = 8
@@ -48,6 +50,8 @@ def load_file(path: Path, package_dirs: Sequence[str | PathLike[str]] = (), name
 def present(path: Path) -> None:
     """Raises `SceneBuildError` unless there is a file with something in it."""
     try:
+        if _ADDRESS.match(str(path)):  # a path has made one slash of its two
+            raise SceneBuildError(f"{path.name}: files are read, not addresses: download it first")
         if path.is_dir():
             raise SceneBuildError(f"{path} is a folder: name a file{readable_in(path, 'in it')}")
         if not path.is_file():

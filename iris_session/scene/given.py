@@ -122,9 +122,9 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
     across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
     pictures: tuple[tuple[str, Picture], ...] = ()
     if "texture" in options:
-        pixels = _texture(options["texture"])
+        pixels = texture_of(options["texture"], "texture")
         pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, Picture(pixels)),)
-    values: dict[str, Any] = {name: numbers(name, [options[name]], 1)[0] for name in _NUMBERS if name in options}
+    values: dict[str, Any] = {name: number(name, options[name])[0] for name in _NUMBERS if name in options}
     for name, value in values.items():
         if value < 0.0 or (value > 1.0 and name != "emission"):
             raise SceneBuildError(f"{name} is {value:g}: {'0 or more' if name == 'emission' else 'from 0 to 1'}")
@@ -139,11 +139,14 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
     return replace(plain, **values)
 
 
-def _texture(texture: Any) -> NDArray[np.uint8]:
-    if isinstance(texture, str | PathLike):
-        path = path_of(texture)
+def texture_of(given: Any, what: str) -> NDArray[np.uint8]:
+    """Pixels, or those of the picture whose path is given."""
+    if isinstance(given, str | PathLike):
+        path = path_of(given)
+        if path.is_dir():
+            raise SceneBuildError(f"{what} is {str(path)!r}, a folder: the path of a picture is needed, or pixels")
         return read_pixels(read_bounded(path), str(path))
-    return checked_pixels(texture, "texture")
+    return checked_pixels(given, what)
 
 
 def path_of(path: Any) -> Path:
@@ -168,59 +171,76 @@ def numbers(what: str, values: Any, count: int, *, above: float | None = None) -
     return found
 
 
+def number(what: str, value: Any, needed: str = "a number is needed", *, above: float | None = None) -> tuple[float]:
+    """One finite number, greater than `above`."""
+    try:
+        found = float(_no_text(value))
+    except (TypeError, ValueError, OverflowError):
+        raise SceneBuildError(f"{what} is {value!r}: {needed}") from None
+    if not np.isfinite(found):
+        raise SceneBuildError(f"{what} is {value!r}: a finite number is needed")
+    if above is not None and found <= above:
+        raise SceneBuildError(f"{what} is {value!r}: a number greater than {above:g} is needed")
+    return (found,)
+
+
 def _no_text(value: Any) -> Any:
     return None if isinstance(value, str | bytes) else value
 
 
-def given_vertices(values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
+def given_vertices(what: str, values: Any, width: int = 3, count: int | None = None) -> NDArray[np.float32]:
     """Rows of finite float32, read-only."""
     needed = f"finite numbers of shape (n, {width}) are needed"
     try:
         given = np.asarray(values)
     except (TypeError, ValueError):
-        raise SceneBuildError(f"rows that are no array: {needed}") from None
+        raise SceneBuildError(f"{what}: rows that are no array: {needed}") from None
     if given.dtype.kind not in "biuf":
-        what = "texts" if given.dtype.kind in "US" else f"an array of {given.dtype}"
-        raise SceneBuildError(f"{what} of shape {given.shape}: {needed}")
+        kind = "texts" if given.dtype.kind in "US" else f"an array of {given.dtype}"
+        raise SceneBuildError(f"{what}: {kind} of shape {given.shape}: {needed}")
     with np.errstate(over="ignore"):  # what float32 cannot hold is not finite then
         array = np.array(given, np.float32)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
-        raise SceneBuildError(f"an array of shape {array.shape}: {needed}")
+        raise SceneBuildError(f"{what}: an array of shape {array.shape}: {needed}")
     if count is not None and len(array) != count:
-        raise SceneBuildError(f"{len(array)} rows for {count} vertices: one each is needed")
+        raise SceneBuildError(f"{what}: {len(array)} rows for {count} vertices: one each is needed")
     array.setflags(write=False)
     return array
 
 
-def triangles_of(values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
+def triangles_of(what: str, values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
     """Rows of vertex numbers."""
-    array = array_of(values, "rows of vertex numbers")
+    array = array_of(values, what)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or array.dtype.kind not in "iu":
         raise SceneBuildError(
-            f"an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at least one row"
+            f"{what}: an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at "
+            "least one row"
         )
     if len(array) > MAX_TRIANGLES:
-        raise SceneBuildError(f"{len(array)} rows: at most {MAX_TRIANGLES:,}")
+        raise SceneBuildError(f"{what}: {len(array)} rows: at most {MAX_TRIANGLES:,}")
     low, high = int(array.min()), int(array.max())
     if low < 0 or high >= vertices:
-        raise SceneBuildError(f"vertex {low if low < 0 else high} of {vertices}: numbers go from 0 to {vertices - 1}")
+        wrong = low if low < 0 else high
+        raise SceneBuildError(f"{what}: vertex {wrong} of {vertices}: numbers go from 0 to {vertices - 1}")
     return np.ascontiguousarray(array, np.uint32)
 
 
-def given_mesh(vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: Any) -> MeshArrays:
-    """A mesh of arrays per vertex."""
-    points = given_vertices(vertices)
-    index = triangles_of(triangles, len(points)).astype(np.int64)
+def given_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any, colors: Any) -> MeshArrays:
+    """A mesh of arrays per vertex; `whose` they are, for error texts."""
+    points = given_vertices(f"vertices of {whose}", vertices)
+    index = triangles_of(f"triangles of {whose}", triangles, len(points)).astype(np.int64)
     if normals is None:
         across = creased_normals(points.astype(np.float64), index).astype(np.float32)
     else:
-        across = np.asarray(unit(given_vertices(normals, 3, len(points)))[index], np.float32)
-    uv = None if uvs is None else given_vertices(uvs, 2, len(points))[index]
+        across = np.asarray(unit(given_vertices(f"normals of {whose}", normals, 3, len(points)))[index], np.float32)
+    uv = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))[index]
     color = None
     if colors is not None:
-        array = array_of(colors, "colors")
+        array = array_of(colors, f"colors of {whose}")
         if array.dtype != np.uint8 or array.ndim != 2 or array.shape[1] not in (3, 4) or len(array) != len(points):
-            raise SceneBuildError(f"colors {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8")
+            raise SceneBuildError(
+                f"colors of {whose}: {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8"
+            )
         if array.shape[1] == 3:
             array = np.concatenate([array, np.full((len(array), 1), 255, np.uint8)], axis=1)
         color = array[index]

@@ -9,6 +9,7 @@ this is judged.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,8 @@ SIBLINGS: Final = (
     "visual",
     "visuals",
 )
+#: Most files that an error text lists.
+_LISTED: Final = 8
 _PACKAGE: Final = "package.xml"
 _files: ContextVar[list[Path] | None] = ContextVar("files that were read", default=None)
 
@@ -86,6 +89,11 @@ class References:
 
     def find(self, reference: str) -> Path:
         """The file that `reference` names. Raises `SceneBuildError` when there is none, or it may not be read."""
+        if "$(" in reference or "${" in reference:
+            raise SceneBuildError(
+                f"{self.path.name} refers to {reference}: xacro must be expanded first: xacro IN.urdf.xacro > OUT.urdf "
+                "(ROS has it; else pip install xacro)"
+            )
         scheme, found, rest = reference.partition("://")
         if not found:
             plain = self.path.parent / reference.replace("\\", "/")
@@ -95,6 +103,10 @@ class References:
             return self._in_package(reference, package, inside.lstrip("/"))
         if scheme == "file":
             return self._allowed(reference, Path(_plain(rest)))
+        if scheme in ("http", "https", "ftp"):
+            raise SceneBuildError(
+                f"{self.path.name} refers to {reference}: files are read, not addresses: download it first"
+            )
         raise SceneBuildError(f"{self.path.name} refers to {reference}: only files and package:// are read")
 
     def folders(self, path: Path) -> tuple[Path, ...]:
@@ -108,7 +120,7 @@ class References:
                 f"{self.path.name} refers to {reference}, outside of its own folders: name the folder in package_dirs"
             )
         if not found.is_file():
-            raise SceneBuildError(f"{self.path.name} refers to {reference}: there is no file {found}")
+            raise SceneBuildError(f"{self.path.name} refers to {reference}: there is no file {found}{_similar(found)}")
         return found
 
     def _in_package(self, reference: str, package: str, inside: str) -> Path:
@@ -126,6 +138,13 @@ class References:
                 if self._may_draw_in(root, found):
                     return found
                 closed = closed or root
+        lost = [(root / inside).resolve() for root in tried if root.is_dir() and self._may_draw_in(root, root)]
+        within = [path for path in lost if any(path.is_relative_to(root.resolve()) for root in tried)]
+        if closed is None and within:
+            raise SceneBuildError(
+                f"{self.path.name} refers to {reference}: package {package} is there, and has no file {within[0]}"
+                f"{_similar(within[0])}"
+            )
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
         if closed is not None:  # any folder has a name: of somebody's pictures, of keys
             hint = f"{closed} has no {_PACKAGE}, so it is no package"
@@ -141,6 +160,17 @@ class References:
     def _above(self) -> tuple[Path, ...]:
         """The file's folder and those above it, without the root of the file system."""
         return tuple(up for up in self.path.parents if up != Path(up.anchor))[:_UP]
+
+
+def _similar(path: Path) -> str:
+    """For error texts: files that are called nearly so, else some of those in its folder."""
+    folder = path.parent
+    try:
+        names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
+    except OSError:
+        return f"; there is no folder {folder}"
+    near = difflib.get_close_matches(path.name, names, n=3) or names[:_LISTED]
+    return f"; in {folder}: {', '.join(near)}" if near else f"; {folder} has no files"
 
 
 def _is_package(root: Path, name: str) -> bool:

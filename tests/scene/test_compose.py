@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image
 
 import iris_session
 from iris_session.protocol.common import IDENTITY, Pose
@@ -361,3 +364,33 @@ def test_a_deformable_that_no_stream_takes_is_refused_where_it_is_added() -> Non
 def test_public_names() -> None:
     assert iris_session.SceneBuilder is SceneBuilder
     assert iris_session.SceneBuildError is SceneBuildError
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda s: s.add_sphere(radius="100"), "radius is '100': a number is needed"),
+        (lambda s: s.add_sphere(radius=-1), "radius is -1: a number greater than 0 is needed"),
+        (lambda s: s.add_mesh("x", vertices=[[0, 0]], triangles=[[0, 1, 2]]), "vertices of mesh 'x': an array"),
+        (lambda s: s.add_mesh("x", vertices=np.eye(3), triangles=[[0, 1, 3]]), "triangles of mesh 'x': vertex 3 of 3"),
+        (lambda s: s.add_mesh("x", vertices=np.eye(3), triangles=[[0, 1, 2]], uvs=[[0, 0]]), "uvs of mesh 'x': 1 rows"),
+        (lambda s: s.add_deformable("c", np.eye(3), edges=[[0, 9]]), "edges of deformable 'c': vertex 9 of 3"),
+        (lambda s: s.add_box(half_size=(1, 1, 1), texture="/tmp"), "texture is '/tmp', a folder"),
+        (lambda s: s.add_file("https://x/a.glb"), "a.glb: files are read, not addresses: download it first"),
+        (lambda s: s.set_skybox("/no.png"), "/no.png: no such file"),
+    ],
+)
+def test_refusals_name_what_was_given(wrong: Callable[[SceneBuilder], object], says: str) -> None:
+    with pytest.raises(SceneBuildError, match=re.escape(says)):
+        wrong(SceneBuilder())
+
+
+def test_a_scale_that_is_text_and_a_skybox_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    scene = SceneBuilder()
+    with pytest.raises(SceneBuildError, match="scale is 'mm': a number, or three, is needed"):
+        scene.add_file(tmp_path / "a.off", scale="mm")  # type: ignore[arg-type]
+    Image.new("RGB", (8, 48), (9, 8, 7)).save(tmp_path / "sky.png")
+    scene.set_skybox(tmp_path / "sky.png")
+    made = scene.build(AssetStore(tmp_path / "assets"))
+    assert made.spec.environment.skybox == 0

@@ -168,7 +168,7 @@ def test_picture_is_mujocos(tmp_path: Path) -> None:
         ("package://arm_description/", "package://other/", "package_dirs"),
         ("package://arm_description/meshes/link.stl", "../../../../../../etc/passwd", "outside of its own folders"),
         ("package://arm_description/meshes/link.stl", "package://arm_description/../../x.stl", "package_dirs"),
-        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "only files and package"),
+        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "files are read, not addresses"),
         ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "the axis of joint turn"),
         ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "3 finite numbers must stand"),
         ('radius="0.1"', 'radius="-1"', "positive lengths"),
@@ -315,3 +315,26 @@ def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
         arm.poses({"lift": float("nan")})
     with pytest.raises(SceneBuildError, match="number"):
         arm.poses({"lift": "high"})  # type: ignore[dict-item]
+
+
+def test_a_file_that_a_package_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
+    """A typo; a reference that only xacro can expand."""
+    package = tmp_path / "mybot"
+    for folder in ("meshes", "urdf"):
+        (package / folder).mkdir(parents=True)
+    (package / "package.xml").write_text("<package><name>mybot</name></package>")
+    (package / "meshes" / "base.stl").write_bytes(b"x")
+    for reference, says in (
+        (
+            "package://mybot/meshes/bsae.stl",
+            "package mybot is there, and has no file .*bsae.stl; in .*meshes: base.stl$",
+        ),
+        ("package://mybot/mesh/base.stl", "package mybot is there, and has no file .*; there is no folder .*mesh$"),
+        ("../meshes/bsae.stl", "there is no file .*bsae.stl; in .*meshes: base.stl$"),
+        ("$(find mybot)/meshes/base.stl", "xacro must be expanded first"),
+        ("package://mybt/meshes/base.stl", "mybt; name the package's folder in package_dirs"),
+    ):
+        text = f'<robot name="r"><link name="a"><visual><geometry><mesh filename="{reference}"/></geometry></visual>'
+        (package / "urdf" / "r.urdf").write_text(f"{text}</link></robot>")
+        with pytest.raises(SceneBuildError, match=says):
+            SceneBuilder().add_urdf(package / "urdf" / "r.urdf")
