@@ -120,7 +120,9 @@ class References:
                 f"{self.path.name} refers to {reference}, outside of its own folders: name the folder in package_dirs"
             )
         if not found.is_file():
-            raise SceneBuildError(f"{self.path.name} refers to {reference}: there is no file {found}{_similar(found)}")
+            raise SceneBuildError(
+                f"{self.path.name} refers to {reference}: there is no file {found}{_similar(found, 0)}"
+            )
         return found
 
     def _in_package(self, reference: str, package: str, inside: str) -> Path:
@@ -162,15 +164,15 @@ class References:
         return tuple(up for up in self.path.parents if up != Path(up.anchor))[:_UP]
 
 
-def _similar(path: Path) -> str:
-    """For error texts: files that are called nearly so, else some of those in its folder."""
+def _similar(path: Path, others: int = _LISTED) -> str:
+    """For error texts: files that are called nearly so, else so many of the others in its folder."""
     folder = path.parent
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
     except OSError:
         return f"; there is no folder {folder}"
-    near = difflib.get_close_matches(path.name, names, n=3) or names[:_LISTED]
-    return f"; in {folder}: {', '.join(near)}" if near else f"; {folder} has no files"
+    near = difflib.get_close_matches(path.name, names, n=3) or names[:others]
+    return f"; in {folder}: {', '.join(near)}" if near else ""
 
 
 def _is_package(root: Path, name: str) -> bool:
