@@ -139,7 +139,7 @@ def test_a_session_that_was_killed_in_its_second_scene_goes_on_there(stage: Stag
     def newest_row() -> int:
         try:
             with Recording.open(stage.server.recording, warn=False) as recording:
-                return max(row.now_ns for row in recording.rows())
+                return max((row.now_ns for row in recording.rows()), default=0)
         except RuntimeError:  # of Rerun's: a message was half written when it looked
             return 0
 
