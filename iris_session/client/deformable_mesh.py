@@ -60,9 +60,8 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     elements, none = rows[places], np.empty((0, 5 - corners), np.int32)
     uv = None
     if ArrayName.UV in arrays:
-        uv = require(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(
-            np.float32
-        )  # not a view of the asset
+        # A copy: no view of the asset.
+        uv = require(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
     faces, edges = (none, elements) if corners == 2 else (elements, none)
     for array in (faces, edges, rows, uv):
         if array is not None:

@@ -120,9 +120,8 @@ class Receiving:
         elif isinstance(message, Event):
             if self.mirror.apply_event(message):
                 self.stream.scene_epoch = self.mirror.bodies_until
-                if (
-                    not self.mirror.synced
-                ):  # another scene: its bodies are asked for at once, however lately others were
+                if not self.mirror.synced:
+                    # Another scene: its bodies are asked for at once, however lately others were.
                     self._snapshot_at = min(self._snapshot_at, now_ns)
                 if isinstance(message.body, EStopChanged) and message.body.active:
                     self.stop.withdraw()
