@@ -80,7 +80,7 @@ class LoaderMachine:
         for address in list(loader.to_look()):
             loader.missing(address, rng.choice((0, 0, 7)))
         if rng.random() < 0.01:
-            loader.cut_off()
+            rng.choice((loader.cut_off, lambda: loader.broke_off(self._now_ns)))()
             self._asks.clear()
         asks = list(loader.requests(self._now_ns))
         self._asks += asks
@@ -99,17 +99,24 @@ class LoaderMachine:
             chunk = codec.decode_asset_chunk(data, 0)
             size = min(rng.choice((0, 5, 524_288)), max(0, chunk.total - chunk.offset))
             outcome = loader.chunk(chunk, size, self._now_ns)
-            self._asks = [ask for ask in self._asks if ask.request_id != chunk.request_id]
+            self._answered(chunk.request_id, fits=outcome is not False)
             if outcome is True:
                 self._unstored += size
                 if loader.whole(chunk.address):
                     loader.again(chunk.address) if rng.random() < 0.5 else loader.drop(chunk.address)
             return outcome is True
         outcome_ = loader.refused(refused, self._now_ns)
-        self._asks = [ask for ask in self._asks if ask.request_id != refused.request_id]
+        self._answered(refused.request_id, fits=True)
         if isinstance(outcome_, str) and outcome_:
             loader.missing(outcome_, 0)
         return outcome_ == ""
+
+    def _answered(self, number: int, *, fits: bool) -> None:
+        """An answer that fits its request says that those before it were lost."""
+        if number in {ask.request_id for ask in self._asks}:
+            self._asks = [
+                ask for ask in self._asks if ask.request_id > number or (ask.request_id < number and not fits)
+            ]
 
     def close(self) -> None:
         """Nothing was opened."""
