@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -15,7 +14,7 @@ import mujoco
 import numpy as np
 
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.runtime.errors import ConfigError
+from iris_session.runtime.errors import ConfigError, brief
 
 _Spec = TypeVar("_Spec", RobotSpec, ObjectSpec)
 #: What is expected of robots and objects that somebody gives, for error texts.
@@ -115,21 +114,16 @@ def check_objects(given: object) -> tuple[ObjectSpec, ...] | None:
 
 def _specs(what: str, given: object, kind: type[_Spec], expected: str) -> tuple[_Spec, ...]:
     if isinstance(given, str | bytes | Path | Mapping) or not isinstance(given, Iterable):
-        raise ConfigError(f"{what} is {_brief(given)}: {expected}")
+        raise ConfigError(f"{what} is {brief(given)}: {expected}")
     specs = tuple(given)
     for place, spec in enumerate(specs):
         if not isinstance(spec, kind):
-            raise ConfigError(f"{what}[{place}] is {_brief(spec)}: {expected}")
+            raise ConfigError(f"{what}[{place}] is {brief(spec)}: {expected}")
         try:
             msgspec.msgpack.decode(msgspec.msgpack.encode(spec), type=kind)
         except (TypeError, ValueError) as error:  # as the journal could not hold it
             raise ConfigError(f"{what}[{place}] is a {kind.__name__} with a wrong field: {error}") from error
     return specs
-
-
-def _brief(given: object) -> str:
-    """On one line, however large it is."""
-    return " ".join(reprlib.repr(given).split())
 
 
 def check_arguments(model: object, data: object, config: object) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import reprlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iris_session.protocol.common import Pose
-from iris_session.runtime.errors import PublishError
+from iris_session.runtime.errors import PublishError, brief
 from iris_session.scene import SceneBuildError
 from iris_session.scene.articulation import Joint
 from iris_session.scene.composed import ComposedScene
@@ -198,7 +197,7 @@ class SceneDraft:
 
 def _names(given: Sequence[str]) -> tuple[str, ...]:
     if isinstance(given, str | bytes) or not isinstance(given, Iterable):
-        raise PublishError(f"names is {_brief(given)}: a list of the names of what moves is expected")
+        raise PublishError(f"names is {brief(given)}: a list of the names of what moves is expected")
     names = tuple(given)
     for name in names:
         _check_name(name)
@@ -207,7 +206,7 @@ def _names(given: Sequence[str]) -> tuple[str, ...]:
 
 def _check_name(name: object) -> None:
     if not isinstance(name, str):
-        raise PublishError(f"{_brief(name)} is no name: that of something that moves, as text, is expected")
+        raise PublishError(f"{brief(name)} is no name: that of something that moves, as text, is expected")
 
 
 def _position(given: Sequence[float], name: str) -> tuple[float, float, float]:
@@ -230,9 +229,9 @@ def _numbers(given: Sequence[float], n: int, what: str) -> list[float]:
     try:
         numbers = [_number(number) for number in given]
     except (TypeError, ValueError, OverflowError) as error:
-        raise PublishError(f"{what} is {_brief(given)}: {n} numbers are expected") from error
+        raise PublishError(f"{what} is {brief(given)}: {n} numbers are expected") from error
     if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise PublishError(f"{what} is {_brief(given)}: {n} finite numbers are expected")
+        raise PublishError(f"{what} is {brief(given)}: {n} finite numbers are expected")
     return numbers
 
 
@@ -258,11 +257,6 @@ def _finite(given: ArrayLike, shape: tuple[int, ...], what: str) -> NDArray[np.f
     if not np.isfinite(array).all():
         raise PublishError(f"{what} hold numbers that are not finite")
     return array
-
-
-def _brief(given: object) -> str:
-    """On one line, however large it is."""
-    return " ".join(reprlib.repr(given).split())
 
 
 def _nearest(name: object, known: Iterable[str], what: str) -> str:

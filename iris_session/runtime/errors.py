@@ -10,6 +10,8 @@ SessionError
 
 from __future__ import annotations
 
+import reprlib
+
 
 class SessionError(Exception):
     """Base of all errors that a session raises to its owner."""
@@ -33,3 +35,8 @@ class OwnershipError(SessionError):
 
 class PublishError(SessionError):
     """What a publisher was given cannot be shown; nothing has changed."""
+
+
+def brief(given: object) -> str:
+    """What somebody gave, for an error text: on one line, however large it is."""
+    return " ".join(reprlib.repr(given).split())

@@ -89,7 +89,8 @@ def _of_ours(error: BaseException) -> str:
     place = Path(last.filename)
     if _ROOM not in place.parents:
         return ""
-    return f" (if other programs open it, please report: {type(error).__name__}: {error}, {place.name}:{last.lineno})"
+    said = " ".join(str(error).split())[:200]  # one line
+    return f" (if other programs open it, please report: {type(error).__name__}: {said}, {place.name}:{last.lineno})"
 
 
 def ending(path: Path) -> str:
