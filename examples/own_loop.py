@@ -11,7 +11,7 @@ import time
 import mujoco
 
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 
 
 def main(seconds: float) -> None:

@@ -13,7 +13,7 @@ import time
 import mujoco
 
 from iris_session import Session
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 
 
 def main(seconds: float) -> None:

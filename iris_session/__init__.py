@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from iris_session.client import Client, ClientError, FoundSession, find_sessions
     from iris_session.client.deformables import Deformables
     from iris_session.client.fetched_scene import FetchedScene, fetch_scene
-    from iris_session.runtime.config import SessionConfig
-    from iris_session.runtime.errors import (
+    from iris_session.scene.compose import SceneBuilder
+    from iris_session.scene.errors import SceneBuildError
+    from iris_session.session.config import SessionConfig
+    from iris_session.session.errors import (
         ConfigError,
         OwnershipError,
         PublishError,
@@ -32,23 +34,21 @@ if TYPE_CHECKING:
         SessionError,
         StartError,
     )
-    from iris_session.runtime.scene_publisher import ScenePublisher
-    from iris_session.runtime.session import Session
-    from iris_session.scene.compose import SceneBuilder
-    from iris_session.scene.errors import SceneBuildError
+    from iris_session.session.scene_publisher import ScenePublisher
+    from iris_session.session.session import Session
 
 _HOME: Final = {
-    "Session": "iris_session.runtime.session",
-    "SessionConfig": "iris_session.runtime.config",
-    "SessionError": "iris_session.runtime.errors",
-    "ConfigError": "iris_session.runtime.errors",
-    "StartError": "iris_session.runtime.errors",
-    "ResumeError": "iris_session.runtime.errors",
-    "OwnershipError": "iris_session.runtime.errors",
+    "Session": "iris_session.session.session",
+    "SessionConfig": "iris_session.session.config",
+    "SessionError": "iris_session.session.errors",
+    "ConfigError": "iris_session.session.errors",
+    "StartError": "iris_session.session.errors",
+    "ResumeError": "iris_session.session.errors",
+    "OwnershipError": "iris_session.session.errors",
     "SceneBuilder": "iris_session.scene.compose",
     "SceneBuildError": "iris_session.scene.errors",
-    "ScenePublisher": "iris_session.runtime.scene_publisher",
-    "PublishError": "iris_session.runtime.errors",
+    "ScenePublisher": "iris_session.session.scene_publisher",
+    "PublishError": "iris_session.session.errors",
     "Client": "iris_session.client",
     "ClientError": "iris_session.client",
     "FoundSession": "iris_session.client",

@@ -36,7 +36,8 @@ _left_behind: list[str] = []
 
 #: Rooms whose tests have processes, sockets or threads, and so a machine that may be taken away for a second.
 LIVE = {
-    "bench", "cli", "client", "doctor", "e2e", "emulator", "recording", "runtime", "system", "tools", "transport",
+    "alignment", "assets", "bench", "cli", "client", "demo", "doctor", "e2e", "emulator", "front", "link", "netsim",
+    "recording", "security", "session", "system", "tools",
 }  # fmt: skip
 
 

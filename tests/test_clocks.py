@@ -19,14 +19,14 @@ WALL = {
 }
 #: Where it may be read, and for what.
 ALLOWED = {
-    "iris_session/keys/allow_list.py": "when a key was added or last seen, for people",
-    "iris_session/keys/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
-    "iris_session/transport/pairing_desk.py": "whether a join code is open, as join_codes.py says",
+    "iris_session/security/allow_list.py": "when a key was added or last seen, for people",
+    "iris_session/security/join_codes.py": "when a join code ends: shared by processes, outlives a reboot",
+    "iris_session/front/pairing.py": "whether a join code is open, as join_codes.py says",
     "iris_session/cli/pair.py": "how long a join code is shown, as join_codes.py says",
-    "iris_session/client/asset_cache.py": "which files were used longest ago, as the file system stamps them",
-    "iris_session/scene/store.py": "which files were used longest ago, as the file system stamps them",
-    "iris_session/runtime/config.py": "name of a default folder",
-    "iris_session/runtime/processes.py": "when a recording was made, for people",
+    "iris_session/assets/cache.py": "which files were used longest ago, as the file system stamps them",
+    "iris_session/assets/store.py": "which files were used longest ago, as the file system stamps them",
+    "iris_session/session/config.py": "name of a default folder",
+    "iris_session/session/processes.py": "when a recording was made, for people",
 }
 
 

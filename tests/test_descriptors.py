@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from iris_session.cli.live import LiveView
-from iris_session.emulator.impairment_process import ImpairmentProcess
 from iris_session.emulator.orders import Orders
+from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import Event, MarkerAdded
 from iris_session.recording import RecorderProcess
 

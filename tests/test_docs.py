@@ -20,9 +20,9 @@ import pytest
 
 from iris_session import SceneBuilder, ScenePublisher, Session, SessionConfig
 from iris_session.cli.main import build_parser
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.run import DemoResult
+from iris_session.demo.scenes import scene_path
 from iris_session.protocol import names
-from iris_session.runtime.demo import DemoResult
 from tests.models import BESIDE
 
 ROOT = Path(__file__).parents[1]

@@ -21,7 +21,7 @@ from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import AssetRefusal
-from tests.transport.harness import scene
+from tests.front.harness import scene
 
 #: What somebody honest fetches all the while.
 PICTURE: Final = bytes(range(256)) * 1000

@@ -16,13 +16,8 @@ from fuzz_inputs import Corpus, encoded, encoded_json
 from iris_session.client.address import Address
 from iris_session.client.discovery import plausible
 from iris_session.client.errors import ClientError
-from iris_session.keys import KeysError
-from iris_session.keys.allow_list import AllowedKey, AllowList
-from iris_session.keys.curve import load_public, load_secret
-from iris_session.keys.files import PrivateFolder
-from iris_session.keys.join_codes import JoinCode, JoinCodes
-from iris_session.keys.known_servers import KnownServer, KnownServers
-from iris_session.keys.session_notes import SessionNote, SessionNotes
+from iris_session.link import messages as link
+from iris_session.link.config import Ports, SceneInfo
 from iris_session.protocol import codec, entries
 from iris_session.protocol.client_messages import ClientEnvelope
 from iris_session.protocol.decoding import decoder
@@ -31,10 +26,15 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
 from iris_session.recording import journal, messages
+from iris_session.security import KeysError
+from iris_session.security.allow_list import AllowedKey, AllowList
+from iris_session.security.curve import load_public, load_secret
+from iris_session.security.files import PrivateFolder
+from iris_session.security.join_codes import JoinCode, JoinCodes
+from iris_session.security.known_servers import KnownServer, KnownServers
+from iris_session.security.session_notes import SessionNote, SessionNotes
 from iris_session.streams.errors import StreamError
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
-from iris_session.transport import link_messages as link
-from iris_session.transport.config import Ports, SceneInfo
 
 Errors = tuple[type[Exception], ...]
 Make = Callable[[Random], bytes]

@@ -25,6 +25,7 @@ from iris_session.client.identity import Identity
 from iris_session.client.limits import MAX_INBOX
 from iris_session.client.state_stream import StateStream
 from iris_session.client.status import Phase
+from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, envelope
 from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server
 from iris_session.protocol.common import IDENTITY
@@ -40,7 +41,6 @@ from iris_session.protocol.server_messages import (
     StateHeader,
     Welcome,
 )
-from iris_session.transport import FrontLimits
 
 ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # the harness and the random entries are those of the tests
@@ -154,7 +154,7 @@ class FrontControl:
     SETTINGS: Final[Mapping[str, Any]] = {}
 
     def __init__(self, rng: Random) -> None:
-        from tests.transport.harness import FrontSession
+        from tests.front.harness import FrontSession
 
         self._rng = rng
         limits = FrontLimits(hellos_per_second=1e4, hello_burst=10_000, excess_per_s=1e6, excess_burst=10**6)
@@ -297,10 +297,10 @@ class FrontTcp(FrontControl):
 
 
 class Core:
-    """Authority, control and physics under random entries that the schema takes: `tests/runtime/fuzz_core.py`."""
+    """Authority, control and physics under random entries that the schema takes: `tests/session/fuzz_core.py`."""
 
     def __init__(self, rng: Random) -> None:
-        from tests.runtime.fuzz_core import Fuzz
+        from tests.session.fuzz_core import Fuzz
 
         self._fuzz = Fuzz(rng.getrandbits(32))
         self._given = 0

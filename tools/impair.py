@@ -20,8 +20,8 @@ import time
 from contextlib import ExitStack
 from typing import Final
 
-from iris_session.emulator import impairment_process
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.netsim import process as impairment_process
+from iris_session.netsim.process import ImpairmentProcess
 
 MESSAGE: Final = 3_700
 HZ: Final = 60.0

@@ -22,8 +22,8 @@ from statistics import quantiles
 from typing import Final
 
 from iris_session import Client, Session, SessionConfig
-from iris_session.emulator.impairment_process import ImpairmentProcess
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
+from iris_session.netsim.process import ImpairmentProcess
 
 LINK: Final = "127.0.0.2"
 HZ: Final = 30

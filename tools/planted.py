@@ -34,7 +34,7 @@ SLOW_LOOP: Final = """
 import time
 import mujoco
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 config = SessionConfig(control_port=7741, state_port=7742, beacon_port=0, record=False)
 with Session(scene_path("handover"), config=config) as session:
     mujoco.set_mjcb_passive(lambda model, data: time.sleep(0.003))  # of 2 ms that a tick has

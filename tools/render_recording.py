@@ -21,7 +21,7 @@ from iris_session.protocol.entries import decode_entries
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import Handover, PresenceItem
 from iris_session.recording import CLOSED, Recording
-from iris_session.runtime.verification import ReplayCore
+from iris_session.session.verification import ReplayCore
 
 #: The detector reports a handover when the receiver has held the object alone for this long [s].
 REPORTED_AFTER_S = 0.1

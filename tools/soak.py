@@ -29,7 +29,7 @@ from typing import Any
 from soak_run import Soak
 
 from iris_session.client import ClientError
-from iris_session.emulator.weather import load_profile
+from iris_session.netsim.profiles import load_profile
 
 
 def soak(options: argparse.Namespace, folder: Path) -> dict[str, Any]:

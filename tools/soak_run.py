@@ -23,10 +23,10 @@ from soak_checks import check_events, check_memory
 from soak_worker import Job
 
 from iris_session.client import Client
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.demo.scenes import n_arms_scene
+from iris_session.demo.scenes.generators import arm_names
 from iris_session.emulator.specs import OBSERVER, HeadsetSpec
-from iris_session.physics.scenes import n_arms_scene
-from iris_session.physics.scenes.generators import arm_names
+from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.client_messages import Acquire, Release
 from iris_session.protocol.common import Target
 from iris_session.protocol.server_messages import Event, MarkerAdded
@@ -250,7 +250,7 @@ class Soak:
                 worker.process, worker.undo = None, (now, "spawn")
         for process in (psutil.Process(self.server.pid), *psutil.Process(self.server.pid).children()):
             line = " ".join(process.cmdline())
-            name = "front" if "transport.front" in line else "recorder" if "recording.process" in line else "authority"
+            name = "front" if "front.main" in line else "recorder" if "recording.process" in line else "authority"
             if name == "authority" and process.pid != self.server.pid:
                 continue  # the live view and other helpers
             self.result.rss.setdefault(name, []).append((now, process.memory_info().rss / 2**20))

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.contract import BenchError
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.netsim.process import ImpairmentProcess
+from iris_session.netsim.session_link import link_address, links_before
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import StateHeader
-from iris_session.runtime.config import SessionConfig
-from iris_session.runtime.links import link_address, links_before
-from iris_session.runtime.session import Session
+from iris_session.session.config import SessionConfig
+from iris_session.session.session import Session
 from iris_session.system import children
 
 #: The bars are stated for at most four clients in one process.

@@ -21,7 +21,7 @@ import zmq
 from numpy.typing import NDArray
 
 from iris_session.bench.contract import BenchError
-from iris_session.runtime.scheduling import quiet_collector, tick_priority
+from iris_session.session.scheduling import quiet_collector, tick_priority
 from iris_session.system import children
 
 PERIOD_NS: Final = 2_000_000

@@ -19,9 +19,9 @@ from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloth_motion import HZ, ClothMotion, cloth_motion
 from iris_session.bench.contract import NO_BARS, BenchError, BenchReport, bar
 from iris_session.bench.deformable_clients import DeformableJob
-from iris_session.physics.scenes import free_bodies_scene
+from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
-from iris_session.runtime.session import Session
+from iris_session.session.session import Session
 from iris_session.streams.deformable import COARSER, DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
 

@@ -11,8 +11,8 @@ from iris_session.bench.arena import Measured, grouped, linked, measure
 from iris_session.bench.bare import bare
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import NO_BARS, BenchReport, bar
-from iris_session.physics.scenes import n_arms_scene
-from iris_session.physics.scenes.generators import arm_names
+from iris_session.demo.scenes import n_arms_scene
+from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device
 
 STATE_BAR_MS = 3.0

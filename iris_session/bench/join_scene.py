@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from iris_session.physics.scenes import free_bodies_scene
+from iris_session.demo.scenes import free_bodies_scene
 
 MESHES: Final = 60
 TEXTURES: Final = 60
@@ -99,10 +99,10 @@ def _stone(
 
 def make_ready(model_path: str, store_path: str) -> Ready:
     """What a server does at its start with a compiled model."""
+    from iris_session.assets.store import AssetStore
     from iris_session.physics.load import load_model
     from iris_session.protocol.scene import asset_addresses, encode_scene
     from iris_session.scene.mujoco_scene import parse_mujoco
-    from iris_session.scene.store import AssetStore
 
     model = load_model(model_path)
     store = AssetStore(Path(store_path))

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from iris_session.bench.arena import CLIENTS_PER_PROCESS, Action, Arena, Log, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import NO_BARS, BenchReport, bar
-from iris_session.physics.scenes import free_bodies_scene
-from iris_session.runtime.links import link_address
+from iris_session.demo.scenes import free_bodies_scene
+from iris_session.netsim.session_link import link_address
 
 ROUNDS: Final = 3
 STALL_S: Final = 3.0

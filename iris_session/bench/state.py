@@ -11,7 +11,7 @@ from iris_session.bench.arena import Measured, grouped, linked, measure
 from iris_session.bench.bare import bare
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.contract import NO_BARS, BenchReport, bar
-from iris_session.physics.scenes import free_bodies_scene
+from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar is stated under input: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
 SENDERS = 8

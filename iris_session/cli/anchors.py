@@ -188,8 +188,8 @@ def run_print(arguments: argparse.Namespace) -> int:
 
 def run_example(arguments: argparse.Namespace) -> int:
     """Prints what the scene has, in the form that `serve --anchors` reads."""
-    from iris_session.runtime.anchors_file import dump_anchors
-    from iris_session.runtime.config import SessionConfig
+    from iris_session.session.anchors_file import dump_anchors
+    from iris_session.session.config import SessionConfig
 
     config = SessionConfig()
     anchors, sizes = config.anchors, config.sheet_sizes()

@@ -16,7 +16,7 @@ from iris_session.cli.live import printable
 if TYPE_CHECKING:
     from anchors.constellation import Constellation
     from anchors.pose import PoseTuple
-    from iris_session.cli.anchors_resolve import Compared, Relative, Result
+    from iris_session.alignment.resolve import Compared, Relative, Result
     from iris_session.recording import Looks, Person, Recording
 
 #: Lines about alignments and outliers per tracking frame; `--json` has all.
@@ -49,10 +49,10 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 def run_solve(arguments: argparse.Namespace) -> int:
     """Exit status 1 when `--out` was asked for and nothing can be written."""
-    from iris_session.cli.anchors_around import Anchors
-    from iris_session.cli.anchors_resolve import constellation
+    from iris_session.alignment.resolve import constellation
+    from iris_session.alignment.smoother import Anchors
     from iris_session.recording import Recording, read_looks
-    from iris_session.runtime.anchors_file import load_anchors
+    from iris_session.session.anchors_file import load_anchors
 
     given = None if arguments.anchors is None else load_anchors(arguments.anchors)
     with Recording.open(arguments.recording, warn=False) as recording:
@@ -107,7 +107,7 @@ def _with(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
 
 
 def _resolved(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Result]:
-    from iris_session.cli.anchors_resolve import resolve
+    from iris_session.alignment.resolve import resolve
 
     by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.looks}
     total = sum(map(len, by_frame.values()))

@@ -64,7 +64,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Runs one benchmark and prints its report."""
 
-    from iris_session.emulator.weather import load_profile
+    from iris_session.netsim.profiles import load_profile
 
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)

@@ -15,7 +15,7 @@ from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 if TYPE_CHECKING:
     import mujoco
 
-    from iris_session.runtime.scenes import Scene
+    from iris_session.demo.named_scenes import Scene
 
 
 #: Whatever is there has taken a connection by then.
@@ -34,14 +34,14 @@ def expected_errors() -> tuple[type[Exception], ...]:
     """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
     from iris_session.client import ClientError
     from iris_session.control import ControlError
-    from iris_session.emulator.impairment_process import ImpairmentError
-    from iris_session.emulator.weather import ProfileError
-    from iris_session.keys import KeysError
+    from iris_session.link import FrontError
+    from iris_session.netsim.process import ImpairmentError
+    from iris_session.netsim.profiles import ProfileError
     from iris_session.physics import PhysicsError
     from iris_session.recording import RecordingError
-    from iris_session.runtime.errors import SessionError
     from iris_session.scene import SceneBuildError
-    from iris_session.transport import FrontError
+    from iris_session.security import KeysError
+    from iris_session.session.errors import SessionError
 
     return (
         SessionError,
@@ -125,7 +125,7 @@ def expect_session(arguments: argparse.Namespace) -> None:
 
 def own_sessions() -> str:
     """Where the encrypted sessions of this user are, for who has typed no address."""
-    from iris_session.keys import KeyHome, KeysError
+    from iris_session.security import KeyHome, KeysError
 
     try:
         notes = KeyHome().sessions.read()
@@ -184,8 +184,8 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
 
 def open_scene(scene: str) -> Scene:
     """The scene of that name, or in that file; a file or folder in the way of a name is no scene."""
+    from iris_session.demo.named_scenes import Scene, scene_by_name
     from iris_session.physics import load_model
-    from iris_session.runtime.scenes import Scene, scene_by_name
 
     path = Path(scene)
     if path.suffix or path.is_file():
@@ -195,7 +195,7 @@ def open_scene(scene: str) -> Scene:
 
 def scene_names() -> str:
     """The scenes that can be named, a line each."""
-    from iris_session.runtime.scene_names import SCENE_NAMES
+    from iris_session.demo.scene_names import SCENE_NAMES
 
     width = max(map(len, SCENE_NAMES))
     return "\n".join(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items())

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from iris_session.cli.common import add_json, add_session_options, positive_seconds, print_json
 
 if TYPE_CHECKING:
-    from iris_session.runtime.demo import DemoResult
-    from iris_session.runtime.session import Session
+    from iris_session.demo.run import DemoResult
+    from iris_session.session.session import Session
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -73,9 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from iris_session.cli.live import LiveView
     from iris_session.cli.serve import session_config
-    from iris_session.emulator.weather import load_profile
-    from iris_session.runtime.demo import run_demo
-    from iris_session.runtime.plays import make_play
+    from iris_session.demo.plays import make_play
+    from iris_session.demo.run import run_demo
+    from iris_session.netsim.profiles import load_profile
 
     profile = arguments.profile if arguments.latency is None else f"{arguments.latency:f}ms"
     if profile:

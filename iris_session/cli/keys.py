@@ -54,7 +54,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 
 def run_list(arguments: argparse.Namespace) -> int:
-    from iris_session.keys import KeyHome
+    from iris_session.security import KeyHome
 
     keys = KeyHome().clients.read()
     if arguments.json:
@@ -81,7 +81,7 @@ def run_list(arguments: argparse.Namespace) -> int:
 
 
 def run_allow(arguments: argparse.Namespace) -> int:
-    from iris_session.keys import KeyHome, load_public
+    from iris_session.security import KeyHome, load_public
 
     home = KeyHome()
     given = arguments.key or home.identity().public
@@ -96,7 +96,7 @@ def _names_a_file(text: str) -> bool:
 
 
 def run_revoke(arguments: argparse.Namespace) -> int:
-    from iris_session.keys import KeyHome
+    from iris_session.security import KeyHome
 
     clients = KeyHome().clients
     entry = clients.revoke(arguments.name)
@@ -108,7 +108,7 @@ def run_revoke(arguments: argparse.Namespace) -> int:
 
 
 def run_show(arguments: argparse.Namespace) -> int:
-    from iris_session.keys import KeyHome
+    from iris_session.security import KeyHome
 
     home = KeyHome()
     server, own = home.server_key(), home.identity()
@@ -128,7 +128,7 @@ def run_show(arguments: argparse.Namespace) -> int:
 
 
 def run_forget(arguments: argparse.Namespace) -> int:
-    from iris_session.keys import KeyHome
+    from iris_session.security import KeyHome
 
     servers = KeyHome().servers
     gone = servers.forget(arguments.address)

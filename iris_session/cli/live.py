@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from iris_session.protocol.server_messages import Event
-    from iris_session.runtime.owner import Owner
+    from iris_session.session.owner import Owner
 
 #: Refresh of the display [s].
 REFRESH_S: Final = 0.5

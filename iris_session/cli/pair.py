@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import CommandError, add_json, print_json
-from iris_session.keys.allow_list import DEFAULT_ROLES
-from iris_session.keys.files import KeysBusyError
 from iris_session.protocol.names import Role
+from iris_session.security.allow_list import DEFAULT_ROLES
+from iris_session.security.files import KeysBusyError
 
 if TYPE_CHECKING:
-    from iris_session.keys import JoinCode, KeyHome, KeyPair, SessionNote
+    from iris_session.security import JoinCode, KeyHome, KeyPair, SessionNote
 
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
@@ -72,7 +72,7 @@ def roles_of(given: list[str] | None) -> tuple[str, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Exit status 1 when the code was not used."""
     from iris_session.client.address import pairing_uri
-    from iris_session.keys import KeyHome, load_secret
+    from iris_session.security import KeyHome, load_secret
 
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.server_key()

@@ -91,7 +91,7 @@ def file_of(scene: str) -> Path | None:
 
 def _is_name(scene: str) -> bool:
     """Whether a scene is called so: a folder of that name is not in its way."""
-    from iris_session.runtime.scene_names import SCENE_NAMES
+    from iris_session.demo.scene_names import SCENE_NAMES
 
     return scene.rstrip("0123456789") in SCENE_NAMES
 

@@ -24,9 +24,9 @@ from iris_session.cli.scene_files import add_file_options, builder_of, check_fil
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
-    from iris_session.runtime.config import SessionConfig
-    from iris_session.runtime.scene_publisher import ScenePublisher
-    from iris_session.runtime.session import Session
+    from iris_session.session.config import SessionConfig
+    from iris_session.session.scene_publisher import ScenePublisher
+    from iris_session.session.session import Session
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -82,7 +82,7 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     import msgspec
 
     from iris_session.authority import AuthorityConfig
-    from iris_session.runtime.config import SessionConfig
+    from iris_session.session.config import SessionConfig
 
     defaults = SessionConfig()
     assigned = assignments(getattr(arguments, "assign", []))
@@ -135,7 +135,7 @@ def session_name(path: Path) -> str:
 def new_session(arguments: argparse.Namespace) -> Session:
     """A session that begins."""
     from iris_session.physics import load_robots_toml
-    from iris_session.runtime.session import Session
+    from iris_session.session.session import Session
 
     if arguments.scene is None:
         raise CommandError("which scene? give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
@@ -149,7 +149,7 @@ def new_session(arguments: argparse.Namespace) -> Session:
 
 def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
     """A session in which everybody sees a file, and nothing moves."""
-    from iris_session.runtime.scene_publisher import ScenePublisher
+    from iris_session.session.scene_publisher import ScenePublisher
 
     drives = ("robots", "assign", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
@@ -161,7 +161,7 @@ def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher
 
 def resumed_session(arguments: argparse.Namespace) -> Session:
     """A session that goes on from its recording."""
-    from iris_session.runtime.session import Session
+    from iris_session.session.session import Session
 
     had = ("robots", "assign", "assignment", "mode", "record", "no_record")
     given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
@@ -175,7 +175,7 @@ def resumed_session(arguments: argparse.Namespace) -> Session:
 
 def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
     """The anchors of a file, where one was given."""
-    from iris_session.runtime.anchors_file import load_anchors
+    from iris_session.session.anchors_file import load_anchors
 
     if path is None:
         return config

@@ -25,7 +25,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Verifies each file; the first problem of each is named with its step and entry."""
     from iris_session.recording import Problem, RecordingError, VerifyReport
-    from iris_session.runtime.verification import verify_recording
+    from iris_session.session.verification import verify_recording
 
     reports = []
     progress = sys.stderr.isatty()

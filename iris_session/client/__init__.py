@@ -4,7 +4,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
-from iris_session.client.asset_cache import AssetCache
+from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.discovery import FoundSession, find_sessions
@@ -23,10 +23,10 @@ from iris_session.client.errors import (
 )
 from iris_session.client.identity import Identity
 from iris_session.client.interpolation import PoseBuffer, Shown
-from iris_session.client.session_state import SessionMirror
 from iris_session.client.sockets import CurveKeys
 from iris_session.client.state_stream import SceneState
 from iris_session.client.waiting import ClientGroup, poll_all, wait_any
+from iris_session.protocol.session_mirror import SessionMirror
 
 __all__ = [
     "AssetCache",

@@ -11,8 +11,8 @@ from typing import Final
 from urllib.parse import parse_qs, quote, urlsplit
 
 from iris_session.client.errors import ClientError
-from iris_session.keys import KeysError, raw_key
 from iris_session.protocol.pairing import KEY_BYTES, normal_code
+from iris_session.security import KeysError, raw_key
 
 DEFAULT_CONTROL_PORT: Final = 7721
 SCHEME: Final = "iris"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from iris_session.client.asset_cache import AssetCache
+from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_workers import Decode
 from iris_session.client.errors import AssetError
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
-from iris_session.client.asset_cache import AssetCache, Part
+from iris_session.assets.cache import AssetCache, Part
 from iris_session.client.errors import AssetError
 from iris_session.system.priority import give_way
 

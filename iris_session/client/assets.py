@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from iris_session.client.asset_cache import AssetCache
+from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.asset_loading import AssetLoader, Failed
 from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored

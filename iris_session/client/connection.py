@@ -31,7 +31,6 @@ from iris_session.client.limits import (
 )
 from iris_session.client.outgoing import Outgoing, PendingStop
 from iris_session.client.receiving import Receiving, Told
-from iris_session.client.session_state import SessionMirror
 from iris_session.client.state_stream import StateStream
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.client.values import checked_bytes
@@ -55,6 +54,7 @@ from iris_session.protocol.server_messages import (
     Refused,
     Welcome,
 )
+from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 

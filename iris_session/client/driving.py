@@ -17,12 +17,12 @@ from iris_session.client.media import Media
 from iris_session.client.receiving import Told
 from iris_session.client.reporting import ArrivalMeter
 from iris_session.client.scene_view import SceneView
-from iris_session.client.session_state import Missed
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
 from iris_session.client.waiting import milliseconds
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, Feedback, Reply
+from iris_session.protocol.session_mirror import Missed
 
 DEFAULT_TIMEOUT_S = 5.0
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from iris_session.client.address import Address
 from iris_session.client.errors import TrustError
-from iris_session.keys import KeyHome, KeysError, KnownServer, fingerprint, raw_key
+from iris_session.security import KeyHome, KeysError, KnownServer, fingerprint, raw_key
 
 
 class Trust:

@@ -20,9 +20,9 @@ from iris_session.client.errors import NotConnectedError, SessionNameError, Trus
 from iris_session.client.known_servers import Trust
 from iris_session.client.pairing import key_name, pair_key
 from iris_session.client.sockets import CurveKeys
-from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
+from iris_session.security import KeyHome, KeysError
 
 INTRODUCTION_S: Final = 2.5
 #: On this machine an answer takes a turn of the front's loop.

@@ -12,7 +12,6 @@ import zmq
 
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, TrustError
-from iris_session.keys import KeyPair, raw_key
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import envelope
 from iris_session.protocol.codec import decode_server, encode_client
@@ -20,6 +19,7 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
 from iris_session.protocol.server_messages import ProtocolFault, Refused
+from iris_session.security import KeyPair, raw_key
 
 ANSWER_S: Final = 5.0
 #: Where many pair at once it says so, where its disk is slow it says nothing for a while: the same is asked again, for

@@ -15,7 +15,6 @@ from iris_session.client.errors import ClientError, RefusedError, VersionError
 from iris_session.client.identity import Identity
 from iris_session.client.limits import MAX_INBOX, NOT_TAKEN, TRANSIENT, end_for_good, heartbeat_period
 from iris_session.client.outgoing import PendingStop
-from iris_session.client.session_state import Missed, SessionMirror
 from iris_session.client.state_stream import StateStream, poses_from_bytes
 from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
@@ -35,6 +34,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
+from iris_session.protocol.session_mirror import Missed, SessionMirror
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 #: What is handed to the application, in this order. Replies: denials that nobody waits for.

@@ -17,9 +17,9 @@ import zmq
 
 from iris_session.client.asset_context import asset_context
 from iris_session.client.errors import IdentityError
-from iris_session.keys import KeysError, load_public, load_secret
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
+from iris_session.security import KeysError, load_public, load_secret
 
 STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.

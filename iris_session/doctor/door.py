@@ -14,11 +14,11 @@ from iris_session.client.errors import NotConnectedError, RequestTimeoutError, S
 from iris_session.client.state_stream import SceneState
 from iris_session.doctor import reach
 from iris_session.doctor.findings import Finding, failed, ok, warning
-from iris_session.keys import KeyHome, KeysError, fingerprint, raw_key
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.names import DenialReason, RefusalCode
 from iris_session.protocol.pairing import normal_code
 from iris_session.protocol.status import StatusReport, quantiles
+from iris_session.security import KeyHome, KeysError, fingerprint, raw_key
 
 JOIN_S: Final = 4.0
 STATE_S: Final = 3.0

@@ -17,9 +17,9 @@ from iris_session.client.meeting import is_loopback
 from iris_session.doctor import condition, door, reach
 from iris_session.doctor.findings import OK, Findings, failed, ok
 from iris_session.doctor.machine import machine
-from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport
+from iris_session.security import KeyHome, KeysError
 
 LOCAL: Final = "127.0.0.1:7721"
 DOOR: Final = ("server_key", "key", "role", "join")

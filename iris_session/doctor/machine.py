@@ -12,8 +12,8 @@ import psutil
 
 from iris_session.doctor.condition import FULL_DISK, LOW_DISK
 from iris_session.doctor.findings import Finding, failed, ok, warning
-from iris_session.keys import KeyHome, KeysError
 from iris_session.protocol.discovery import DISCOVERY_PORT
+from iris_session.security import KeyHome, KeysError
 
 CONTROL_PORT: Final = 7721
 #: TCP ports of a session, from the control port.
@@ -29,7 +29,7 @@ def machine(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
 
 def scheduling() -> Finding:
     """Whether the tick loop may run before other work."""
-    from iris_session.runtime.scheduling import tick_priority
+    from iris_session.session.scheduling import tick_priority
 
     with tick_priority() as reached:
         pass
@@ -120,7 +120,7 @@ def ports(control: int) -> Finding:
         f"{', '.join(f'{port} ({wanted[port]})' for port, one in sorted(taken.items()) if one == who)}: {who}"
         for who in dict.fromkeys(taken[port] for port in sorted(taken))
     )
-    if all("iris_session.transport" in who for who in taken.values()):
+    if all("iris_session.front" in who for who in taken.values()):
         return ok("ports", f"a session has {text}; another one here needs --port-base")
     advice = "end that program, or start the session with --port-base"
     return warning("ports", f"in use: {text}", "another program has ports of a session", advice)

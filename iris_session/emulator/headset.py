@@ -30,8 +30,8 @@ from anchors.pose import (
     quat_normalize,
     quat_rotate,
 )
-from iris_session.emulator.link import LinkModel
 from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
+from iris_session.netsim.latency import LinkModel
 
 #: Where the sheet lies in the demo scene: on the table in front of the people, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))

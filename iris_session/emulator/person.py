@@ -25,9 +25,9 @@ from iris_session.emulator.equipment import behaviour_of, curve_of
 from iris_session.emulator.gaze import Gaze
 from iris_session.emulator.headset import Headset
 from iris_session.emulator.judge import judge
-from iris_session.emulator.link import DelayLine
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from iris_session.emulator.viewpoints import between
+from iris_session.netsim.latency import DelayLine
 from iris_session.protocol.client_messages import Acquire, Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, DenialReason, Device, Role

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import compose, inverse
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
 from iris_session.protocol.scene import (
     Body,
@@ -36,7 +37,6 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.extent import box_extent
 from iris_session.scene.meshes import MeshArrays
 from iris_session.scene.parts import MAX_TRIANGLES, Item, Look, Matrix, Picture, rigid_and_rest
-from iris_session.scene.store import AssetStore
 from iris_session.scene.surfaces import scaled
 from iris_session.scene.totals import with_totals
 from iris_session.streams.deformable_topology import DeformableTopology

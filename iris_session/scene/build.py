@@ -19,13 +19,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Vec3
 from iris_session.protocol.scene_looks import MeshLevel, TextureLevel
 from iris_session.protocol.scene_names import AssetEncoding, TextureKind
 from iris_session.scene.images import Pixels, encode_image, halved
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 from iris_session.scene.simplify import simplified
-from iris_session.scene.store import AssetStore
 
 #: Raised whenever the same content gives other assets.
 ENCODER_VERSION: Final = 4

@@ -12,6 +12,7 @@ from typing import Any, Final, Unpack
 
 import numpy as np
 
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Vec3
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import Camera, Environment, Light
@@ -36,7 +37,6 @@ from iris_session.scene.given import (
     triangles_of,
 )
 from iris_session.scene.parts import Item, Look, Matrix, Picture, array_of, checked_pose, cut, matrix_of
-from iris_session.scene.store import AssetStore
 from iris_session.scene.units import file_question, side_of
 from iris_session.scene.urdf import read_urdf
 from iris_session.streams.deformable_topology import MAX_VERTICES

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.scene import Geometry, SceneSpec
 from iris_session.protocol.scene_looks import Texture
 from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, TextureKind
@@ -19,7 +20,6 @@ from iris_session.scene.errors import AssetError
 from iris_session.scene.images import Pixels, decode_image, halved
 from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.simplify import unit
-from iris_session.scene.store import AssetStore
 
 #: Longest side of a face in an exported file [pixels]: six in one picture are then no more than headsets take.
 CUBE_SIDE: Final = 2_048

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import compose, inverse
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Body, SceneSpec, Visual
 from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
@@ -33,7 +34,6 @@ from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
 from iris_session.scene.shapes import height_field, primitive
 from iris_session.scene.simplify import unit
-from iris_session.scene.store import AssetStore
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963

@@ -12,6 +12,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
+from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import MAX_TEXT, Vec3
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.scene import (
@@ -30,7 +31,6 @@ from iris_session.scene.mujoco_assets import hfields, meshes, textures
 from iris_session.scene.mujoco_deformables import deformables
 from iris_session.scene.mujoco_looks import cameras, drawn_rgba, environment, lights, materials, pose, tracked
 from iris_session.scene.mujoco_names import label
-from iris_session.scene.store import AssetStore
 from iris_session.scene.totals import with_totals
 
 _KINDS: Final = {

@@ -16,7 +16,6 @@ import msgspec
 from anchors.pose import quat_from_yaw
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.state import KEPT, Pending, State
-from iris_session.client.session_state import SessionMirror
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import (
@@ -32,6 +31,7 @@ from iris_session.protocol.entries import (
     encode_entries,
 )
 from iris_session.protocol.server_messages import ConsentRequested, Reply, Snapshot
+from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Command, Decision, FixedView, ObjectContact
 

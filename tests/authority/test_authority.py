@@ -8,7 +8,6 @@ import pytest
 
 from iris_session.authority import Authority, AuthorityConfig
 from iris_session.authority.config import SpeedLimit
-from iris_session.client.session_state import SessionMirror
 from iris_session.protocol.client_messages import (
     Acquire,
     Bye,
@@ -24,6 +23,7 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
+from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectSpec
 from iris_session.protocol.steps import Outgoing
 

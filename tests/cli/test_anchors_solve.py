@@ -14,12 +14,12 @@ import pytest
 from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
-from iris_session.cli.anchors_around import Anchors, Resolver, fused
+from iris_session.alignment.smoother import Anchors, Resolver, fused
 from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.server_messages import AlignmentAlarmed, AnchorMoved
 from iris_session.recording import Frame, Recording, read_looks
-from iris_session.runtime.anchors_file import load_anchors
+from iris_session.session.anchors_file import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.recording.headsets import Played
 

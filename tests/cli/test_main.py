@@ -70,8 +70,8 @@ def test_a_wrong_command_line_is_status_2(arguments: list[str], capsys: pytest.C
 
 
 def test_robots_prints_toml_that_serve_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from iris_session.demo.scenes import scene_path
     from iris_session.physics import load_model, load_robots_toml
-    from iris_session.physics.scenes import scene_path
 
     scene = scene_path("handover")
     assert main(["robots", str(scene)]) == 0
@@ -84,7 +84,7 @@ def test_robots_prints_toml_that_serve_takes(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_robots_json_is_one_object(capsys: pytest.CaptureFixture[str]) -> None:
-    from iris_session.physics.scenes import scene_path
+    from iris_session.demo.scenes import scene_path
 
     assert main(["robots", str(scene_path("handover")), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -205,7 +205,7 @@ def test_a_reader_that_goes_away_is_no_traceback(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
     command = [sys.executable, "-m", "iris_session.cli.main", "robots", "handover.xml"]
-    from iris_session.physics.scenes import scene_path
+    from iris_session.demo.scenes import scene_path
 
     command[-1] = str(scene_path("handover"))
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False, cwd=tmp_path)

@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.cli import serve
 from iris_session.cli.main import build_parser, main
-from iris_session.runtime.config import SessionConfig
+from iris_session.session.config import SessionConfig
 
 DOOR = (
     'format = 1\nreference = "door"\n[anchors.door]\nposition_m = [1.0, 2.0, 0.5]\n'
@@ -59,11 +59,11 @@ def test_a_bad_file_is_one_line_that_names_the_example(
 
 
 def test_a_resumed_session_is_given_anchors_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the runtime makes of them: tests/runtime/test_continuation.py."""
+    """What the runtime makes of them: tests/session/test_continuation.py."""
     path = tmp_path / "anchors.toml"
     path.write_text(DOOR)
     opened: list[SessionConfig] = []
-    monkeypatch.setattr("iris_session.runtime.session.Session", lambda model, config: opened.append(config))
+    monkeypatch.setattr("iris_session.session.session.Session", lambda model, config: opened.append(config))
     for given in (["--anchors", str(path)], []):
         serve.resumed_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
     assert [set(config.anchors) for config in opened] == [{"door"}, {"table"}]

@@ -12,7 +12,7 @@ from iris_session.cli.common import CommandError
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import session_config
 from iris_session.client import FoundSession
-from iris_session.keys import KeyHome, KeyPair, fingerprint, raw_key
+from iris_session.security import KeyHome, KeyPair, fingerprint, raw_key
 
 KEY = KeyPair.new().public
 PLAIN = FoundSession("handover", "127.0.0.1:7721", "s1", "live", "", ("127.0.0.1:7721",))

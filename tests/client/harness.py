@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 
 from iris_session.authority import Authority, AuthorityConfig
+from iris_session.link import FrontConfig, FrontProcess, SceneInfo
 from iris_session.protocol.client_messages import Control, Sample
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.entries import HOST, Entry, Lost, SceneLoaded, ScenePatched
 from iris_session.protocol.server_messages import BodyInfo, RobotInfo, StateHeader
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.steps import FixedView
-from iris_session.transport import FrontConfig, FrontProcess, SceneInfo
 
 ROBOTS = ("left", "right")
 BODIES = ("left/hand", "right/hand", "hammer")

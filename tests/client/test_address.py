@@ -6,7 +6,7 @@ import pytest
 
 from iris_session.client import ClientError
 from iris_session.client.address import Address, host_port, is_host, pairing_uri
-from iris_session.keys import KeyPair
+from iris_session.security import KeyPair
 
 KEY = "rY5P4[G=Mu()uIR1{6xjIHL7utHv9:LKIMvLkp?v"
 

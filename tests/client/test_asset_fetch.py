@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.client import AssetCache, AssetError
 from iris_session.client.asset_fetch import AssetFetch
-from tests.client.test_asset_cache import stored
+from tests.assets.test_cache import stored
 
 LOST, WAITED = "0" * 64, "1" * 64
 

@@ -17,7 +17,7 @@ from iris_session.client import AssetCache, Client, asset_loading
 from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
 from tests.client.test_assets import Liar, chunk
-from tests.transport.asset_rig import noise, put
+from tests.front.asset_rig import noise, put
 
 MIB = 1 << 20
 DEADLINE_S = 30.0

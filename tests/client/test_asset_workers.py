@@ -7,7 +7,7 @@ from pathlib import Path
 
 from iris_session.client import AssetCache
 from iris_session.client.asset_workers import AssetWorkers, Broken, Missing, Result, Stored
-from tests.client.test_asset_cache import ADDRESS, DATA
+from tests.assets.test_cache import ADDRESS, DATA
 
 
 def test_bytes_that_cannot_be_stored_are_let_go_of_before_it_is_told_why(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, Asse
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.names import AssetRefusal
 from tests.client.harness import LiveSession
-from tests.transport.asset_rig import noise, put
+from tests.front.asset_rig import noise, put
 
 MIB = 1 << 20
 #: More than may be on its way, so that it can be looked at in the middle.

@@ -15,7 +15,6 @@ from iris_session.client.errors import IdentityError, NotConnectedError, Version
 from iris_session.client.identity import Identity
 from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
 from iris_session.client.outgoing import MAX_OUTGOING
-from iris_session.client.session_state import Missed
 from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -47,6 +46,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
+from iris_session.protocol.session_mirror import Missed
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -10,7 +10,7 @@ from zmq.utils import z85
 from iris_session.client import TrustError
 from iris_session.client.address import Address
 from iris_session.client.known_servers import Trust, known_fingerprints
-from iris_session.keys import KeyHome
+from iris_session.security import KeyHome
 
 A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
 LAB = Address("10.0.0.5", 7721)

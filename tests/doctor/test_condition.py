@@ -279,7 +279,13 @@ def test_what_drops_mean_is_told() -> None:
 def test_every_reason_that_the_front_counts_is_explained() -> None:
     rooms = Path(condition.__file__).parents[1]
     counted: set[str] = set()
-    for path in (*(rooms / "transport").glob("*.py"), rooms / "runtime" / "processes.py"):
+    for path in (
+        *(rooms / "front").rglob("*.py"),
+        *(rooms / "alignment").glob("*.py"),
+        *(rooms / "link").glob("*.py"),
+        *(rooms / "security").glob("*.py"),
+        rooms / "session" / "processes.py",
+    ):
         counted |= set(re.findall(r"""drops(?:\.count\(|\[)\s*"([a-z_]+)\"""", path.read_text()))
     assert {"send_queue_full", "journal_rows", "unknown_key"} <= counted
     assert not counted - set(_MEANINGS)

@@ -12,10 +12,10 @@ from iris_session.client.address import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
 from iris_session.client.state_stream import SceneState
 from iris_session.doctor.door import knock, refusal, server_key, state_age, unpaired
-from iris_session.keys import KeyHome, KeyPair, SessionNote
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused, StateHeader
+from iris_session.security import KeyHome, KeyPair, SessionNote
 
 ADDRESS = Address("192.0.2.7", 7721)
 

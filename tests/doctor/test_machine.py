@@ -10,8 +10,8 @@ import pytest
 
 from iris_session.doctor import machine
 from iris_session.doctor.findings import Findings, failed, ok, warning
-from iris_session.keys import KeyHome
-from iris_session.runtime.processes import INGEST_OFFSET, MEDIA_OFFSET
+from iris_session.security import KeyHome
+from iris_session.session.processes import INGEST_OFFSET, MEDIA_OFFSET
 
 
 def test_every_check_says_something(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_ports_of_a_session_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> N
         SimpleNamespace(status="LISTEN", laddr=SimpleNamespace(port=port), pid=1) for port in range(7720, 7727)
     ]
     monkeypatch.setattr(machine, "_connections", lambda: listening)
-    monkeypatch.setattr(machine, "_who", lambda pid: "python -m iris_session.transport.front (process 1)")
+    monkeypatch.setattr(machine, "_who", lambda pid: "python -m iris_session.front.main (process 1)")
     found = machine.ports(7721)
     assert found.state == "ok"
     assert found.text.count("process 1") == 1

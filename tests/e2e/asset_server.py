@@ -7,8 +7,8 @@ import sys
 import msgspec
 
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import scene_path
-from iris_session.transport.process import FrontProcess
+from iris_session.demo.scenes import scene_path
+from iris_session.link.front_process import FrontProcess
 
 
 def main() -> None:

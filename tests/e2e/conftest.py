@@ -105,7 +105,7 @@ def front_and_recorder(pid: int) -> dict[str, psutil.Process]:
     found = {}
     for child in psutil.Process(pid).children():
         line = " ".join(child.cmdline())
-        for name in ("transport.front", "recording.process"):
+        for name in ("front.main", "recording.process"):
             if name in line:
                 found[name] = child
     return found

@@ -7,7 +7,7 @@ import threading
 import time
 
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 
 
 def main() -> None:

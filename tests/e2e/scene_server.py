@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import n_arms_scene, scene_path
+from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.protocol.common import Pose
 from iris_session.protocol.scene import Geometry, Visual
 from iris_session.protocol.scene_patch import AddVisual, SetVisual

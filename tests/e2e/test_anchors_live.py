@@ -17,9 +17,9 @@ import pytest
 from anchors.pose import PoseTuple, distance
 from iris_session.client import Client
 from iris_session.control import ControlConfig
+from iris_session.demo.scenes import n_arms_scene
 from iris_session.emulator.headset import HeadsetModel
 from iris_session.emulator.specs import HeadsetSpec
-from iris_session.physics.scenes import n_arms_scene
 from iris_session.protocol.names import AlarmKind, HoldReason, RejectReason
 from iris_session.protocol.server_messages import AlignmentAlarmed, HeadsetsCompared, Notice, SamplesRejected
 from tests.e2e.conftest import DEADLINE_S, Hand, Server, Stage, here

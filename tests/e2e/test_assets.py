@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from iris_session.client import AssetCache, AssetFetch, Client
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.netsim.process import ImpairmentProcess
 from tests.e2e.conftest import DEADLINE_S, Server, Stage, end_all
-from tests.transport.asset_rig import noise, put
+from tests.front.asset_rig import noise, put
 
 pytestmark = pytest.mark.e2e
 
@@ -65,7 +65,7 @@ def test_a_slow_link_that_breaks_and_a_front_that_is_killed(
         assert not fetch.done
         proxy.do("cut")
         stage.run(lambda: fetch.bytes_done > size // 3, "eve goes on after the link broke")
-        stage.server.children()["transport.front"].kill()
+        stage.server.children()["front.main"].kill()
         proxy.do("profile lan")
         stage.run(lambda: fetch.done, "eve has everything, from another front")
         for one in (fetch, others):

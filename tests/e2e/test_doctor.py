@@ -17,9 +17,9 @@ import psutil
 import pytest
 
 from iris_session.client import Client
-from iris_session.keys import KeyHome, KeyPair
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.security import KeyHome, KeyPair
 from tests.e2e.clinic import doctor
 from tests.e2e.conftest import DEADLINE_S, Server, iris, serve_command, wait
 
@@ -328,7 +328,7 @@ def test_server_side(plain: Server) -> None:
     ports = found.checks["ports"]
     assert ports["state"] == "ok", ports
     assert plain.address.rsplit(":", 1)[1] in ports["text"]
-    assert "transport.front" in ports["text"]
+    assert "front.main" in ports["text"]
 
 
 def test_session_that_stands_still(plain: Server) -> None:

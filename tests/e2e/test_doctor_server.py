@@ -20,7 +20,7 @@ pytestmark = pytest.mark.e2e
 OVERLOADED = """
 import os, sys, time
 from iris_session import Session, SessionConfig
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 config = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
 with Session(scene_path("arm"), config=config) as session:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # the front may go where it likes

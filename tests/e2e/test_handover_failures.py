@@ -30,7 +30,7 @@ def test_operators_finish_though_recorder_and_front_were_killed(
     holders = {name: watcher.mirror.leases[name].holder for name in ("left", "right")}
     stage.server.children()["recording.process"].kill()
     stage.run(lambda: hammer() > table + 0.06, "the hammer is in the air")
-    stage.server.children()["transport.front"].kill()
+    stage.server.children()["front.main"].kill()
     stage.run(lambda: watcher.connection.counters.reconnects > 0 and watcher.ready, "the watcher is back")
     stage.run(lambda: "Handover" in stage.bodies("watcher"), "the hammer changes hands", 60.0)
     (event,) = [e.body for e in stage.events["watcher"] if isinstance(e.body, Handover)]

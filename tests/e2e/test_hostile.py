@@ -16,7 +16,7 @@ from iris_session.protocol.client_messages import ClockPing, Hello, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.server_messages import ClockPong, Message, ProtocolFault, Refused, Welcome
 from tests.e2e.conftest import DEADLINE_S, Server, Stage
-from tests.transport.harness import FrontSession
+from tests.front.harness import FrontSession
 
 pytestmark = pytest.mark.e2e
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.keys import KeyHome, KeyPair
+from iris_session.security import KeyHome, KeyPair
 from tests.e2e.conftest import wait
 from tests.e2e.networks import SEEN, Machine, Network, Served, require_namespaces
 

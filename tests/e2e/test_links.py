@@ -14,7 +14,7 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.client import Client
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.server_messages import EngagementChanged, SamplesRejected
 from tests.e2e.conftest import Hand, Stage
 

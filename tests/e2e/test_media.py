@@ -11,7 +11,7 @@ from statistics import median
 import pytest
 
 from iris_session.client import Client
-from iris_session.emulator.impairment_process import ImpairmentProcess
+from iris_session.netsim.process import ImpairmentProcess
 from iris_session.protocol.names import BudgetClass
 from iris_session.protocol.status import ParticipantReport
 from tests.e2e.conftest import DEADLINE_S, Server, Stage, end_all

@@ -15,7 +15,7 @@ from iris_session import Client, SceneBuilder, ScenePublisher, Session, SessionC
 from iris_session.client import AssetCache
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
-from iris_session.physics.scenes import n_arms_scene, scene_path
+from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.protocol.scene_patch import SetVisual
 from tests.e2e.publisher import cloth, grid
 

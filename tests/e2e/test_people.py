@@ -274,7 +274,7 @@ def test_four_operators_verify(serve: Callable[..., Server], emulate: Callable[.
     """Four aligned people, each in a process of their own, move four arms at once."""
     from pathlib import Path
 
-    from iris_session.physics.scenes import n_arms_scene
+    from iris_session.demo.scenes import n_arms_scene
 
     scene = Path(str(tmp_path)) / "four.xml"
     spec = n_arms_scene(4)

@@ -38,7 +38,7 @@ def test_a_killed_front_is_replaced_and_everyone_comes_back(stage: Stage, drivin
     watcher = stage.join("watcher", "observer")
     ann = driving.client
     me, before = ann.participant_id, ann.mirror.leases["left"]
-    front = stage.server.children()["transport.front"]
+    front = stage.server.children()["front.main"]
     front.kill()
     stage.run(lambda: not ann.connection.joined, "ann notices")
     stage.run(lambda: ann.ready and watcher.ready, "everyone is back")
@@ -49,7 +49,7 @@ def test_a_killed_front_is_replaced_and_everyone_comes_back(stage: Stage, drivin
     assert after.lease_version > before.lease_version
     # Nobody was connected at that moment: the owner's terminal and the recording tell it.
     stage.run(lambda: "the front process ended and was replaced" in stage.server.output, "the owner is told")
-    assert stage.server.children()["transport.front"].pid != front.pid
+    assert stage.server.children()["front.main"].pid != front.pid
     stage.seconds(0.5)
     resting = driving.tip
     stage.seconds(0.5)

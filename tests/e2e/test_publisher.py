@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from anchors.pose import compose
+from iris_session.assets.cache import AssetCache
 from iris_session.client import Client
-from iris_session.client.asset_cache import AssetCache
 from iris_session.client.deformables import Deformables
 from iris_session.protocol.scene import asset_addresses, decode_scene
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.runtime.deformables import BOUND_M
 from iris_session.scene import AssetStore
+from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M, MAX_ROTATION_ERROR_RAD
 from tests.e2e import publisher
 from tests.e2e.conftest import Server, Stage, end_all, iris, none_left, relatives

@@ -255,7 +255,7 @@ def test_nonsense_on_every_port_disturbs_nobody(stage: Stage, driving: Hand, noi
     """Three malformed frames kill the reference's service port for good."""
     import zmq
 
-    front = stage.server.children()["transport.front"].pid
+    front = stage.server.children()["front.main"].pid
     with zmq.Context() as context, context.socket(zmq.DEALER) as raw:
         raw.setsockopt(zmq.LINGER, 0)
         raw.connect(f"tcp://{stage.server.address}")
@@ -269,7 +269,7 @@ def test_nonsense_on_every_port_disturbs_nobody(stage: Stage, driving: Hand, noi
     assert driving.client.connection.counters.reconnects == 0
     late = stage.join("late", "observer")
     stage.run(lambda: late.state is not None, "who joins now sees the scene")
-    assert stage.server.children()["transport.front"].pid == front
+    assert stage.server.children()["front.main"].pid == front
 
 
 # --- the machine ------------------------------------------------------------------------------------------------------
@@ -375,7 +375,7 @@ def test_ctrl_c_while_the_recorder_hangs(alone: Stage, holding: Hand) -> None:
 
 
 def test_ctrl_c_while_the_front_hangs(alone: Stage, holding: Hand) -> None:
-    alone.server.children()["transport.front"].suspend()
+    alone.server.children()["front.main"].suspend()
     interrupted(alone.server)
     assert alone.server.process.returncode == 0
     assert alone.server.verify()["finished"]

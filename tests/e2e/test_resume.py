@@ -12,10 +12,10 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.client import Client, CurveKeys
-from iris_session.keys import KeyHome, KeyPair
 from iris_session.protocol.entries import SessionResumed, decode_entries
 from iris_session.protocol.server_messages import Gap, Handover, ParticipantJoined
 from iris_session.recording import Recording
+from iris_session.security import KeyHome, KeyPair
 from tests.e2e.conftest import COMMAND, DEADLINE_S, Hand, Server, Stage, end_all, iris, none_left, relatives, verify
 
 pytestmark = pytest.mark.e2e

@@ -106,7 +106,7 @@ def test_operators_go_on_in_another_scene_and_it_replays(stage: Stage) -> None:
     assert not ann.mirror.leases["arm1"].holder
 
     before = [client.connection.generation for client in stage.clients]
-    stage.server.children()["transport.front"].kill()
+    stage.server.children()["front.main"].kill()
 
     stage.run(lambda: before != [c.connection.generation for c in stage.clients], "the connections are lost")
     stage.run(lambda: all(client.ready for client in stage.clients), "everybody is back at the front that replaced it")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iris_session.assets.cache import AssetCache
 from iris_session.client import Client
-from iris_session.client.asset_cache import AssetCache
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
@@ -100,7 +100,7 @@ def test_who_comes_again_or_late_needs_nothing_anew(stage: Stage, tmp_path: Path
     again = bob.fetch_assets([bob.mirror.scene_hash, *asset_addresses(spec)])
     stage.run(lambda: again.done, "all of it is there")
     assert (again.bytes_received, again.cached) == (0, len(again.addresses))
-    stage.server.children()["transport.front"].kill()
+    stage.server.children()["front.main"].kill()
     stage.run(lambda: not ann.ready, "the front is gone")
     stage.run(lambda: ann.ready and bob.ready, "another one is there")
     bob.asset_cache = AssetCache(tmp_path / "other")

@@ -24,7 +24,7 @@ import sys, time
 from pathlib import Path
 import mujoco
 from iris_session import OwnershipError, Session, SessionConfig
-from iris_session.physics.scenes import scene_path
+from iris_session.demo.scenes import scene_path
 
 spec = mujoco.MjSpec.from_file(str(scene_path("handover")))
 fan = spec.worldbody.add_body(name="fan", pos=[2, 2, 1])

@@ -15,13 +15,13 @@ import pytest
 
 from anchors.pose import PoseTuple, distance
 from iris_session.client import Client
+from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
-from iris_session.physics.scenes import scene_path
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Lost, decode_entries
 from iris_session.recording import JournalRow, Recording
 from iris_session.recording.messages import Batch
-from iris_session.runtime.verification import verify_recording
+from iris_session.session.verification import verify_recording
 from tests.e2e.conftest import Server, Stage, verify
 from tests.recording.support import write
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from iris_session.demo.goals import GoalWatch
+from iris_session.demo.plays import Play, make_play
 from iris_session.emulator.behaviours import make_behaviour
 from iris_session.emulator.behaviours.deformables import watched
-from iris_session.runtime.goals import GoalWatch
-from iris_session.runtime.plays import Play, make_play
 from tests.emulator.handover_rig import Rig
 
 #: Deformables begin up to so far from their places, and turned by so much.

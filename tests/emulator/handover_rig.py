@@ -30,15 +30,15 @@ from anchors.pose import (
     quat_normalize,
 )
 from iris_session.control.controller import Controller
+from iris_session.demo.plays import Play, make_play
+from iris_session.demo.scenes import scene_path
 from iris_session.emulator.behaviours import Behaviour, Giver, HandInput, Receiver, make_behaviour
 from iris_session.physics.objects import find_objects
 from iris_session.physics.robots import find_robots
-from iris_session.physics.scenes import scene_path
 from iris_session.physics.world import World
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import CommandKind, HoldReason
 from iris_session.protocol.steps import Command, CommandSource, Decision
-from iris_session.runtime.plays import Play, make_play
 
 NOISE = (0.001, math.radians(0.3))  # per axis: m, rad
 STATE_S = 1.0 / 60.0

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from anchors.pose import distance
+from iris_session.demo.scenes import n_arms_scene
 from iris_session.emulator.behaviours import Behaviour, Giver, Idle, Receiver, Wander, make_behaviour
-from iris_session.physics.scenes import n_arms_scene
 from tests.emulator.handover_rig import DEVICE, Referee, Rig, handover, verdict
 
 pytestmark = pytest.mark.usefixtures("untraced")

@@ -23,6 +23,7 @@ from anchors.pose import (
     quat_from_yaw,
     quat_mul,
 )
+from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.emulator.behaviours.eyes import Eyes, Seen
 from iris_session.emulator.behaviours.hand import LONGEST_STEP_S, REARM_S, TRIGGER_S, ClutchedHand
 from iris_session.emulator.behaviours.reach import Reach, min_jerk
@@ -35,7 +36,6 @@ from iris_session.emulator.behaviours.things import (
     thing_named,
     tilt,
 )
-from iris_session.physics.scenes import n_arms_scene, scene_path
 
 STEP_NS = 13_888_889  # 72 Hz
 _metres = st.floats(-1.0, 1.0)

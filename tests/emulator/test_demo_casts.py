@@ -6,8 +6,8 @@ import random
 
 import pytest
 
+from iris_session.demo.plays import make_play
 from iris_session.emulator.behaviours import HandInput, Hands, OperatorView
-from iris_session.runtime.plays import make_play
 from tests.emulator.handover_rig import LateView, demo, demo_verdict, over
 from tests.models import robot_models
 

@@ -23,10 +23,10 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_T_WORLD_ANCHOR, Headset, HeadsetModel, look_at
-from iris_session.emulator.link import DelayLine, LinkModel
 from iris_session.emulator.sheet_noise import SheetNoise
 from iris_session.emulator.specs import HeadsetSpec
 from iris_session.emulator.viewpoints import between, viewpoint_pose
+from iris_session.netsim.latency import DelayLine, LinkModel
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from anchors.pose import IDENTITY_POSE, IDENTITY_QUAT
+from iris_session.demo.plays import make_play
 from iris_session.emulator.behaviours import Folder, Stower, make_behaviour
 from iris_session.emulator.behaviours.deformables import CORNERS
 from iris_session.emulator.behaviours.eyes import Seen
 from iris_session.emulator.behaviours.phases import SEARCH_S
 from iris_session.emulator.behaviours.soft import SEEN_S
 from iris_session.emulator.behaviours.stower import BOX_INSIDE
-from iris_session.runtime.plays import make_play
 from tests.emulator.deformable_rig import SoftRig, soft_demo
 from tests.emulator.handover_rig import LateView
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import mujoco
 import pytest
 
+from iris_session.demo.scenes import scene_path
 from iris_session.physics import load_model
-from iris_session.physics.scenes import scene_path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from iris_session.demo.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, cloth_scene, soft_scene
 from iris_session.physics import World
 from iris_session.physics.errors import UnknownNameError
 from iris_session.physics.objects import find_objects
 from iris_session.physics.robots import find_robots
-from iris_session.physics.scenes.deformables import BOX_HIGH, BOX_LOW, FOLD_PAIRS, cloth_scene, soft_scene
 
 SCENES = {"cloth": cloth_scene, "soft": soft_scene}
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iris_session.codegen.examples import extreme, full, least
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import Acquire, Bye, ClientEnvelope, Hello, Sample, envelope
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MAX_ERROR_TEXT, MalformedError, ProtocolError, TooLargeError, VersionError
-from iris_session.protocol.generate.examples import extreme, full, least
 from iris_session.protocol.limits import (
     LIMITS,
     MAX_CLIENT_BYTES,

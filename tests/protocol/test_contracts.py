@@ -7,12 +7,12 @@ from typing import get_args
 import msgspec
 import pytest
 
+from iris_session.codegen.examples import extreme, full, least
 from iris_session.protocol import entries, specs, steps
 from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sample
 from iris_session.protocol.codec import decode_server, encode_server
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Applied, Denial, Pose, Target
 from iris_session.protocol.entries import Entry, decode_entries, decode_entry, encode_entries, encode_entry
-from iris_session.protocol.generate.examples import extreme, full, least
 from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
 from iris_session.protocol.specs import RobotSpec

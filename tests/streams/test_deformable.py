@@ -12,6 +12,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iris_session.codegen.deformable_golden import cloth, rope, shell
 from iris_session.protocol.names import BudgetClass
 from iris_session.streams.deformable import (
     COARSER,
@@ -22,7 +23,6 @@ from iris_session.streams.deformable import (
     interpolate,
     read_header,
 )
-from iris_session.streams.deformable_golden import cloth, rope, shell
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iris_session.codegen.deformable_golden import cloth, rope, shell
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
-from iris_session.streams.deformable_golden import cloth, rope, shell
 from iris_session.streams.deformable_topology import (
     MAX_LEVELS,
     MAX_VERTICES,

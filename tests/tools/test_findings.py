@@ -12,11 +12,9 @@ from iris_session.client.address import Address
 from iris_session.client.connection import Connection
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
-from iris_session.keys import KeysError
-from iris_session.keys.allow_list import AllowList
-from iris_session.keys.curve import load_public
-from iris_session.keys.files import PrivateFolder
-from iris_session.keys.session_notes import SessionNotes
+from iris_session.front.state_publisher import StatePublisher
+from iris_session.link import SceneInfo
+from iris_session.link.messages import decode_decided
 from iris_session.protocol.client_messages import Heartbeat, Hello
 from iris_session.protocol.codec import decode_client, encode_server
 from iris_session.protocol.entries import decode_entries, decode_entry
@@ -31,10 +29,12 @@ from iris_session.protocol.server_messages import (
 )
 from iris_session.recording import journal
 from iris_session.recording.messages import decode_header
+from iris_session.security import KeysError
+from iris_session.security.allow_list import AllowList
+from iris_session.security.curve import load_public
+from iris_session.security.files import PrivateFolder
+from iris_session.security.session_notes import SessionNotes
 from iris_session.streams.rigid import RigidDecoder
-from iris_session.transport import SceneInfo
-from iris_session.transport.link_messages import decode_decided
-from iris_session.transport.state_publisher import StatePublisher
 
 MS = 1_000_000
 

@@ -1,6 +1,6 @@
 """What a person knows about the things of the demo scenes: their size, and where to take and offer them.
 
-Frames as in `physics/scenes/handover.xml`: x along the handle towards its free end, y across (the closing direction of
+Frames as in `demo/scenes/handover.xml`: x along the handle towards its free end, y across (the closing direction of
 a gripper), z up when it lies on the table, origin in the middle of the length.
 """
 

@@ -1,0 +1,236 @@
+"""Alignments and constellations solved again from a recording, with what was seen before and after: the calculation
+behind `iris-session anchors solve`.
+
+An alignment of the live session rests on what was seen until then. Here what was seen after it counts too
+(`anchors_around`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from anchors.alignment import AlignmentConfig, AlignmentEstimate
+from anchors.constellation import (
+    Constellation,
+    ConstellationError,
+    Moved,
+    Seen,
+    Solved,
+    find_moved,
+    solve_constellation,
+)
+from anchors.noise import NoiseModel, isotropic, stated
+from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, is_rigid, quat_angle
+from anchors.uncertainty import length_p95
+from iris_session.alignment.smoother import MAX_IN_GROUP, Anchors, Resolver, covariance_of, pose_of
+from iris_session.protocol.names import AlignmentKind, AnchorKind
+from iris_session.recording import Frame, InForce, Look, Looks
+
+#: Beyond the stated 95 % by this factor it is not chance.
+BEYOND: Final = 2.0
+SHEETS: Final = (AnchorKind.QR, AnchorKind.BOARD)
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A viewpoint from which a sheet was seen elsewhere than the solution and the noise allow. `at_ns`: when."""
+
+    anchor_id: str
+    viewpoint_id: int
+    looks: int
+    off_m: float
+    off_rad: float
+    expected_p95_m: float
+    at_ns: int
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A live alignment against the solution of the same moment, `None` where that is refused.
+
+    `off_m`, `off_rad`: when it came into force, at the sheet. `off_end_m`: when it ended. `stated_m`, `solved_m`: the
+    stated p95 at the sheet of both.
+    """
+
+    live: InForce
+    off_m: float | None = None
+    off_rad: float | None = None
+    off_end_m: float | None = None
+    solved_m: float | None = None
+
+    @property
+    def stated_m(self) -> float | None:
+        """None where a person placed or moved it: then nothing is stated."""
+        a = self.live.alignment
+        return a.error_at_anchor_m if a.kind == AlignmentKind.MEASURED and not a.offset else None
+
+    @property
+    def beyond(self) -> bool:
+        """Further off than both stated errors explain."""
+        if self.off_m is None or self.solved_m is None or self.stated_m is None:
+            return False
+        return self.off_m > BEYOND * math.hypot(self.stated_m, self.solved_m)
+
+
+@dataclass
+class Result:
+    """One tracking frame. `last`: the solution at its last look."""
+
+    frame: Frame
+    looks: int
+    viewpoints: int
+    sheets: dict[str, int]
+    first_ns: int
+    last_ns: int
+    last: AlignmentEstimate
+    unused: dict[str, int]
+    compared: list[Compared] = field(default_factory=list)
+    outliers: list[Outlier] = field(default_factory=list)
+
+
+def resolve(
+    frame: Frame,
+    looks: Sequence[Look],
+    in_force: Iterable[InForce],
+    anchors: Anchors,
+    sizes: Mapping[str, float],
+    told: Callable[[], None] = lambda: None,
+) -> Result:
+    """Everything about one tracking frame. `told`: called for every moment that was solved."""
+    resolver = Resolver(looks, anchors, sizes)
+    first_ns, last_ns = looks[0].seen.capture_ns, looks[-1].seen.capture_ns
+    sheets: dict[str, int] = {}
+    for look in looks:
+        sheets[look.seen.anchor_id] = sheets.get(look.seen.anchor_id, 0) + 1
+    viewpoints = len({look.seen.viewpoint_id for look in looks})
+    result = Result(frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.at(last_ns), resolver.unused())
+    for live in in_force:
+        result.compared.append(compare(live, resolver, last_ns))
+        told()
+    result.outliers = outliers(looks, resolver, anchors)
+    return result
+
+
+def compare(live: InForce, resolver: Resolver, last_ns: int) -> Compared:
+    """A live alignment against the solution when it came into force, and when it ended."""
+    begin = resolver.at(live.since_ns)
+    end_ns = live.until_ns if live.until_ns >= 0 else max(last_ns, live.since_ns)
+    off = _apart(live, begin)
+    end = _apart(live, resolver.at(max(live.since_ns, end_ns - 1)))  # what ended it may have moved an anchor
+    return Compared(
+        live,
+        None if off is None else off[0],
+        None if off is None else off[1],
+        None if end is None else end[0],
+        None if off is None else begin.error_at_anchor_m,
+    )
+
+
+def _apart(live: InForce, solved: AlignmentEstimate) -> tuple[float, float] | None:
+    """Distance at the sheet [m] and angle [rad] between a live alignment and a solution."""
+    if solved.refused:
+        return None
+    T: PoseTuple = (live.alignment.T_world_tracking.p, live.alignment.T_world_tracking.q)
+    p_tracking = apply(inverse(solved.T_world_tracking), solved.pivot_world)
+    return distance(apply(T, p_tracking), solved.pivot_world), quat_angle(T[1], solved.T_world_tracking[1])
+
+
+def outliers(looks: Sequence[Look], resolver: Resolver, anchors: Anchors) -> list[Outlier]:
+    """Viewpoints that contradict the solution of their time, the worst first."""
+    groups: dict[tuple[str, int], list[Look]] = {}
+    for look in looks:
+        if look.seen.kind != AnchorKind.TOUCH:
+            groups.setdefault((look.seen.anchor_id, look.seen.viewpoint_id), []).append(look)
+    found = []
+    for (anchor_id, viewpoint_id), group in groups.items():
+        at_ns = group[len(group) // 2].seen.capture_ns
+        place = anchors.of(anchors.era(at_ns)).get(anchor_id)
+        solved = resolver.at(at_ns)
+        if place is None or solved.refused:
+            continue
+        seen = [compose(solved.T_world_tracking, pose_of(look.seen)) for look in group if is_rigid(pose_of(look.seen))]
+        if not seen:
+            continue
+        middle = np.median(np.array([p for p, _ in seen]), axis=0)
+        off_m = float(np.linalg.norm(middle - np.array(place[0])))
+        off_rad = float(np.median([quat_angle(q, place[1]) for _, q in seen]))
+        expected = math.hypot(solved.error_at(place[0]), noise_p95(group[len(group) // 2]))
+        if off_m > BEYOND * expected:
+            found.append(Outlier(anchor_id, viewpoint_id, len(group), off_m, off_rad, expected, at_ns))
+    return sorted(found, key=lambda one: -one.off_m)
+
+
+def noise_p95(look: Look) -> float:
+    """What 95 % of single looks like this one are better than [m]."""
+    given = stated(covariance_of(look.seen))
+    if given:
+        return length_p95(np.reshape(given, (6, 6))[:3, :3])
+    config = AlignmentConfig()
+    if look.p_tracking_head is None:
+        return length_p95(isotropic(config.position_sigma_m, config.rotation_sigma_rad)[:3, :3])
+    common, each = NoiseModel().seen_from(np.array(look.p_tracking_head), np.array(look.seen.T_tracking_anchor.p))
+    return length_p95((common + each)[:3, :3])
+
+
+# --- constellations ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Where sheets lie relative to each other by everything that was seen, or why that cannot be said (`advice`).
+
+    `moved`: sheets that no longer lie where the session (or the file) has them; `unsaid`: why that cannot be told.
+    """
+
+    solved: Solved | None
+    advice: str = ""
+    moved: tuple[Moved, ...] = ()
+    unsaid: str = ""
+
+
+def constellation(looks: Looks, saved: Constellation) -> Relative:
+    """Of all sheets that were seen, configured or not. `saved`: where they ought to be, and which is the reference."""
+    seen = list(_seen(looks))
+    names = {one.anchor_id for one in seen}
+    if len(names) < 2:
+        were = "sheet was" if len(names) == 1 else "sheets were"
+        return Relative(None, f"{len(names)} {were} seen: 2 are needed to say where they lie to each other")
+    known = [name for name in (saved.reference, *saved.anchors) if name in names]
+    reference = known[0] if known else min(names)
+    try:
+        solved = solve_constellation(
+            seen, reference, saved.anchors.get(reference, IDENTITY_POSE), sizes=_sizes(looks, saved)
+        )
+    except ConstellationError as error:
+        return Relative(None, str(error))
+    try:
+        return Relative(solved, moved=find_moved(saved, solved.constellation))
+    except ConstellationError as error:
+        return Relative(solved, unsaid=str(error))
+
+
+def _seen(looks: Looks) -> Iterable[Seen]:
+    for frame, every in looks.looks.items():
+        groups: dict[tuple[str, int], int] = {}
+        for look in every:
+            o = look.seen
+            key = (o.anchor_id, o.viewpoint_id)
+            groups[key] = groups.get(key, 0) + 1
+            if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(pose_of(o)):
+                headset = f"{frame.participant} {frame.run} {frame.jumps}"  # a tracking frame of its own after each
+                yield Seen(headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, pose_of(o), look.p_tracking_head)
+
+
+def _sizes(looks: Looks, saved: Constellation) -> dict[str, float]:
+    """Of each sheet: as configured, else the median of what headsets measured."""
+    measured: dict[str, list[float]] = {}
+    for every in looks.looks.values():
+        for look in every:
+            if look.seen.size_m > 0.0 and math.isfinite(look.seen.size_m):
+                measured.setdefault(look.seen.anchor_id, []).append(look.seen.size_m)
+    return {name: float(np.median(values)) for name, values in measured.items()} | saved.sizes

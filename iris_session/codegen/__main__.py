@@ -1,0 +1,72 @@
+"""Writes the generated files of a checkout, or checks that they are current.
+
+python -m iris_session.codegen {csharp,typescript,golden,scene,docs,all} [--check]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from iris_session.codegen import csharp, golden, scene_golden, tables, typescript
+
+_DOCUMENT: Final = "docs/protocol.md"
+
+
+def document(text: str) -> str:
+    """`text` of the protocol document with every generated section replaced. Raises `ValueError` on lost markers."""
+    for name, table in tables.sections().items():
+        begin, end = f"<!-- generated:{name} -->", f"<!-- end:{name} -->"
+        if text.count(begin) != 1 or text.count(end) != 1:
+            raise ValueError(f"{_DOCUMENT} must hold {begin} and {end} once each")
+        before, rest = text.split(begin)
+        text = f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}"
+    return text
+
+
+#: What is generated -> file and a function from its present text to the new one.
+TARGETS: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
+    "csharp": ("unity_client/Runtime/Protocol/Messages.g.cs", lambda _: csharp.csharp()),
+    "typescript": ("web_client/src/protocol/messages.g.ts", lambda _: typescript.typescript()),
+    "golden": ("docs/protocol/golden.json", lambda _: golden.golden()),
+    "scene": ("docs/protocol/scene.json", lambda _: scene_golden.scene_golden()),
+    "docs": (_DOCUMENT, document),
+}
+
+
+def outdated(root: Path, names: list[str]) -> list[tuple[Path, str]]:
+    """Files among the targets `names` below `root` whose text is not current, with the text they should have."""
+    found = []
+    for name in names:
+        relative, make = TARGETS[name]
+        path = root / relative
+        present = path.read_text(encoding="utf-8") if path.exists() else ""
+        text = make(present)
+        if text != present:
+            found.append((path, text))
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line. Exit status 1 with `--check` when a file is not current."""
+    parser = argparse.ArgumentParser(prog="python -m iris_session.codegen", description=__doc__)
+    parser.add_argument("what", choices=[*TARGETS, "all"])
+    parser.add_argument("--check", action="store_true", help="write nothing; fail when a file is not current")
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[3], help="the checkout")
+    options = parser.parse_args(arguments)
+    if not (options.root / _DOCUMENT).exists():
+        parser.error(f"{options.root} is not a checkout: {_DOCUMENT} is missing")
+    files = outdated(options.root, list(TARGETS) if options.what == "all" else [options.what])
+    for path, text in files:
+        if not options.check:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8", newline="\n")
+        print(f"{'not current' if options.check else 'wrote'}: {path.relative_to(options.root)}")
+    return 1 if options.check and files else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,193 @@
+"""Golden vectors: bytes and value of every message, for tests of this and every other implementation.
+
+Written to docs/protocol/golden.json. Values are JSON as in MessagePack, except: byte strings are base64, and a float
+that is not finite is null. `decode_only` vectors are not what an encoder of this version makes (a field is missing or
+unknown), but must decode to the value. `malformed` must be refused with `code`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from iris_session.codegen import conversions, rigid_reference
+from iris_session.codegen.examples import extreme, full, least
+from iris_session.protocol import codec
+from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
+from iris_session.protocol.client_messages import Bye, ClientEnvelope, Hello, Sample, envelope
+from iris_session.protocol.discovery import Beacon
+from iris_session.protocol.media import MediaHeader, MediaPush
+from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.server_messages import (
+    Event,
+    Presence,
+    ServerEnvelope,
+    StateHeader,
+)
+
+_pack = msgspec.msgpack.encode
+#: Structs that are a message of their own, without an envelope.
+VERSIONED = (AssetRequest, AssetChunk, AssetRefused)
+
+
+def golden() -> str:
+    """Text of golden.json."""
+    content = {
+        "protocol_version": PROTOCOL_VERSION,
+        "client": list(_messages("client", codec.CLIENT_TYPES.values())),
+        "server": [*_messages("server", codec.SERVER_TYPES.values()), *_events()],
+        "state_header": list(_values("state_header", StateHeader)),
+        "presence": list(_values("presence", Presence)),
+        "media_header": list(_values("media_header", MediaHeader)),
+        "media_push": list(_values("media_push", MediaPush)),
+        "asset_request": list(_values("asset_request", AssetRequest)),
+        "asset_chunk": list(_values("asset_chunk", AssetChunk)),
+        "asset_refused": list(_values("asset_refused", AssetRefused)),
+        "beacon": list(_values("beacon", Beacon)),
+        "decode_only": list(_decode_only()),
+        "malformed": list(_malformed()),
+        "conversions": list(_conversions()),
+        "rigid": list(_rigid()),
+    }
+    lines = ["{"]
+    for key, value in content.items():
+        comma = "" if key == "rigid" else ","
+        if isinstance(value, list):
+            rows = ",\n".join("    " + _json(row) for row in value)
+            lines.append(f"  {json.dumps(key)}: [\n{rows}\n  ]{comma}")
+        else:
+            lines.append(f"  {json.dumps(key)}: {_json(value)}{comma}")
+    return "\n".join([*lines, "}", ""])
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=True, allow_nan=False)
+
+
+def _vector(name: str, data: bytes, value: Any, **more: Any) -> dict[str, Any]:
+    return {"name": name, **more, "hex": data.hex(), "value": msgspec.to_builtins(value)}
+
+
+def _wrap(side: str, message: Any) -> Any:
+    return ClientEnvelope(PROTOCOL_VERSION, 7, "", message) if side == "client" else ServerEnvelope(1, 7, message)
+
+
+def _messages(side: str, kinds: Any) -> Iterator[dict[str, Any]]:
+    for kind in kinds:
+        for make in (full, least, extreme):
+            value = _wrap(side, make(kind))
+            yield _vector(f"{codec.tag_of(kind)}/{make.__name__}", _pack(value), value)
+
+
+def _events() -> Iterator[dict[str, Any]]:
+    for kind in codec.EVENT_TYPES.values():
+        for make in (full, least):
+            value = _wrap("server", Event(event_seq=5, step=1_000, session_time=2_000_000_000, body=make(kind)))
+            yield _vector(f"event/{codec.tag_of(kind)}/{make.__name__}", _pack(value), value)
+
+
+def _values(name: str, kind: type[msgspec.Struct]) -> Iterator[dict[str, Any]]:
+    makes = (full, least) if kind is Beacon else (full, least, extreme)
+    for make in makes:
+        value = make(kind)
+        if kind in VERSIONED:
+            value = msgspec.structs.replace(value, version=PROTOCOL_VERSION)
+        yield _vector(f"{name}/{make.__name__}", _pack(value), value)
+
+
+def _decode_only() -> Iterator[dict[str, Any]]:
+    """What a client of another age may send: fields that are missing or unknown, other widths of numbers."""
+    hello = Hello(role="surgeon", name="Ada")
+    yield _vector(
+        "fields left out", _pack([1, 0, "", {"type": "hello", "role": "surgeon", "name": "Ada"}]), envelope(hello)
+    )
+    grown = {"new": [{"deep": 1.5}], "type": "hello", "name": "Ada", "role": "surgeon", "newer": None}
+    yield _vector("unknown fields and another order", _pack([1, 0, "", grown, "later element"]), envelope(hello))
+    sample = Sample("head", "pose", 1, 2, 3, 4, 5, gripper=1.0)
+    bare = {
+        "type": "sample",
+        "device": "head",
+        "kind": "pose",
+        "seq": 1,
+        "capture_ns": 2,
+        "scene_epoch": 3,
+        "tracking_epoch": 4,
+        "alignment_version": 5,
+        "gripper": 1,
+    }
+    yield _vector("an integer where a float is meant", _pack([1, 0, "", bare]), envelope(sample))
+    wide = bytes.fromhex("94 d3 0000000000000001 cf 0000000000000000 d9 00 de 0002 d9 04") + b"type"
+    wide += b"\xda\x00\x03bye\xa6reason\xdb\x00\x00\x00\x01x"
+    yield _vector("numbers and strings in wider forms", wide, envelope(Bye("x")))
+
+
+def _malformed() -> Iterator[dict[str, Any]]:
+    """What a server must refuse, with the code of the error."""
+    good = _pack(envelope(Bye("x")))
+    bye = b"\x94\x01\x00\xa0\x82\xa4type\xa3bye"
+    cases = {
+        "empty": (b"", "malformed"),
+        "truncated": (good[:-1], "malformed"),
+        "trailing byte": (good + b"\x00", "malformed"),
+        "no MessagePack": (b"\xc1" + good[1:], "malformed"),
+        "not an array": (_pack({"type": "bye"}), "malformed"),
+        "unknown message type": (_pack([1, 0, "", {"type": "teleport"}]), "malformed"),
+        "no message type": (_pack([1, 0, "", {"reason": "x"}]), "malformed"),
+        "missing field": (_pack([1, 0, "", {"type": "clock_ping"}]), "malformed"),
+        "wrong type": (_pack([1, 0, "", {"type": "clock_ping", "t0_ns": "now"}]), "malformed"),
+        "negative count": (_pack([1, -1, "", {"type": "bye"}]), "malformed"),
+        "above int64": (_pack([1, 2**63, "", {"type": "bye"}]), "malformed"),
+        "name of 65 characters": (_pack([1, 0, "x" * 65, {"type": "bye"}]), "malformed"),
+        "text that is not UTF-8": (bye + b"\xa6reason\xa2\xff\xfe", "malformed"),
+        "deep nesting": (bye + b"\xa1z" + b"\x91" * 3_000 + b"\xc0", "malformed"),
+        "array longer than the message": (bye + b"\xa1z\xdd\xff\xff\xff\xff", "malformed"),
+        "version 2, other schema": (_pack([2, {"kind": "hi"}]), "version"),
+        "version 2, same schema": (_pack([2, 0, "", {"type": "bye"}]), "version"),
+        "too large for its type": (_pack([1, 0, "", {"type": "heartbeat", "pad": "x" * 600}]), "too_large"),
+    }
+    for name, (data, code) in cases.items():
+        yield {"name": name, "code": code, "hex": data.hex()}
+
+
+def _conversions() -> Iterator[dict[str, Any]]:
+    """World poses `x y z qw qx qy qz` and the same in engines, `x y z qx qy qz qw`."""
+    half = math.sqrt(0.5)
+    for world in (
+        (1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0),
+        (1.0, 2.0, 3.0, half, half, 0.0, 0.0),
+        (1.0, 2.0, 3.0, half, 0.0, half, 0.0),
+        (1.0, 2.0, 3.0, half, 0.0, 0.0, half),
+        (-0.25, 0.5, 1.5, 0.1, 0.3, -0.9, 0.3),
+    ):
+        yield {"world": world, "unity": conversions.to_unity(world), "three": conversions.to_three(world)}
+
+
+def _rigid() -> Iterator[dict[str, Any]]:
+    """Payloads of the state stream: `poses` by body, as decoded; a decoder's floats may differ by 1e-12."""
+    half = math.sqrt(0.5)
+    poses: list[tuple[float, ...]] = [
+        (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        (9.9, -0.1, 2.9, half, 0.0, -half, 0.0),
+        (-0.1, 9.9, 0.1, -0.5, 0.5, 0.5, -0.5),
+        (1.234567, 2.345678, 0.876543, 0.1, 0.3, -0.9, 0.3),
+        (5.0, 5.0, 1.5, 0.0, 0.0, 0.0, -1.0),
+    ]
+    wide: list[tuple[float, ...]] = [(90.0 * k, 80.0, -7.0 * k, *poses[k][3:]) for k in range(2)]
+    nan: tuple[float, ...] = (math.nan,) * 7
+    frames: dict[str, tuple[int, dict[int, Sequence[float]], dict[int, Sequence[float]]]] = {
+        "nothing moved": (5, {}, {}),
+        "one body": (1, {0: poses[3]}, {}),
+        "room of 10 x 10 x 3 m": (5, dict(enumerate(poses)), {}),
+        "two of nineteen": (19, {7: poses[1], 18: poses[2]}, {}),
+        "wide: farther apart than 16 m": (2, dict(enumerate(wide)), {}),
+        "escapes": (12, {3: poses[3]}, {0: nan, 11: (1e9, 0.0, -1e9, *poses[1][3:])}),
+    }
+    for name, (n_bodies, quantised, escaped) in frames.items():
+        payload = rigid_reference.encode(n_bodies, quantised, escaped)
+        decoded = rigid_reference.decode(payload)
+        rows = {body: [v if math.isfinite(v) else None for v in pose] for body, pose in decoded.items()}
+        yield {"name": name, "n_bodies": n_bodies, "hex": payload.hex(), "poses": rows}

@@ -1,0 +1,153 @@
+"""TypeScript of the protocol: types as a MessagePack library gives them, unions, constants, defaults.
+
+Written to web_client/src/protocol/messages.g.ts. Maps are interfaces, arrays labelled tuples; 64-bit integers are
+numbers, exact up to 2**53 (session times of 104 days).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any, Final
+
+import msgspec
+
+from iris_session.codegen import rigid_reference
+from iris_session.codegen.schema import UNIONS, Field, Struct, Type, all_structs, enum_doc, enums
+from iris_session.protocol import arrays, server_messages
+from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol.scene import MAX_SCENE_BYTES
+from iris_session.protocol.scene_names import SCENE_VERSION
+
+HEAD: Final = """\
+// Messages of the iris-session protocol. Written by `python -m iris_session.codegen typescript`: do not edit.
+//
+// Fields with a `?` may be missing in what is received: their value is then that of `DEFAULTS`. Values of open
+// enumerations may be others than those listed.
+// Some types are called like those of three.js and of browsers: `import type * as wire` keeps them apart.
+"""
+
+_SCALARS: Final = {"bool": "boolean", "int": "number", "float": "number", "str": "string", "bytes": "Uint8Array"}
+
+
+def typescript() -> str:
+    """Text of messages.g.ts."""
+    parts = [HEAD.rstrip("\n"), _constants(), *_enums()]
+    parts.extend(_tuple(struct) if struct.array_like else _interface(struct) for struct in all_structs())
+    parts.extend(_union(name, members) for name, members in UNIONS.items())
+    parts += [_defaults(), _value_defaults()]
+    return "\n\n".join(parts) + "\n"
+
+
+def _constants() -> str:
+    return "\n".join(
+        [
+            f"export const PROTOCOL_VERSION = {PROTOCOL_VERSION};",
+            f'export const TOPIC_RIGID = "{server_messages.TOPIC_RIGID.decode()}";',
+            f'export const TOPIC_PRESENCE = "{server_messages.TOPIC_PRESENCE.decode()}";',
+            f"export const RIGID_FORMAT = {rigid_reference.FORMAT};",
+            "/** Edge of the position lattice [m]. */",
+            f"export const RIGID_LATTICE_M = {rigid_reference.LATTICE_M!r};",
+            f"export const RIGID_POSITION_BITS = {rigid_reference.POSITION_BITS};",
+            f"export const RIGID_ROTATION_CENTRE = {rigid_reference.ROTATION_CENTRE};",
+            f"export const SCENE_VERSION = {SCENE_VERSION};",
+            f"export const MAX_SCENE_BYTES = {MAX_SCENE_BYTES};",
+            f'export const ARRAYS_MAGIC = "{arrays.MAGIC.decode()}";',
+        ]
+    )
+
+
+def _enums() -> Iterator[str]:
+    for name, values in enums().items():
+        rows = [f"  {key}: {json.dumps(value)}," for key, value in values.items()]
+        known = f"(typeof {name})[keyof typeof {name}]"
+        doc = _doc(enum_doc(name))
+        # `string & {}` keeps the known values in the editor's completion.
+        yield "\n".join(
+            [
+                *doc,
+                f"export const {name} = {{",
+                *rows,
+                "} as const;",
+                f"export type {name} = {known} | (string & {{}});",
+            ]
+        )
+
+
+def _doc(text: str) -> list[str]:
+    if not text:
+        return []
+    lines = text.replace("*/", "* /").split("\n")
+    if len(lines) == 1:
+        return [f"/** {lines[0]} */"]
+    return ["/**", *(f" * {line}".rstrip() for line in lines), " */"]
+
+
+def _interface(struct: Struct) -> str:
+    rows = []
+    if struct.tag:
+        rows.append(f"  {struct.tag_field}: {json.dumps(struct.tag)};")
+    for field in struct.fields:
+        rows.append(f"  {field.name}{'' if field.required else '?'}: {_name(field)};")
+    return "\n".join([*_doc(struct.doc), f"export interface {struct.name} {{", *rows, "}"])
+
+
+def _tuple(struct: Struct) -> str:
+    rows = [f"  {field.name}{'' if field.required else '?'}: {_name(field)}," for field in struct.fields]
+    return "\n".join([*_doc(struct.doc), f"export type {struct.name} = [", *rows, "];"])
+
+
+def _name(field: Field) -> str:
+    if field.enum and field.type.base == "str":
+        return field.enum
+    if field.enum:
+        return f"{field.enum}[]"
+    return _type(field.type) + (" | null" if field.type.optional else "")
+
+
+def _type(kind: Type) -> str:
+    if kind.base in _SCALARS:
+        return _SCALARS[kind.base]
+    if kind.base in ("struct", "union"):
+        return kind.name
+    assert kind.item is not None
+    item = _type(kind.item)
+    if kind.base == "map":
+        return f"Record<string, {item}>"
+    return f"[{', '.join([item] * kind.length)}]" if kind.length else f"{item}[]"
+
+
+def _union(name: str, members: tuple[type[msgspec.Struct], ...]) -> str:
+    rows = "\n".join(f"  | {member.__name__}" for member in members)
+    return f"export type {name} =\n{rows};"
+
+
+def _defaults() -> str:
+    """Defaults of the optional fields of every message, event and operation, by tag."""
+    rows = []
+    for struct in all_structs():
+        if struct.tag:
+            values = {field.name: field.default for field in struct.fields if not field.required}
+            inner = ", ".join(f"{name}: {_value(value)}" for name, value in values.items())
+            rows.append(f"  {struct.tag}: {{ {inner} }}," if inner else f"  {struct.tag}: {{}},")
+    doc = _doc("Values of the fields that a message, event or operation may leave out, by its tag.")
+    return "\n".join([*doc, "export const DEFAULTS = {", *rows, "} as const;"])
+
+
+def _value_defaults() -> str:
+    """Defaults of the optional fields of maps without a tag, by name."""
+    rows = []
+    for struct in all_structs():
+        values = {field.name: field.default for field in struct.fields if not field.required}
+        if values and not struct.tag and not struct.array_like:
+            rows.append(f"  {struct.name}: {{")
+            rows.extend(f"    {name}: {_value(value)}," for name, value in values.items())
+            rows.append("  },")
+    doc = _doc("Values of the fields that other maps may leave out, by the name of their type.")
+    return "\n".join([*doc, "export const VALUE_DEFAULTS = {", *rows, "} as const;"])
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bytes):
+        return "new Uint8Array()"
+    return json.dumps(msgspec.to_builtins(value))

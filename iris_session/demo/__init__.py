@@ -1,0 +1,1 @@
+"""Demos: scenes that come with the package, who does what in them, and running one as a whole session."""

@@ -1,0 +1,106 @@
+"""Scenes that are known by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
+
+Each comes with the place of its alignment sheet. Names like `arms4` say how many arms there are.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import mujoco
+
+from anchors.pose import IDENTITY_QUAT, PoseTuple
+from iris_session.demo.scene_names import SCENE_NAMES
+from iris_session.demo.scenes import free_bodies_scene, n_arms_scene, scene_path
+from iris_session.demo.scenes.aloha import SHEET_Z, aloha_scene
+from iris_session.demo.scenes.deformables import cloth_scene, soft_scene
+from iris_session.demo.scenes.iiwa import iiwa_scene
+from iris_session.demo.scenes.parts import add_sheet, sheet_place
+from iris_session.physics import load_model
+from iris_session.session.config import DEFAULT_ANCHORS, DEFAULT_SHEET_M
+from iris_session.session.errors import ConfigError
+
+#: Id of the sheet in every scene here.
+ANCHOR_ID: Final = next(iter(DEFAULT_ANCHORS))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A model, and where its sheet lies: the default is for scenes that do not say."""
+
+    model: mujoco.MjModel
+    anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
+
+    @property
+    def anchor_sizes(self) -> dict[str, float]:
+        """Edge of the code on each sheet [m]."""
+        return dict.fromkeys(self.anchors, DEFAULT_SHEET_M)
+
+
+def arms(n: int) -> Scene:
+    """`n` arms drawn from primitives around a round table."""
+    spec = n_arms_scene(n)
+    add_sheet(spec, sheet_place(n))
+    return Scene(spec.compile(), _sheet(sheet_place(n)))
+
+
+def iiwa(n: int) -> Scene:
+    """`n` KUKA iiwa 14 arms around a round table."""
+    return Scene(iiwa_scene(n).compile(), _sheet(sheet_place(n)))
+
+
+def aloha() -> Scene:
+    """Two ALOHA stations face to face."""
+    return Scene(aloha_scene().compile(), _sheet((0.0, 0.0, SHEET_Z)))
+
+
+def cloth() -> Scene:
+    """Two arms and a cloth between them."""
+    return Scene(cloth_scene().compile(), _sheet(sheet_place(2)))
+
+
+def soft() -> Scene:
+    """Two arms, a soft body before each, and an open box."""
+    return Scene(soft_scene().compile(), _sheet(sheet_place(2)))
+
+
+def packaged(name: str) -> Scene:
+    """An MJCF file of the package."""
+    return Scene(load_model(scene_path(name)))
+
+
+def _sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
+    return {ANCHOR_ID: (p_world, IDENTITY_QUAT)}
+
+
+#: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
+FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae, .3mf"
+#: How the scenes of `SCENE_NAMES` are made.
+SCENES: Final[dict[str, Callable[[], Scene]]] = {
+    "handover": lambda: packaged("handover"),
+    "arm": lambda: packaged("arm"),
+    "arms": lambda: arms(8),
+    "iiwa": lambda: iiwa(2),
+    "aloha": aloha,
+    "cloth": cloth,
+    "soft": soft,
+    "bodies": lambda: Scene(free_bodies_scene().compile()),
+}
+NUMBERED: Final[dict[str, Callable[[int], Scene]]] = {"arms": arms, "iiwa": iiwa}
+
+
+def scene_by_name(name: str) -> Scene:
+    """Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot."""
+    if name in SCENES:
+        return SCENES[name]()
+    match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
+    if match is None or match[1] not in NUMBERED:
+        names = ", ".join(SCENE_NAMES)
+        raise ConfigError(f"no scene is called '{name}'. Scenes: {names}; or give a file ({FILES})")
+    try:
+        return NUMBERED[match[1]](int(match[2]))
+    except ValueError as error:  # out of range
+        raise ConfigError(f"scene '{name}': {error}") from error

@@ -1,0 +1,88 @@
+"""KUKA LBR iiwa 14 arms around a round table: the scene of `iris-session demo iiwa`.
+
+The model is that of MuJoCo Menagerie, from `IRIS_DATA`. The arm comes without a gripper: it gets the parallel gripper
+of our own `arm.xml` on its flange. World, names and objects as in `n_arms_scene`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from iris_session.demo.scenes.generators import (
+    ARM_FILE,
+    FINGER_OPEN,
+    add_object,
+    add_round_table,
+    arm_names,
+    bearing_of,
+    circle_radius,
+    hue,
+    place_arm,
+    room,
+)
+from iris_session.demo.scenes.models import model_file, read_model
+from iris_session.demo.scenes.parts import add_sheet, sheet_place
+from iris_session.protocol.common import Vec3
+
+#: Joint positions with the gripper pointing down, 0.50 m in front of the base and 0.35 m above it [rad].
+IIWA_HOME: Final = (0.0, 0.3225, 0.0, -1.658, 0.0, 1.1611, 0.0)
+MOST_ARMS: Final = 8
+#: Two arms stand so far from the middle [m]; more of them farther, and so far from their neighbours.
+_TWO: Final = 0.75
+_LEAST_RADIUS, _APART = 1.0, 1.1
+_REACH: Final = 0.62  # from a base to the object in front of it [m]
+
+
+def iiwa_radius(n: int) -> float:
+    """Radius [m] of the circle on which `n` arms stand."""
+    return _TWO if n <= 2 else circle_radius(n, _LEAST_RADIUS, _APART)
+
+
+def iiwa_scene(n: int = 2) -> Any:
+    """An `mujoco.MjSpec` with `n` (1 to 8) arms, a hammer or board for every two, a sheet, keyframe `home`.
+
+    Raises `ValueError` when `n` is out of range, `ModelNotFoundError` when `IRIS_DATA` lacks the model.
+    """
+    if not 1 <= n <= MOST_ARMS:
+        raise ValueError(f"iiwa_scene makes 1 to {MOST_ARMS} arms, not {n}")
+    path = model_file("kuka_iiwa_14", "iiwa14.xml")
+    radius = iiwa_radius(n)
+    spec = room("iiwa")
+    add_round_table(spec, radius + 0.30)
+    for i, name in enumerate(arm_names(n)):
+        spec.attach(_arm(path), prefix=f"{name}/", frame=place_arm(spec, radius, bearing_of(i, n)))
+        flange = spec.site(f"{name}/attachment_site")
+        frame = spec.body(f"{name}/link7").add_frame(pos=flange.pos, quat=flange.quat)
+        frame.attach_body(_gripper(hue(i / n)).body("hand"), f"{name}/", "")
+    if hasattr(spec, "dedup_assets"):  # MuJoCo 4: the meshes of the arms once
+        spec.dedup_assets()
+    qpos = [*IIWA_HOME, FINGER_OPEN, FINGER_OPEN] * n
+    n_objects = (n + 1) // 2
+    for k in range(n_objects):
+        qpos += add_object(spec, k, n_objects, radius - _REACH)
+    add_sheet(spec, sheet_place(n))
+    spec.add_key(name="home", qpos=qpos, ctrl=[*IIWA_HOME, FINGER_OPEN] * n)
+    return spec
+
+
+def _arm(path: Path) -> Any:
+    """One arm. Its controller compensates gravity, as the real one does."""
+    arm = read_model(path)
+    for light in list(arm.lights):
+        arm.delete(light)
+    for body in arm.bodies:
+        if body.name != "world":
+            body.gravcomp = 1.0
+    return arm
+
+
+def _gripper(rgb: Vec3) -> Any:
+    """The arm of `arm.xml`, of which only what is about its hand is left to be attached."""
+    import mujoco
+
+    gripper = mujoco.MjSpec.from_file(str(ARM_FILE))
+    gripper.material("accent").rgba = [*rgb, 1.0]
+    for actuator in [a for a in gripper.actuators if a.name != "gripper"]:
+        gripper.delete(actuator)
+    return gripper

@@ -1,0 +1,243 @@
+"""`hello`: who may knock, as whom; and `Welcome` once the authority has let them in. Keys and tokens end here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from iris_session.front.audit import AuditTrail
+from iris_session.front.connection_guard import Doors
+from iris_session.front.connections import ClientTable, Connection, Outbox, Peer, Route
+from iris_session.front.shares import HelloShares, connections_of_one
+from iris_session.link.config import FrontConfig, Ports
+from iris_session.link.sockets import peer_of
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.entries import Entry, Join
+from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.names import AuditKind, RefusalCode, Role
+from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
+from iris_session.protocol.steps import Admitted
+from iris_session.protocol.token_bucket import Drops
+from iris_session.security import fingerprint
+from iris_session.security.keyring import Keyring, roles_behind
+from iris_session.security.resume_tokens import ResumeTokens
+
+SECRET_BYTES = 16  # 128 bits, made by the client
+
+
+class _RefusedError(Exception):
+    """Ends the handling of one hello."""
+
+    def __init__(self, code: str, message: str, advice: str = "") -> None:
+        super().__init__(message)
+        self.answer = Refused(code, message, advice)
+
+
+class Admission:
+    """Accepts or refuses `hello`."""
+
+    def __init__(
+        self,
+        config: FrontConfig,
+        ports: Ports,
+        clients: ClientTable,
+        outbox: Outbox,
+        drops: Drops,
+        tokens: ResumeTokens,
+        keyring: Keyring,
+        audit: AuditTrail,
+        doors: Doors,
+    ) -> None:
+        self._config = config
+        self._ports = ports
+        self._clients = clients
+        self._outbox = outbox
+        self._drops = drops
+        self._tokens = tokens
+        self._keyring = keyring
+        self._audit = audit
+        self._doors = doors
+        #: Called when somebody is let in, before he is told: by then every channel must know him.
+        self.lets_in: list[Callable[[], None]] = []
+        self._hellos = HelloShares(config.limits)
+        self._knocks: dict[int, RateLimiter] = {}
+
+    def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
+        """Answers a refusal itself, and gives no entry then."""
+        try:
+            connection, join = self._accept(route, peer, hello, now_ns)
+        except _RefusedError as refused:
+            self._drops.count(f"hello_{refused.answer.code}")
+            self._outbox.send_to_route(route, refused.answer)
+            return None
+        connection.last_heard_ns = now_ns
+        self._clients.add(connection)
+        return Entry(connection.number, connection.number, now_ns, join)
+
+    def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
+        if not self._may_knock(route, peer, now_ns):
+            raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
+        gateway = self._gateway(route, peer, now_ns)
+        key_id = self._key_id(peer, hello, gateway)
+        if self._doors.barred(key_id, now_ns):
+            raise _RefusedError(
+                RefusalCode.RATE, "this client was cut off: it sent a flood", "send less; try again soon"
+            )
+        roles = self._roles(key_id, gateway)
+        address = peer_of(peer.descriptor)
+        resume_of = self._resume(hello, key_id, address[0], now_ns)
+        # Who comes back replaces a connection that may still be counted: as many again, so that it is bounded.
+        limit = self._config.limits.connections
+        if len(self._clients) >= (2 * limit if resume_of else limit):
+            raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
+        share = connections_of_one(limit)
+        if not resume_of and self._held_by(gateway.key_id if gateway else key_id) >= share:
+            raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
+        number = self._tokens.new_connection()
+        connection = Connection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
+        join = Join(
+            key_id,
+            hello.role,
+            hello.name,
+            hello.software,
+            hello.devices,
+            hello.capabilities,
+            hello.alignment,
+            resume_of,
+            connection.gateway,
+            roles,
+        )
+        return connection, join
+
+    def _may_knock(self, route: Route, peer: Peer, now_ns: int) -> bool:
+        """Bounds the hellos of one TCP connection (a gateway's are those of many people), of one key, and of all."""
+        if not route.on_behalf_of:
+            knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
+            if not knocks.allow(Hello, now_ns):
+                return False
+        return self._hellos.take(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+
+    def _held_by(self, key_id: str) -> int:
+        """Connections of one key, people behind it included."""
+        connections = self._clients.by_number
+        gateways = {number for number, one in connections.items() if one.key_id == key_id}
+        return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
+
+    def forget_peer(self, descriptor: int) -> None:
+        """A TCP connection was closed: its descriptor may become another's."""
+        self._knocks.pop(descriptor, None)
+
+    def gateway(self, routing_id: bytes, peer: Peer) -> Connection | None:
+        """The admitted gateway that this peer is."""
+        gateway = self._clients.find(Route(routing_id), peer)
+        return gateway if gateway is not None and gateway.admitted and gateway.hello.role == Role.GATEWAY else None
+
+    def forged(self, route: Route, peer: Peer, now_ns: int) -> None:
+        """Somebody who is no gateway spoke on behalf of another."""
+        address = peer_of(peer.descriptor)[0]
+        sender = self._clients.find(Route(route.routing_id), peer)
+        self._audit.note(
+            AuditKind.GATEWAY_REFUSED,
+            now_ns,
+            subject=sender.key_id if sender is not None else peer.user_id,
+            name=sender.hello.name if sender is not None else "",
+            address=address,
+            detail=f"on behalf of {route.on_behalf_of}",
+        )
+
+    def _gateway(self, route: Route, peer: Peer, now_ns: int) -> Connection | None:
+        """The gateway that speaks, `None` for a client of its own."""
+        if not route.on_behalf_of:
+            return None
+        gateway = self.gateway(route.routing_id, peer)
+        if gateway is None:
+            self.forged(route, peer, now_ns)
+            raise _RefusedError(
+                RefusalCode.GATEWAY_ONLY,
+                "only an admitted participant with role 'gateway' may speak on behalf of others",
+                "leave on_behalf_of empty",
+            )
+        return gateway
+
+    def _key_id(self, peer: Peer, hello: Hello, gateway: Connection | None) -> str:
+        if gateway is None and peer.user_id:
+            return peer.user_id
+        if len(hello.secret) < SECRET_BYTES:
+            raise _RefusedError(
+                RefusalCode.IDENTITY,
+                f"hello has a secret of {len(hello.secret)} bytes, at least {SECRET_BYTES} are needed",
+                "make 16 random bytes once, keep them, and send them in every hello",
+            )
+        return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
+
+    def _roles(self, key_id: str, gateway: Connection | None) -> tuple[str, ...]:
+        """What the key may join as, empty for any role."""
+        entry = self._keyring.find(gateway.key_id if gateway else key_id)
+        if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
+            raise _RefusedError(
+                RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
+            )
+        roles = () if entry is None else entry.roles
+        return roles if gateway is None else roles_behind(roles)
+
+    def _resume(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
+        if not hello.resume_token:
+            return ""
+        participant_id = self._tokens.find(hello.resume_token, key_id)
+        if participant_id is None:
+            self._audit.note(
+                AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
+            )
+            raise _RefusedError(
+                RefusalCode.RESUME_TOKEN, "this resume token is used, unknown, or of another key", "join without one"
+            )
+        return participant_id
+
+    def welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
+        """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over. `tick_period_ns`: of
+        the present scene."""
+        connection = self._clients.by_number.get(admitted.connection)
+        if connection is None:
+            return
+        config = self._config
+        gateway = self._clients.by_number.get(connection.gateway)
+        behind = gateway.key_id if gateway is not None else ""
+        token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
+        connection.admitted = True
+        self._keyring.welcomed(connection.key_id)
+        connection.participant_id = admitted.participant_id
+        for let_in in self.lets_in:
+            let_in()
+        self._outbox.send(
+            connection,
+            Welcome(
+                config.session_id,
+                config.session_name,
+                config.session_kind,
+                admitted.participant_id,
+                connection.number,
+                admitted.role,
+                token,
+                admitted.resumed,
+                now_ns,
+                config.heartbeat_ns,
+                tick_period_ns,
+                config.state_period_ns,
+                Endpoints(
+                    self._ports.state,
+                    self._ports.media,
+                    self._ports.assets,
+                    config.web_port,
+                    self._ports.media_ingest,
+                ),
+                self._ports.key_fingerprint,
+            ),
+        )
+
+    def left(self, participant_id: str) -> None:
+        """A participant is gone for good: its tokens open nothing any more."""
+        self._tokens.left(participant_id)
+
+    def confirmed(self, connection: Connection) -> None:
+        """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
+        if connection.hello.resume_token:
+            self._tokens.retire(connection.hello.resume_token)

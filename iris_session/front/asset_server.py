@@ -1,0 +1,303 @@
+"""Sends assets: a thread of the front with a ZeroMQ context of its own, below everything else.
+
+The context's I/O thread, which copies and encrypts, has a lower priority than all other threads of the front. This
+thread has not: it holds Python's lock for moments, and one that is not let run while it holds it would stop the front.
+It makes pauses instead, whenever the front's loop is late.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final, NamedTuple
+
+import zmq
+
+from iris_session.assets.chunk_scheduler import ADVICE, AssetHub, Reader
+from iris_session.assets.mapped_files import AssetFiles
+from iris_session.front.media.connection_guard import MediaDoors
+from iris_session.link.config import MILLISECOND, FrontConfig
+from iris_session.link.sockets import open_assets, readable, watch_tcp
+from iris_session.protocol.assets import AssetChunk, AssetRefused
+from iris_session.protocol.codec import decode_asset_request, encode_asset_header
+from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
+from iris_session.security import KeyPair, fingerprint
+from iris_session.security.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
+from iris_session.system.priority import made_below
+
+IDLE_MS: Final = 50
+#: Requests taken, and chunks sent, before the rest is looked at.
+ROUND: Final = 64
+CHUNKS: Final = 2
+#: While the front's loop is late, one chunk goes out in so long: the slowest headset still gets its scene.
+YIELD_MS: Final = 5
+#: After a fault of ours nothing is done for so long: one that comes back must not take a whole processor.
+FAULT_S: Final = 0.25
+#: As plain integers: operations on the enumerations take longer than what they are for.
+_DONTWAIT: Final = int(zmq.DONTWAIT)
+_MORE: Final = int(zmq.DONTWAIT | zmq.SNDMORE)
+#: Of one reader, that wait to be read: far more than all its requests.
+REQUEST_BYTES: Final = 65_536
+
+
+#: A folder, with the addresses of what is served from it.
+Store = tuple[str, tuple[str, ...]]
+
+
+class Table(NamedTuple):
+    """What the thread has to know, replaced as a whole. `listeners`: connections that may ask, with the key by which
+    they come (empty without encryption); `marks`: keys that may connect; `stores`: what is served."""
+
+    listeners: Mapping[int, str] = {}
+    marks: frozenset[str] = frozenset()
+    stores: tuple[Store, ...] = ()
+
+
+class Tallied(NamedTuple):
+    """Counters since the start, and readers that wait now. `reasons`: refusals and everything thrown away."""
+
+    bytes: int
+    chunks: int
+    requests: int
+    waiting: int
+    reasons: Mapping[str, int]
+
+
+class AssetSockets:
+    """The channel's sockets, in a context of their own. Raises `FrontError`."""
+
+    def __init__(self, config: FrontConfig, key: KeyPair | None) -> None:
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(1)
+        self.zap: zmq.Socket[bytes] | None = None
+        if key is not None:  # before anybody can connect: libzmq lets everybody in while nobody decides
+            self.zap = self.context.socket(zmq.ROUTER)
+            self.zap.bind(ZAP_ENDPOINT)
+        try:
+            self.socket = open_assets(self.context, config, key)
+        except BaseException:
+            self.close()
+            raise
+        self.monitor = watch_tcp(self.socket, "assets")
+
+    def close(self) -> None:
+        self.context.destroy(linger=0)
+
+
+def open_below(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
+    """`AssetSockets` whose I/O thread gives way to all others. Raises `FrontError`."""
+    return made_below(lambda: AssetSockets(config, key))
+
+
+class AssetServer:
+    """`publish`, `late_until_ns` and `tallied` are for other threads; everything else belongs to ours."""
+
+    def __init__(self, sockets: AssetSockets, doors: MediaDoors, now_ns: Callable[[], int]) -> None:
+        self._sockets = sockets
+        self._socket = sockets.socket
+        self._doors = doors
+        self._now_ns = now_ns
+        self._encrypted = sockets.zap is not None
+        self._files = AssetFiles()
+        self._hub = AssetHub(self._files.size)
+        self._table = self._taken = Table()
+        self._counts = {"bytes": 0, "chunks": 0, "requests": 0}
+        self._reasons: dict[str, int] = {}
+        self._lock = threading.Lock()  # of the counters
+        self._stopping = False
+        self._said = ""
+        self._thread = threading.Thread(target=self._run, name="iris-assets", daemon=True)
+        #: Session time until which the front's loop wants to be left alone.
+        self.late_until_ns = 0
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def publish(self, table: Table) -> None:
+        """Who may ask for what: whoever hears of it after this call, and asks then, is answered by it."""
+        self._table = table
+
+    def tallied(self) -> Tallied:
+        with self._lock:
+            counts = self._counts
+            reasons = dict(self._reasons)
+            return Tallied(counts["bytes"], counts["chunks"], counts["requests"], self._hub.waiting, reasons)
+
+    def close(self) -> None:
+        """Waits for the end of the thread, then frees the sockets."""
+        self._stopping = True
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._doors.close()
+        self._sockets.close()
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._stopping:
+            try:
+                self._serve()
+            except Exception as error:  # a fault of ours: it costs what was under way, and assets alone
+                self._begin_anew(error)
+
+    def _begin_anew(self, error: Exception) -> None:
+        """Counts every fault, and tells each the first time in a row. Readers ask again by new connections."""
+        for descriptor in self._hub.begin_anew():
+            self._doors.close_one(descriptor, "")
+        self._count(["assets_fault"])
+        if repr(error) != self._said:
+            self._said = repr(error)
+            text = f"iris-session: a fault in the thread of assets, which goes on: {self._said}\n"
+            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+        time.sleep(FAULT_S)
+
+    def _serve(self) -> None:
+        poller = zmq.Poller()
+        for one in (self._socket, self._sockets.zap):
+            if one is not None:
+                poller.register(one, zmq.POLLIN)
+        while not self._stopping:
+            poller.poll(self._patience_ms())
+            self._look_at_table()
+            if self._sockets.zap is not None:
+                answer_zap(self._sockets.zap, self._user_id)
+            self._come_and_gone()
+            self._count(self._doors.turn(self._now_ns()))
+            self._take_requests()
+            self._send_chunks()
+
+    def _patience_ms(self) -> int:
+        due_ns = self._hub.next_turn_ns()
+        if due_ns is None:
+            return IDLE_MS
+        now_ns = self._now_ns()
+        if now_ns < self.late_until_ns:
+            return YIELD_MS
+        return min(IDLE_MS, max(0, -(-(due_ns - now_ns) // MILLISECOND)))
+
+    def _look_at_table(self) -> None:
+        table = self._table
+        if table is self._taken:
+            return
+        if table.stores != self._taken.stores:
+            self._files.serve(table.stores)
+        self._taken = table
+        for descriptor in self._hub.allow(table.listeners):
+            self._doors.close_one(descriptor, "")
+
+    def _user_id(self, request: list[bytes]) -> str:
+        mark = fingerprint(request[6]) if asks_with_curve(request) else ""
+        if mark in self._taken.marks:
+            return mark
+        self._count(["assets_unknown_key"])
+        return ""
+
+    def _come_and_gone(self) -> None:
+        for descriptor in self._doors.read(self._now_ns()):
+            self._hub.left(descriptor)
+
+    def _count(self, reasons: Iterable[str]) -> None:
+        for reason in filter(None, reasons):
+            with self._lock:
+                self._reasons[reason] = self._reasons.get(reason, 0) + 1
+
+    # --- what is asked -----------------------------------------------------------------------------------------------
+
+    def _take_requests(self) -> None:
+        for _ in range(ROUND):
+            if not readable(self._socket):
+                return
+            route = self._socket.recv(_DONTWAIT)
+            self._look_at_table()  # a scene that was told of since the last look may be what is asked for
+            frame = self._socket.recv(_DONTWAIT, copy=False)
+            lengths = [len(frame)]
+            more = frame.more
+            while more:
+                extra = self._socket.recv(_DONTWAIT, copy=False)
+                lengths.append(len(extra))
+                more = extra.more
+            try:
+                descriptor = int(frame.get(zmq.SRCFD))
+                user = str(frame.get("User-Id")) if self._encrypted else ""
+            except zmq.ZMQError:
+                self._count(["assets_unversioned_peer"])
+                continue
+            self._come_and_gone()
+            refused = self._take(route, descriptor, user, frame, single=len(lengths) == 1)
+            self._count([self._doors.heard(descriptor, user, lengths, counts=refused)])
+
+    def _take(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
+        """One message. True: it was refused."""
+        now_ns = self._now_ns()
+        request_id, address = 0, ""
+        with self._lock:
+            self._counts["requests"] += 1
+        try:
+            request = decode_asset_request(frame.buffer if single else b"")
+        except VersionError:
+            reason: str = AssetRefusal.VERSION
+        except ProtocolError:
+            reason = AssetRefusal.MALFORMED
+        else:
+            request_id, address = request.request_id, request.address
+            reason = self._hub.ask(route, descriptor, user, request, now_ns)
+        if reason:
+            self._refuse(route, request_id, address, reason)
+        return bool(reason)
+
+    def _refuse(self, route: bytes, request_id: int, address: str, reason: str) -> None:
+        """At once, or behind what the reader waits for."""
+        self._count([f"assets_{reason}"])
+        if self._hub.queues(route) or not self._told(route, _refusal(request_id, address, reason)):
+            kept = self._hub.refuse(route, request_id, address, reason)
+            self._count([] if kept else ["assets_refusal_unsent"])
+
+    def _told(self, route: bytes, refusal: bytes) -> bool:
+        """False: who is to be told reads nothing, or is gone."""
+        try:
+            self._socket.send_multipart((route, refusal), _DONTWAIT)
+        except zmq.ZMQError:
+            return False
+        return True
+
+    # --- what is sent ------------------------------------------------------------------------------------------------
+
+    def _send_chunks(self) -> None:
+        late = self._now_ns() < self.late_until_ns
+        for _ in range(1 if late else CHUNKS):
+            reader = self._hub.turn(self._now_ns())
+            if reader is None:
+                return
+            self._send_chunk(reader)
+
+    def _send_chunk(self, reader: Reader) -> None:
+        wanted = reader.queue[0]
+        chunk = None if wanted.refused else self._files.chunk(wanted.address, wanted.offset, wanted.length)
+        try:
+            if chunk is None:  # or the scene changed twice since it was asked for
+                reason = wanted.refused or AssetRefusal.UNKNOWN
+                refusal = _refusal(wanted.request_id, wanted.address, reason)
+                self._socket.send_multipart((reader.route, refusal), _DONTWAIT)
+            else:
+                head = AssetChunk(PROTOCOL_VERSION, wanted.request_id, wanted.address, wanted.offset, wanted.total)
+                self._socket.send(reader.route, _MORE)
+                self._socket.send(encode_asset_header(head), _MORE)
+                self._socket.send(chunk, _DONTWAIT, copy=False)
+        except zmq.Again:
+            self._hub.full(reader, self._now_ns())
+            return
+        except zmq.ZMQError:  # gone; its end will be told of
+            self._hub.forget(reader.route)
+            return
+        self._hub.sent(reader)
+        if chunk is not None:
+            with self._lock:
+                self._counts["bytes"] += wanted.length
+                self._counts["chunks"] += 1
+
+
+def _refusal(request_id: int, address: str, reason: str) -> bytes:
+    return encode_asset_header(AssetRefused(PROTOCOL_VERSION, request_id, address, reason, ADVICE[reason]))

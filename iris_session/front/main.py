@@ -1,0 +1,53 @@
+"""The front process: `python -m iris_session.front.main`, with `FrontStart` on standard input."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+import msgspec
+
+from iris_session.front.loop import ENDED, ORPHANED, Front
+from iris_session.link.config import FrontError, FrontStart
+from iris_session.link.sockets import raise_descriptor_limit
+from iris_session.system.parent import die_with_parent, parent_ends, parent_is
+
+
+def main() -> int:
+    """Serves one session. Exit status 1 when the front could not start; the link has told why."""
+    start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=FrontStart)
+    raise_descriptor_limit()
+    try:
+        front = Front(start)
+    except FrontError:
+        return 1
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        if number != signal.SIGHUP:
+            front.end(ENDED)
+        elif not parent_is(start.parent_pid):
+            front.end(ORPHANED)
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, on_signal)
+    die_with_parent(signal.SIGHUP)
+    # Everything made so far lives as long as the process; the loop collects the rest when it is idle.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        front.run()
+    finally:
+        front.close()
+        if (front.cut_off or front.ended == ORPHANED) and parent_ends(start.parent_pid):
+            # Killed: nobody else removes the folder of the link.
+            shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Rigid state and presence on the PUB socket: encodes each state frame once, stamps it when it is sent."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import zmq
+
+from iris_session.link.config import SceneInfo
+from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID, StateHeader
+from iris_session.streams.rigid import RigidEncoder
+
+POSE_BYTES = 56  # seven float64
+#: How far back delays are told: what was late longer ago says nothing about now.
+RECENT_NS = 5_000_000_000
+_encoder = msgspec.msgpack.Encoder()
+_decode_header = msgspec.msgpack.Decoder(StateHeader).decode
+
+
+class _RawPresence(msgspec.Struct, array_like=True):
+    """`Presence` on the wire, its items encoded already."""
+
+    session_time: int
+    published_ns: int
+    items: msgspec.Raw
+
+
+class StatePublisher:
+    """Latest value only: nothing waits here, and a subscriber that does not keep up loses frames in its own queue."""
+
+    def __init__(
+        self, state: zmq.Socket[bytes], scene: SceneInfo, now_ns: Callable[[], int], first_seq: int = 1
+    ) -> None:
+        self._state: zmq.Socket[bytes] | None = state
+        self._now_ns = now_ns
+        self._next_seq = first_seq
+        self.frames = 0
+        #: When each of the newest frames was handed to the socket, and how long after the end of its tick; without
+        #: those that are sent again while their source is silent.
+        self._delays: deque[tuple[int, int]] = deque(maxlen=300)
+        self._shown_ns = -1
+        self.scene = scene
+        self._begin()
+
+    @property
+    def newest_delay_ns(self) -> int:
+        """End of the tick of the newest frame until it was handed to the socket, 0 before the first."""
+        return self._delays[-1][1] if self._delays else 0
+
+    def delays_ns(self) -> list[int]:
+        """The same of all frames of the last seconds, oldest first."""
+        since_ns = self._now_ns() - RECENT_NS
+        return [delay for at_ns, delay in self._delays if at_ns > since_ns]
+
+    def use_socket(self, state: zmq.Socket[bytes] | None) -> None:
+        """Sends on another socket from now on, and closes the one before. `None`: nothing is sent for a while."""
+        if self._state is not None:
+            self._state.close(linger=0)
+        self._state = state
+
+    def tend(self) -> None:
+        """Lets libzmq do what it does only when asked for something: else, while no state is sent, all that became of
+        connections would pile up."""
+        if self._state is not None:
+            self._state.get(zmq.EVENTS)
+
+    def set_scene(self, scene: SceneInfo) -> None:
+        """Takes over another scene: later frames have its bodies. A patch of the present one moves none of them."""
+        before, self.scene = self.scene, scene
+        if scene.patches and scene.bodies == before.bodies:
+            return
+        self._begin()
+
+    def _begin(self) -> None:
+        self._encoder = RigidEncoder(len(self.scene.bodies), self._next_seq)
+        self._published = False
+
+    def publish(self, header: bytes, poses: bytes) -> bool:
+        """Encodes and sends one state. `header`: encoded `StateHeader` without its `published_ns` and `*_seq`.
+
+        False: the poses are not those of the present scene.
+        """
+        n = len(self.scene.bodies)
+        if len(poses) != n * POSE_BYTES:
+            return False
+        head = _decode_header(header)
+        frame = self._encoder.encode(np.frombuffer(poses, np.float64).reshape(n, 7), head.scene_epoch)
+        self._published = True
+        self._next_seq = frame.state_seq + 1
+        published_ns = self._now_ns()
+        if head.session_time != self._shown_ns:
+            self._delays.append((published_ns, published_ns - head.session_time))
+        self._shown_ns = head.session_time
+        stamped = StateHeader(
+            head.scene_epoch,
+            head.scene_revision,
+            head.tick,
+            head.sim_time,
+            head.session_time,
+            published_ns,
+            frame.state_seq,
+            frame.base_seq,
+            head.applied,
+        )
+        if self._state is not None:
+            self._state.send_multipart((TOPIC_RIGID, _encoder.encode(stamped), frame.payload))
+            self.frames += 1
+        return True
+
+    def publish_presence(self, session_time: int, items: bytes) -> None:
+        """`items`: encoded array of `PresenceItem`, passed on as it is."""
+        if self._state is not None:
+            presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
+            self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
+
+    def keyframe(self) -> tuple[int, bytes]:
+        """`(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, or of the scene before the first."""
+        if not self._published:
+            return 0, self.scene.poses
+        seq, poses = self._encoder.keyframe()
+        return seq, poses.tobytes()

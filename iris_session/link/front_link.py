@@ -1,0 +1,211 @@
+"""The authority's side of the link to the front: entries in, decisions and state out. No thread, never waits."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import zmq
+
+from iris_session.link import messages
+from iris_session.link.config import FrontConfig, Ports, SceneInfo
+from iris_session.link.sockets import readable
+from iris_session.protocol.entries import HOST, Entry, FrontRestarted, decode_entries
+from iris_session.protocol.server_messages import ParticipantLeft, PresenceItem, StateHeader
+from iris_session.protocol.status import StatusReport
+from iris_session.protocol.steps import Decision
+
+#: Messages taken from the front in one `poll`; more than its credits allow cannot wait.
+_POLL_BOUND: Final = 64
+_SEND_QUEUE: Final = 256
+#: Decisions kept while the front does not read; when they are full the front is given up.
+_BACKLOG: Final = 4096
+#: Presence follows a state frame, so that clients are woken once for both; alone when no state came for so long.
+PRESENCE_ALONE_NS: Final = 50_000_000
+#: Longest time between two looks at the link that counts as silence of the front.
+LOOKED_NS: Final = 100_000_000
+#: State frames come at tick times, so their distance varies by a tick.
+PRESENCE_SLACK_NS: Final = 4_000_000
+
+
+class FrontLink:
+    """Talks to one front process at a time; `open` starts over for a new one.
+
+    `ports`: where the front listens, `None` until it is ready. `failure`: why it could not start. `status`: its
+    counters, and those of the fronts before it. `state_drops`: state frames that the front did not take. `overrun`:
+    it reads nothing any more.
+    """
+
+    def __init__(self, config: FrontConfig, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._config = config
+        self._monotonic_ns = monotonic_ns
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._socket: zmq.Socket[bytes] | None = None
+        self._entries: list[Entry] = []
+        self._presence: dict[tuple[str, str], PresenceItem] = {}
+        self._presence_ns = 0
+        self._sent_ns = 0
+        self._backlog: deque[tuple[bytes, bytes]] = deque()
+        self.ports: Ports | None = None
+        self.failure = ""
+        self.status = self._status_before = messages.FrontStatus(0, {}, {})
+        self._silence_ns = 0
+        self._received_ns = 0
+        self._scene: bytes | None = None
+        self.handback = b""
+        self.state_drops = 0
+        self.overrun = False
+        # Half of the front's credits are acknowledged at once: fewer wake-ups, and it is never left without credit.
+        self._acknowledge_at = max(1, config.limits.unacknowledged // 2)
+        self._taken = 0
+
+    def open(self, path: Path) -> str:
+        """Listens on a new ipc socket at `path` for the next front; gives its endpoint."""
+        if self._socket is not None:
+            self.receive()  # the last words of a front that died: an e-stop, the tokens it gave out
+            self._socket.close(linger=0)
+            if self.ports is not None:
+                self._entries.append(Entry(HOST, HOST, self.now_ns, FrontRestarted()))
+        self.ports, self.failure, self.overrun = None, "", False
+        self._status_before = msgspec.structs.replace(self.status, connections=0, dropped_by={})
+        self._scene = None  # the next front starts with it
+        self._silence_ns = 0
+        self._backlog.clear()
+        self._taken = 0
+        self._socket = self._context.socket(zmq.PAIR)
+        self._socket.setsockopt(zmq.SNDHWM, _SEND_QUEUE)
+        self._socket.setsockopt(zmq.RCVHWM, 0)  # bounded by the front's credits
+        endpoint = f"ipc://{path}"
+        self._socket.bind(endpoint)
+        return endpoint
+
+    @property
+    def silence_ns(self) -> int:
+        """How long we have looked and a front that was ready has said nothing."""
+        return self._silence_ns if self.ports is not None else 0
+
+    @property
+    def now_ns(self) -> int:
+        """Session time."""
+        return self._monotonic_ns() - self._config.origin_ns
+
+    def poll(self) -> list[Entry]:
+        """Entries since the last call, in the order to be given to the authority. Never waits."""
+        self.receive()
+        entries, self._entries = self._entries, []
+        return entries
+
+    def receive(self) -> None:
+        """Takes what waits; `poll` hands out the entries. Bounded by the front's credits. Never waits."""
+        socket = self._socket
+        now_ns = self._monotonic_ns()
+        # Only while we look: an authority that stood still itself accuses nobody.
+        self._silence_ns += min(now_ns - self._received_ns, LOOKED_NS)
+        self._received_ns = now_ns
+        if socket is None or not readable(socket):
+            return
+        self._silence_ns = 0
+        batches = 0
+        for _ in range(_POLL_BOUND):
+            kind, payload = socket.recv_multipart(zmq.DONTWAIT)
+            if kind == messages.ENTRIES:
+                self._entries += decode_entries(payload)
+                batches += 1
+            elif kind == messages.HANDBACK:
+                self.handback = payload
+            elif kind == messages.STATUS:
+                self.status = messages.add_status(self._status_before, messages.decode_status(payload))
+            elif kind == messages.READY:
+                self.ports = messages.decode_ports(payload)
+                if self._scene is not None:
+                    self._send(messages.SCENE, self._scene)
+            elif kind == messages.FAILED:
+                self.failure = payload.decode()
+            if not readable(socket):
+                break
+        self._taken += batches
+        if self._taken >= self._acknowledge_at:
+            self._send(messages.ACK, bytes((self._taken,)))
+            self._taken = 0
+
+    def send_decision(self, step: int, decision: Decision) -> None:
+        """Gives the front what leaves the process; call it in every step, it also says that the session lives."""
+        for item in decision.presence:
+            self._presence[(item.participant, item.device)] = item
+        for event in decision.events:
+            if isinstance(event.body, ParticipantLeft):
+                for key in [key for key in self._presence if key[0] == event.body.participant]:
+                    del self._presence[key]
+        if decision.outgoing or decision.events or decision.admitted or decision.dropped:
+            decided = messages.Decided(step, decision.admitted, decision.outgoing, decision.events, decision.dropped)
+            self._send(messages.DECIDED, messages.encoder.encode(decided))
+        now_ns = self._monotonic_ns()
+        if self._presence and now_ns - self._presence_ns >= PRESENCE_ALONE_NS:
+            self._send_presence(now_ns)
+        elif now_ns - self._sent_ns > messages.KEEPALIVE_NS:
+            self._send(messages.ALIVE, b"")
+
+    def _send_presence(self, now_ns: int) -> None:
+        self._presence_ns = now_ns
+        items = tuple(self._presence.values())
+        self._presence.clear()
+        self._send(messages.PRESENCE, messages.encoder.encode(items))
+
+    def send_state(self, header: StateHeader, poses: npt.NDArray[np.float64]) -> None:
+        """State after a tick: `poses` (n, 7) float64 C-contiguous, `x y z qw qx qy qz`, world, in the order of the
+        scene's bodies. The front fills `published_ns`, `state_seq` and `base_seq`. A front that does not keep up
+        loses frames, counted in `state_drops`."""
+        if self._socket is None or self.ports is None:
+            return
+        try:
+            self._socket.send_multipart(
+                (messages.STATE, messages.encoder.encode(header), np.ascontiguousarray(poses).data), zmq.DONTWAIT
+            )
+            self._sent_ns = self._monotonic_ns()
+        except zmq.Again:
+            self.state_drops += 1
+        if self._presence and self._sent_ns - self._presence_ns >= self._config.presence_period_ns - PRESENCE_SLACK_NS:
+            self._send_presence(self._sent_ns)
+
+    def send_report(self, report: StatusReport) -> None:
+        """The authority's half of the status. Only the newest counts: a front that does not read gets none."""
+        if not self._backlog:
+            self._send(messages.REPORT, messages.encoder.encode(report))
+
+    def send_scene(self, scene: SceneInfo) -> None:
+        """Another scene: later snapshots and states are of its bodies. A front that is not ready yet gets it then."""
+        self._scene = messages.encoder.encode(scene)
+        self._send(messages.SCENE, self._scene)
+
+    def send_end(self) -> None:
+        """Asks the front to tell its clients that the session ends, and to exit."""
+        self._send(messages.END, b"")
+
+    def _send(self, kind: bytes, payload: bytes) -> None:
+        """Sends in order; keeps a bounded backlog while the front does not read."""
+        if self._socket is None or self.ports is None:
+            return
+        self._backlog.append((kind, payload))
+        try:
+            while self._backlog:
+                self._socket.send_multipart(self._backlog[0], zmq.DONTWAIT)
+                self._backlog.popleft()
+        except zmq.Again:
+            self.overrun = self.overrun or len(self._backlog) > _BACKLOG
+            if self.overrun:
+                self._backlog.clear()
+            return
+        self._sent_ns = self._monotonic_ns()
+
+    def close(self) -> None:
+        """Closes the socket. The front notices by its parent's end or by `send_end`."""
+        if self._socket is not None:
+            self._socket.close(linger=200)
+            self._socket = None
+        self._context.term()

@@ -1,0 +1,241 @@
+"""Starting, watching, restarting and ending the front process. The parent's side.
+
+The only thread lives for some milliseconds, while a front is replaced: to end a process that hangs and to make another
+takes longer than a tick.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import zmq
+
+from iris_session.link.config import FrontConfig, FrontError, FrontStart, Ports, SceneInfo
+from iris_session.link.front_link import FrontLink
+from iris_session.link.media_source import MediaSource
+from iris_session.link.starvation import Starvation
+from iris_session.protocol.common import Pose
+from iris_session.system import children
+
+#: Room is left for our own names, of folder and socket.
+LONGEST_FOLDER: Final = 75
+#: A front says something at least every `link_messages.BEAT_NS`, however busy; one that does not for so long hangs.
+HANGING_NS: Final = 1_500_000_000
+#: One that gets no processor is waited for so long.
+STARVED_NS: Final = 15_000_000_000
+#: From this silence on it is seen whether it gets one.
+_QUIET_NS: Final = 500_000_000
+
+
+class FrontProcess:
+    """One front of a session, and its successors.
+
+        process = FrontProcess(config, scene)
+        ports = process.start()
+        entries = process.link.poll()
+        ...
+        if not process.alive:
+            process.restart()          # same ports, resume tokens stay valid
+        process.close()
+
+    The front runs in a session of its own, so Ctrl-C in the terminal reaches only the parent, which then closes it.
+    """
+
+    def __init__(self, config: FrontConfig, scene: SceneInfo) -> None:
+        self._scene = scene
+        self._folder = tempfile.TemporaryDirectory(prefix="iris-", dir=_folder_for_sockets())  # mode 0700
+        #: Where processes of this session hand in media, whichever front there is.
+        self.media_endpoint = f"ipc://{self._folder.name}/media"
+        self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
+        self._generation = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._replacing: threading.Thread | None = None
+        self._failure: FrontError | None = None
+        self._source = MediaSource(self.media_endpoint)
+        self._starvation = Starvation()
+        self.link = FrontLink(config)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the present front, 0 without one."""
+        return 0 if self._process is None else self._process.pid
+
+    @property
+    def scene(self) -> SceneInfo:
+        """What this front and its successors were told last."""
+        return self._scene
+
+    @property
+    def alive(self) -> bool:
+        """Whether the front runs, reads its link and says something now and then, or is being replaced."""
+        if self._replacing is not None and self._replacing.is_alive():
+            return True
+        return not self.fault
+
+    @property
+    def fault(self) -> str:
+        """What a front did that is to be replaced, empty while all is well."""
+        process = self._process
+        if process is None or process.poll() is not None:
+            return "ended"
+        if self.link.overrun:
+            return "read nothing any more"
+        return "" if not self._hangs(process.pid) else f"said nothing for {self.link.silence_ns * 1e-9:.1f} s"
+
+    def _hangs(self, pid: int) -> bool:
+        silence_ns = self.link.silence_ns
+        if silence_ns < _QUIET_NS:
+            self._starvation.clear()
+            return False
+        starved = self._starvation.look(pid, time.monotonic_ns())
+        return silence_ns > (STARVED_NS if starved else HANGING_NS)
+
+    @property
+    def restarts(self) -> int:
+        return max(0, self._generation - 1)
+
+    def start(self, timeout_s: float = 60.0) -> Ports:
+        """Starts the front and waits until it listens.
+
+        Raises `FrontError` with one line that says what to do: a port in use, a missing key, a wrong address.
+        """
+        self._process = self._spawn(self._open_link())
+        return self.wait_ready(timeout_s)
+
+    def restart(self) -> None:
+        """Replaces a front that died or hangs, on the same ports. Does not wait: `link.ports` is set when it is ready.
+
+        Raises `FrontError` when the last try has failed, because the system gives no process, or no room for its
+        files; it may be tried again.
+        """
+        self._finish_replacing()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+        ports = self.link.ports
+        if ports is not None:
+            self._config = msgspec.structs.replace(
+                self._config,
+                control_port=ports.control,
+                state_port=ports.state,
+                media_port=ports.media,
+                media_ingest_port=ports.media_ingest,
+                assets_port=ports.assets,
+            )
+        start = self._open_link()
+        self._replacing = threading.Thread(target=self._replace, args=(self._process, start), name="iris-front")
+        self._replacing.start()
+
+    def _replace(self, old: subprocess.Popen[bytes] | None, start: FrontStart) -> None:
+        if old is not None:
+            old.kill()  # dead, or it takes part no more: no step waits for its answer
+            old.wait()
+        try:
+            self._process = self._spawn(start)
+        except FrontError as error:
+            self._process, self._failure = None, error
+
+    def _finish_replacing(self) -> None:
+        if self._replacing is not None:
+            self._replacing.join()
+            self._replacing = None
+
+    def set_scene(self, scene: SceneInfo) -> None:
+        """Another scene, for this front and its successors."""
+        self._scene = scene
+        self.link.send_scene(scene)
+
+    def set_anchors(self, anchors: dict[str, Pose]) -> None:
+        """Where the anchors are now (`T_world_anchor`), for the successors of this front, which hears it by events."""
+        self._config = msgspec.structs.replace(self._config, anchors=anchors)
+
+    def wait_ready(self, timeout_s: float) -> Ports:
+        """Waits for `Ready`. Raises `FrontError` when the front fails, dies or says nothing for `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            # In this order: once the thread has ended, the process is the new one.
+            replacing = self._replacing is not None and self._replacing.is_alive()
+            running = replacing or (self._process is not None and self._process.poll() is None)
+            self.link.receive()
+            if self.link.ports is not None:
+                return self.link.ports
+            if self.link.failure or not running:
+                text = self.link.failure or str(self._failure or "")
+                text = text or "the front process ended at its start, see its messages above"
+                self.close()
+                raise FrontError(text)
+            time.sleep(0.002)
+        self.close()
+        raise FrontError(f"the front process was not ready after {timeout_s:g} s")
+
+    def _open_link(self) -> FrontStart:
+        """Listens for the next front; gives what it is to be told."""
+        self._generation += 1
+        try:
+            endpoint = self.link.open(Path(self._folder.name) / f"front-{self._generation}")
+        except zmq.ZMQError as error:
+            raise _not_started(error) from error
+        return FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
+
+    def _spawn(self, start: FrontStart) -> subprocess.Popen[bytes]:
+        try:
+            # A file instead of a pipe: a large scene must not make the parent wait until the front reads.
+            path = Path(self._folder.name) / "start"
+            path.write_bytes(msgspec.msgpack.encode(start))
+            with path.open("rb") as stdin:
+                path.unlink()
+                return subprocess.Popen(
+                    children.command("iris_session.front.main"),
+                    stdin=stdin,
+                    env=children.environment(),
+                    start_new_session=True,
+                )
+        except OSError as error:
+            raise _not_started(error) from error
+
+    def publish_media(
+        self, stream: str, frames: bytes | Mapping[str, bytes], capture_ns: int, scene_epoch: int, encoding: str
+    ) -> bool:
+        """Hands a frame to whichever front there is; see `MediaSource.publish`."""
+        return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
+
+    def _end_process(self, patience_s: float) -> None:
+        process = self._process
+        if process is None:
+            return
+        try:
+            process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            try:
+                process.wait(0.2 if patience_s else 0.05)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""
+        self._finish_replacing()
+        self._source.close()
+        self.link.send_end()
+        self._end_process(timeout_s if self.link.ports is not None else 0.0)
+        self._process = None
+        self.link.close()
+        self._folder.cleanup()
+
+
+def _not_started(error: OSError | zmq.ZMQError) -> FrontError:
+    return FrontError(f"the front process cannot be started: {error.strerror or error}")
+
+
+def _folder_for_sockets() -> str | None:
+    """The path of a Unix socket has at most 107 bytes: some TMPDIR are too long for one."""
+    return None if len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER else "/tmp"

@@ -1,0 +1,254 @@
+"""The process of the impairment proxy: its command line, the commands it takes while it runs, and a handle for others.
+
+    python -m iris_session.netsim.process --link 127.0.0.2 --profile busy-wifi --seed 1
+
+Commands, one per line on standard input, each answered by one JSON line; `@ADDRESS` picks one link, else all:
+`stall`, `resume`, `cut` (close all connections), `reset` (break them off), `roam ADDRESS` (another network: connections
+are gone without a word to the session, new ones come from that address), `profile NAME`, `start` (the profile begins
+anew, with the seed), `stats`, `quit`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import gc
+import json
+import os
+import select
+import selectors
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Final, Self
+
+from iris_session.netsim.profiles import Profile, ProfileError, load_profile
+from iris_session.netsim.proxy import Link
+from iris_session.system import children
+
+ANSWER_S: Final = 10.0
+#: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
+REALTIME_PRIORITY: Final = 2
+
+
+class ImpairmentError(Exception):
+    """The proxy cannot run; the text is one line that says why."""
+
+
+class ImpairmentProcess:
+    """A proxy in a process of its own, as a context. `links`: address -> profile (a name or a file).
+
+        with ImpairmentProcess({"127.0.0.2": "busy-wifi"}, ports=[7721, 7722]) as proxy:
+            ...  # clients join at 127.0.0.2:7721
+            proxy.do("stall")
+
+    Raises `ImpairmentError` when a port is in use or a profile unknown.
+    """
+
+    def __init__(
+        self, links: Mapping[str, str], ports: Sequence[int], *, target: str = "127.0.0.1", seed: int = 0,
+        udp: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        command = children.command(__name__, "--target", target, "--seed", str(seed), "--until-eof")
+        command += ["--ports", ",".join(map(str, ports))]
+        command += ["--udp", ",".join(map(str, udp))] if udp else []
+        for address, profile in links.items():
+            command += ["--link", f"{address}={profile}"]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=children.environment(),
+            start_new_session=True,
+        )
+        self._rest = b""
+        self._unanswered = 1
+        try:
+            self._answer("start")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def do(self, command: str) -> dict[str, Any]:
+        """One command, and its answer once it is done."""
+        self.post(command)
+        while self._unanswered > 1:
+            self._answer("an earlier command")
+        return self._answer(command)
+
+    def post(self, command: str) -> None:
+        """One command, without waiting for it."""
+        assert self._process.stdin is not None
+        self._unanswered += 1
+        try:
+            self._process.stdin.write(command.encode() + b"\n")
+            self._process.stdin.flush()
+        except OSError as error:
+            raise ImpairmentError(f"the proxy has ended with status {self._process.poll()}") from error
+
+    def close(self) -> None:
+        """Ends the process; may be called twice."""
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
+            assert pipe is not None
+            pipe.close()
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _answer(self, command: str) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        fd = self._process.stdout.fileno()
+        ready = select.poll()  # `select.select` takes no descriptor above 1023
+        ready.register(fd, select.POLLIN)
+        while b"\n" not in self._rest:
+            if not ready.poll(ANSWER_S * 1e3):
+                raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s")
+            data = os.read(fd, 65536)
+            if not data:
+                said = self._process.stderr.read().decode(errors="replace").strip().splitlines()
+                raise ImpairmentError(said[-1] if said else f"the proxy ended at {command!r}")
+            self._rest += data
+        line, _, self._rest = self._rest.partition(b"\n")
+        self._unanswered -= 1
+        answer: dict[str, Any] = json.loads(line)
+        if not answer["ok"]:
+            raise ImpairmentError(answer["error"])
+        return answer
+
+
+def obey(links: Sequence[Link], line: str) -> dict[str, Any]:
+    """Does one command of standard input; see the module docstring. Raises `ProfileError` for what it does not know."""
+    words = line.split()
+    command = words[0] if words else ""
+    named = [word.removeprefix("@") for word in words[1:] if word.startswith("@")]
+    rest = [word for word in words[1:] if not word.startswith("@")]
+    chosen = [link for link in links if not named or link.address in named]
+    if len(chosen) < len(named):
+        raise ProfileError(f"no link {' '.join(named)}: there are {', '.join(link.address for link in links)}")
+    if command == "stats":
+        return {"links": [link.stats() for link in chosen]}
+    for link in chosen:
+        if command in ("stall", "resume"):
+            link.held = command == "stall"
+            link.changed()
+        elif command in ("cut", "reset"):
+            link.break_all(reset=command == "reset")
+        elif command == "roam" and len(rest) == 1:
+            link.roam(rest[0])
+        elif command == "start":
+            link.begin(link.profile)
+        elif command == "profile" and len(rest) == 1:
+            link.begin(load_profile(rest[0]))
+        else:
+            raise ProfileError(
+                f"{line!r} is no command: stall, resume, cut, reset, roam ADDRESS, profile NAME, start, stats, quit"
+            )
+    return {}
+
+
+async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespace) -> None:
+    """Forwards until `quit`, a signal, or (with `--until-eof`) the end of standard input."""
+    loop = asyncio.get_running_loop()
+    done = asyncio.Event()
+    made = []
+    for number, (address, profile) in enumerate(links):
+        link = Link(address, options.target, profile, options.seed + number)
+        try:
+            link.listen(options.ports, options.udp)
+        except OSError as error:
+            advice = f"the session must listen on {options.target} only, not on all addresses, and no other proxy here"
+            raise ImpairmentError(f"cannot listen on {address}: {error.strerror or error}: {advice}") from error
+        made.append(link)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, done.set)
+    rest = b""
+
+    def commands() -> None:
+        nonlocal rest
+        data = os.read(0, 4096)
+        if not data:
+            loop.remove_reader(0)
+            if options.until_eof:
+                done.set()
+        *lines, rest = (rest + data).split(b"\n")
+        for line in lines:
+            if line.strip() == b"quit":
+                done.set()
+                return
+            try:
+                answer = {"ok": True, **obey(made, line.decode(errors="replace"))}
+            except ProfileError as error:
+                answer = {"ok": False, "error": str(error)}
+            print(json.dumps(answer), flush=True)
+
+    loop.add_reader(0, commands)
+    gc.freeze()
+    with contextlib.suppress(OSError, AttributeError):  # not permitted, or no Linux: the measure says what it costs
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(REALTIME_PRIORITY))
+    print(json.dumps({"ok": True, "ready": [link.address for link in made], "ports": options.ports}), flush=True)
+    await done.wait()
+
+
+def port_list(text: str) -> list[int]:
+    """Type of options that take ports: `7720-7725`, `7721,7722`, nothing."""
+    ports: list[int] = []
+    for part in filter(None, text.split(",")):
+        first, _, last = part.partition("-")
+        if not first.isdigit() or not (last or first).isdigit() or not 0 < int(first) <= int(last or first) < 65536:
+            raise argparse.ArgumentTypeError(f"{text!r} are no ports: give for example 7720-7725 or 7721,7722")
+        ports += range(int(first), int(last or first) + 1)
+    return ports
+
+
+def parser(prog: str | None = None, description: str | None = __doc__) -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(
+        prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument("--target", default="127.0.0.1", metavar="ADDR", help="where the session is (%(default)s)")
+    made.add_argument("--ports", type=port_list, default=port_list("7720-7726"), help="TCP (default: 7720-7726)")
+    made.add_argument("--udp", type=port_list, default=[], metavar="PORTS", help="UDP ports (default: none)")
+    made.add_argument(
+        "--link", action="append", metavar="ADDR[=PROFILE]", help="address of a link, repeatable (127.0.0.2)"
+    )
+    made.add_argument("--profile", default="good-wifi", help="a name, or a .toml or .json file (%(default)s)")
+    made.add_argument("--seed", type=int, default=0, help="of everything random; each further link adds 1")
+    made.add_argument("--until-eof", action="store_true", help="end with standard input")
+    return made
+
+
+def main(argv: Sequence[str] | None = None, prog: str | None = None, description: str | None = __doc__) -> int:
+    """Exit status 0 after an orderly end, 2 for unusable input."""
+    options = parser(prog, description).parse_args(argv)
+    try:
+        parts = [text.partition("=") for text in options.link or ["127.0.0.2"]]
+        links = [(address, load_profile(profile or options.profile)) for address, _, profile in parts]
+        loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
+        with asyncio.Runner(loop_factory=lambda: loop) as runner:
+            runner.run(serve(links, options))
+    except (ProfileError, ImpairmentError) as error:
+        print(f"impairment: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

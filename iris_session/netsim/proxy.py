@@ -1,0 +1,319 @@
+"""A bad link in user space: forwards the ports of a session from other loopback addresses, later and slower.
+
+A client that joins at a link's address (127.0.0.2) has that link between itself and the session, which listens on the
+same ports of another address (127.0.0.1). Connections over one link share its rate and its stalls. TCP: bytes are
+never lost and keep their order; a sender is held back when `window_kib` are under way. The process around this, with
+its command line, is `impairment_process`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Final
+
+from iris_session.netsim.datagrams import DatagramPort
+from iris_session.netsim.profiles import DIRECTIONS, DOWN, UP, Profile, Weather
+
+CHUNK: Final = 16_384
+#: Kernel buffers of our own sockets; they come on top of what the profile lets be under way.
+BUFFER_BYTES: Final = 32_768
+#: `select` takes 1024 files, a connection needs two. Its timeouts are exact to 50 us, those of `epoll` to 1 ms.
+MAX_CONNECTIONS: Final = 300
+OWN_DELAYS_KEPT: Final = 20_000
+_RESET: Final = struct.pack("ii", 1, 0)  # SO_LINGER 0: close sends RST
+
+
+class Link:
+    """One radio link: its weather, its rate, its connections. All times are CLOCK_MONOTONIC in nanoseconds."""
+
+    def __init__(self, address: str, target: str, profile: Profile, seed: int) -> None:
+        self.address, self.target, self.seed = address, target, seed
+        self.profile = profile
+        self.held = False  # a stall by command
+        self.source = ""  # address from which the session is reached; empty: the system's choice
+        self.orphans: deque[socket.socket] = deque()
+        self.lanes: set[_Lane] = set()
+        self.pairs: set[_Pair] = set()
+        self.ports: list[DatagramPort] = []
+        self.accepted = self.refused = 0
+        self.bytes = dict.fromkeys(DIRECTIONS, 0)
+        self.own_ns: deque[int] = deque(maxlen=OWN_DELAYS_KEPT)
+        self._loop = asyncio.get_running_loop()
+        self._change: asyncio.TimerHandle | None = None
+        self._was_stalled: dict[str, bool] = {}
+        self._listening: list[socket.socket] = []
+        self.begin(profile)
+
+    @property
+    def window(self) -> int:
+        """Bytes that may be under way per connection and direction."""
+        return self.profile.window_kib * 1024
+
+    def listen(self, ports: Sequence[int], udp_ports: Sequence[int]) -> None:
+        """Opens the ports. Raises `OSError`."""
+        for port in ports:
+            listening = socket.create_server((self.address, port), backlog=512)
+            listening.setblocking(False)
+            self._listening.append(listening)
+            self._loop.add_reader(listening.fileno(), self._accept, listening, port)
+        self.ports += [DatagramPort(self, port) for port in udp_ports]
+
+    def begin(self, profile: Profile) -> None:
+        """The profile begins now."""
+        self.profile = profile
+        self.weather = Weather(profile, self.seed)
+        self._start_ns = time.monotonic_ns()
+        self._free_ns = dict.fromkeys(DIRECTIONS, 0)
+        self.changed()
+
+    def changed(self) -> None:
+        """Looks whether stalls began or ended, and when to look again."""
+        now_ns = time.monotonic_ns()
+        t_ns = now_ns - self._start_ns
+        self.weather.move_on(t_ns, lambda how: self.break_all(reset=how == "reset"))
+        for direction in DIRECTIONS:
+            stalled = self.stalled(direction, now_ns)
+            if self._was_stalled.get(direction) and not stalled:
+                self._free_ns[direction] = now_ns
+                for lane in [lane for lane in self.lanes if lane.direction == direction]:
+                    lane.retime(now_ns)
+            self._was_stalled[direction] = stalled
+        if self._change is not None:
+            self._change.cancel()
+        wait_ns = min(self.weather.next_change_ns(t_ns) - t_ns, 3_600_000_000_000)
+        self._change = self._loop.call_later(wait_ns * 1e-9 + 1e-4, self.changed)
+
+    def stalled(self, direction: str, now_ns: int) -> bool:
+        return self.held or self.weather.stalled(direction, now_ns - self._start_ns)
+
+    def arrival_ns(self, direction: str, size: int, now_ns: int) -> int:
+        """When `size` bytes that are sent now are there."""
+        rate = self.weather.phase.direction(direction).rate_mbit
+        sent_ns = max(now_ns, self._free_ns[direction])
+        if rate:
+            sent_ns += round(size * 8e3 / rate)
+            self._free_ns[direction] = sent_ns
+        return sent_ns + self.weather.delay_ns(direction, now_ns - self._start_ns)
+
+    def break_all(self, *, reset: bool) -> None:
+        """Closes every connection, in order or by RST."""
+        for pair in list(self.pairs):
+            pair.close(reset=reset)
+
+    def roam(self, source: str) -> None:
+        """The clients' network has changed: their connections are gone, though the session hears nothing of that,
+        and new ones come from address `source`."""
+        self.source = source or self.source
+        for pair in list(self.pairs):
+            self.orphans.append(pair.abandon())
+            if len(self.orphans) > MAX_CONNECTIONS:
+                self.orphans.popleft().close()
+
+    def stats(self) -> dict[str, Any]:
+        """Counters, and by how much deliveries came later than they should [ms]."""
+        own = sorted(self.own_ns)
+        p50, p99 = (own[int(q * (len(own) - 1))] / 1e6 if own else 0.0 for q in (0.5, 0.99))
+        lost, dropped = (sum(getattr(port, name) for port in self.ports) for name in ("lost", "dropped"))
+        return {
+            "link": self.address,
+            "connections": len(self.pairs),
+            "accepted": self.accepted,
+            "refused": self.refused,
+            "bytes_up": self.bytes[UP],
+            "bytes_down": self.bytes[DOWN],
+            "held_bytes": sum(lane.size for lane in self.lanes),
+            "own_delay_ms_p50": round(p50, 3),
+            "own_delay_ms_p99": round(p99, 3),
+            "datagrams_lost": lost,
+            "datagrams_dropped": dropped,
+        }
+
+    def _accept(self, listening: socket.socket, port: int) -> None:
+        with contextlib.suppress(OSError):
+            near, _ = listening.accept()
+            if len(self.pairs) >= MAX_CONNECTIONS:
+                self.refused += 1
+                _close(near, reset=True)
+                return
+            self.accepted += 1
+            self._loop.create_task(_Pair(self, near).connect(port))
+
+
+class _Pair:
+    """One TCP connection: the client's end (`near`), the session's (`far`), a lane each way."""
+
+    def __init__(self, link: Link, near: socket.socket) -> None:
+        self.link, self._near = link, near
+        self._far = socket.socket(socket.AF_INET6 if ":" in link.target else socket.AF_INET)
+        self._lanes: list[_Lane] = []
+        link.pairs.add(self)
+        for end in (self._near, self._far):
+            end.setblocking(False)
+            end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+
+    async def connect(self, port: int) -> None:
+        """Reaches the session; a port where nobody listens is refused to the client by RST."""
+        try:
+            if self.link.source:
+                self._far.bind((self.link.source, 0))
+            await asyncio.get_running_loop().sock_connect(self._far, (self.link.target, port))
+        except OSError:
+            self.close(reset=True)
+            return
+        if self in self.link.pairs:
+            self._lanes = [_Lane(self, UP, self._near, self._far), _Lane(self, DOWN, self._far, self._near)]
+
+    def close(self, *, reset: bool = False) -> None:
+        """Closes both ends at once; what is under way is gone."""
+        self.link.pairs.discard(self)
+        for lane in self._lanes:
+            lane.stop()
+        for end in (self._near, self._far):
+            _close(end, reset=reset)
+
+    def abandon(self) -> socket.socket:
+        """Closes the client's end only. Returns the other, which the session still takes for a connection."""
+        self.link.pairs.discard(self)
+        for lane in self._lanes:
+            lane.stop()
+        _close(self._near, reset=True)
+        return self._far
+
+    def ended(self) -> None:
+        """One direction has ended in order; both: the connection is over."""
+        if all(lane.ended for lane in self._lanes):
+            self.close()
+
+
+class _Lane:
+    """One direction of a connection: bytes with the time at which they arrive, in order."""
+
+    def __init__(self, pair: _Pair, direction: str, source: socket.socket, sink: socket.socket) -> None:
+        self.direction, self.size, self.ended = direction, 0, False
+        self._pair, self._link, self._source, self._sink = pair, pair.link, source, sink
+        self._loop = asyncio.get_running_loop()
+        self._items: deque[tuple[int, bytes]] = deque()  # empty bytes: the end
+        self._last_ns = 0
+        self._timer: asyncio.TimerHandle | None = None
+        self._reading = self._writing = False
+        self._ending = False
+        self._link.lanes.add(self)
+        self._read_on()
+
+    def retime(self, now_ns: int) -> None:
+        """A stall has ended: everything that waited leaves now, at the link's rate."""
+        self._last_ns = 0
+        waiting, self._items = self._items, deque()
+        for _, data in waiting:
+            self._last_ns = max(self._last_ns, self._link.arrival_ns(self.direction, len(data), now_ns))
+            self._items.append((self._last_ns, data))
+        self._deliver()
+
+    def stop(self) -> None:
+        """Lets go of both sockets."""
+        self._link.lanes.discard(self)
+        self._pause()
+        self._stop_writing()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _readable(self) -> None:
+        room = self._link.window - self.size
+        if room <= 0:  # another profile, with a smaller window
+            self._pause()
+            return
+        try:
+            data = self._source.recv(min(CHUNK, room))
+        except BlockingIOError:
+            return
+        except OSError:
+            self._pair.close(reset=True)
+            return
+        now_ns = time.monotonic_ns()
+        self._last_ns = max(self._last_ns, self._link.arrival_ns(self.direction, len(data), now_ns))
+        self._items.append((self._last_ns, data))
+        self.size += len(data)
+        self._link.bytes[self.direction] += len(data)
+        self._ending = not data
+        if self._ending or self.size >= self._link.window:
+            self._pause()
+        if len(self._items) == 1:  # else a timer for the first one runs already
+            self._deliver()
+
+    def _deliver(self, *, held_up: bool = False) -> None:
+        """Hands on what has arrived; sets the timer for what has not. `held_up`: the sink did not take it earlier."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        now_ns = time.monotonic_ns()
+        if self._writing or self._link.stalled(self.direction, now_ns):
+            return  # goes on when the sink takes more, or by `retime`
+        while self._items and self._items[0][0] <= now_ns:
+            arrived_ns, data = self._items.popleft()
+            if not data:
+                self._end()
+                return
+            if not held_up:
+                self._link.own_ns.append(now_ns - arrived_ns)
+            if not self._send(arrived_ns, data):
+                return
+        if self._items:
+            self._timer = self._loop.call_at(self._items[0][0] * 1e-9, self._deliver)
+        if not self._reading and not self._ending and self.size < self._link.window:
+            self._read_on()
+
+    def _send(self, arrived_ns: int, data: bytes) -> bool:
+        """False when the sink took less than all: the rest goes when it can."""
+        try:
+            taken = self._sink.send(data)
+        except BlockingIOError:
+            taken = 0
+        except OSError:
+            self._pair.close(reset=True)
+            return False
+        self.size -= taken
+        if taken == len(data):
+            return True
+        self._items.appendleft((arrived_ns, data[taken:]))
+        self._writing = True
+        self._loop.add_writer(self._sink.fileno(), self._writable)
+        return False
+
+    def _writable(self) -> None:
+        self._stop_writing()
+        self._deliver(held_up=True)
+
+    def _end(self) -> None:
+        self.ended = True
+        with contextlib.suppress(OSError):
+            self._sink.shutdown(socket.SHUT_WR)
+        self._pair.ended()
+
+    def _read_on(self) -> None:
+        self._reading = True
+        self._loop.add_reader(self._source.fileno(), self._readable)
+
+    def _pause(self) -> None:
+        if self._reading:
+            self._reading = False
+            self._loop.remove_reader(self._source.fileno())
+
+    def _stop_writing(self) -> None:
+        if self._writing:
+            self._writing = False
+            self._loop.remove_writer(self._sink.fileno())
+
+
+def _close(end: socket.socket, *, reset: bool) -> None:
+    with contextlib.suppress(OSError):
+        if reset:
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        end.close()

@@ -1,0 +1,32 @@
+"""The home of keys: CURVE key pairs, the allow-list, join codes, known servers, and notes of running sessions.
+
+One folder per user, readable by that user only (`KeyHome`). Processes share it: every change is made under a lock and
+replaces the file as a whole. A file that cannot be read is an error of one line, and is never replaced.
+"""
+
+from iris_session.security.allow_list import DEFAULT_ROLES, AllowedKey, AllowList
+from iris_session.security.curve import KeyPair, fingerprint, load_public, load_secret, raw_key
+from iris_session.security.home import KeyHome, KeysBusyError, KeysError
+from iris_session.security.join_codes import JoinCode, JoinCodes
+from iris_session.security.known_servers import KnownServer, KnownServers
+from iris_session.security.session_notes import SessionNote, SessionNotes
+
+__all__ = [
+    "KeyHome",
+    "KeysError",
+    "KeysBusyError",
+    "KeyPair",
+    "fingerprint",
+    "raw_key",
+    "load_public",
+    "load_secret",
+    "AllowList",
+    "AllowedKey",
+    "DEFAULT_ROLES",
+    "JoinCodes",
+    "JoinCode",
+    "KnownServers",
+    "KnownServer",
+    "SessionNotes",
+    "SessionNote",
+]

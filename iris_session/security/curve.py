@@ -1,0 +1,134 @@
+"""CURVE key pairs: made, read from and written as ZeroMQ certificates, named by fingerprints."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import zmq
+from zmq.utils import z85
+
+from iris_session.security.files import KeysError, PrivateFolder, check_private
+
+Z85_CHARACTERS: Final = 40
+MAX_CERTIFICATE_BYTES: Final = 65_536
+#: A line of a certificate (ZeroMQ's ZPL): the name of a key, and the key in quotes.
+_KEY: Final = re.compile(r"""^[ \t]*(public|secret)-key[ \t]*=[ \t]*["']?([^"'\s]*)["']?[ \t\r]*$""", re.MULTILINE)
+_CERTIFICATE: Final = """#   ZeroMQ CURVE certificate of iris-session.
+#   The secret key is what proves who you are: never pass it on.
+
+metadata
+curve
+    public-key = "{public}"
+    secret-key = "{secret}"
+"""
+
+
+def fingerprint(key: bytes, person: bytes = b"iris-key") -> str:
+    """Name of a key (raw 32 bytes) that tells nothing about it: 128-bit BLAKE2b in base32, lower case."""
+    digest = hashlib.blake2b(key, digest_size=16, person=person).digest()
+    return base64.b32encode(digest).decode().rstrip("=").lower()
+
+
+def raw_key(text: str) -> bytes:
+    """The 32 raw bytes of a CURVE key in Z85 (40 characters). Raises `KeysError`."""
+    if len(text) == Z85_CHARACTERS and text.isascii():
+        try:
+            key = z85.decode(text.encode())
+        except (KeyError, ValueError, struct.error):  # the last: five characters above 2**32
+            key = b""
+        if len(key) == 32:
+            return bytes(key)
+    raise KeysError(f"{text[:50]!r} is not a CURVE key: {Z85_CHARACTERS} characters of Z85, as in a *.key file")
+
+
+@dataclass(frozen=True, slots=True)
+class KeyPair:
+    """A CURVE key pair, both halves Z85 text of 40 characters."""
+
+    public: str
+    secret: str
+
+    def __repr__(self) -> str:
+        return f"KeyPair({self.fingerprint})"  # never the secret, in no log and no traceback
+
+    @property
+    def raw_public(self) -> bytes:
+        return raw_key(self.public)
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.raw_public)
+
+    @classmethod
+    def new(cls) -> KeyPair:
+        public, secret = zmq.curve_keypair()
+        return cls(public.decode(), secret.decode())
+
+
+def load_public(path: str | os.PathLike[str]) -> str:
+    """The public key (Z85) in a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
+    return _load(Path(path))[0]
+
+
+def load_secret(path: str | os.PathLike[str]) -> KeyPair:
+    """The key pair in a `*.key_secret` certificate that its owner alone can read. Raises `KeysError`."""
+    path = Path(path)
+    public, secret = _load(path, private=True)
+    if not secret:
+        raise KeysError(f"{path} holds no secret key: give the *.key_secret file")
+    try:
+        raw_key(secret)
+    except KeysError:  # whose text would show it
+        raise KeysError(f"the secret key in {path} {_wrong(secret)}: make the pair anew") from None
+    if zmq.curve_public(secret.encode()) != public.encode():
+        raise KeysError(f"the two keys in {path} do not belong together: take the file as it was made")
+    return KeyPair(public, secret)
+
+
+def pair_in(folder: PrivateFolder, name: str) -> KeyPair:
+    """The key pair in a file of a private folder, made on first use."""
+    if folder.read(name) is None:  # also checks who may read it
+        with folder.locked():
+            if folder.read(name) is None:
+                pair = KeyPair.new()
+                folder.write(name, _CERTIFICATE.format(public=pair.public, secret=pair.secret).encode())
+    return load_secret(folder.path / name)
+
+
+def _load(path: Path, *, private: bool = False) -> tuple[str, str]:
+    """Both keys of a certificate, the secret one empty when it has none. `private`: it must be this user's alone if it
+    has one; what is checked is the file that is read, whatever has its name by then."""
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            text = file.read(MAX_CERTIFICATE_BYTES).decode(errors="replace")
+    except PermissionError:
+        raise KeysError(f"key file {path} cannot be read: its owner has to run chmod u+r {path}") from None
+    except OSError as error:
+        raise KeysError(f"key file {path} cannot be used: {error.strerror}") from None
+    keys = dict(reversed(_KEY.findall(text)))  # of two the first
+    public, secret = keys.get("public", ""), keys.get("secret", "")
+    if private and secret:
+        check_private(path, status, f"chmod 600 {path}")
+    if not public:
+        text = 'a ZeroMQ certificate with a line public-key = "..."'
+        raise KeysError(f"key file {path} cannot be used: it should be {text}")
+    try:
+        raw_key(public)
+    except KeysError:
+        raise KeysError(f"key file {path} cannot be used: its public key {_wrong(public)}") from None
+    return public, secret
+
+
+def _wrong(key: str) -> str:
+    """What is wrong with a key, without showing it."""
+    if len(key) != Z85_CHARACTERS:
+        return f"has {len(key)} characters, a CURVE key has {Z85_CHARACTERS} of Z85"
+    return f"is not {Z85_CHARACTERS} characters of Z85"

@@ -1,0 +1,57 @@
+"""`sessions.json`: the encrypted sessions that this user serves now: `iris-session pair` tells people to go there."""
+
+from __future__ import annotations
+
+import os
+from typing import Final
+
+import msgspec
+
+from iris_session.security.files import PATIENCE_S, PrivateFolder
+
+FILE: Final = "sessions.json"
+
+
+class SessionNote(msgspec.Struct, frozen=True):
+    """One session. `hosts`: addresses under which it can be reached, best first. `server`: fingerprint of its key.
+    `pid`: of the process that holds the sockets."""
+
+    session_id: str
+    name: str
+    pid: int
+    hosts: tuple[str, ...]
+    control: int
+    server: str
+
+
+class SessionNotes:
+    """Reads and changes the notes. Those whose process is gone are passed over, and removed with the next change."""
+
+    def __init__(self, folder: PrivateFolder) -> None:
+        self._folder = folder
+
+    def read(self) -> list[SessionNote]:
+        """Sessions that run now."""
+        return [one for one in self._folder.read_json(FILE, list[SessionNote]) or [] if _runs(one.pid)]
+
+    def add(self, note: SessionNote, patience_s: float = PATIENCE_S) -> None:
+        """Notes a session, in place of an older note of it."""
+        with self._folder.locked(patience_s):
+            others = [one for one in self.read() if one.session_id != note.session_id]
+            self._folder.write_json(FILE, [*others, note], durable=False)
+
+    def remove(self, session_id: str, pid: int, patience_s: float = PATIENCE_S) -> None:
+        """Forgets a session, unless another process has taken it over."""
+        with self._folder.locked(patience_s):
+            others = [one for one in self.read() if (one.session_id, one.pid) != (session_id, pid)]
+            self._folder.write_json(FILE, others, durable=False)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):  # the latter: a number that no process can have
+        return False
+    except OSError:
+        return True
+    return True

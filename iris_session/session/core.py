@@ -1,0 +1,274 @@
+"""`SessionCore`: the session as a pure function of (initial state, configuration, journal).
+
+Composes authority, control and the plant for one step and takes the digest that replay compares. Reads no clock, no
+random source, no socket. Two classes (docs/architecture.md): `closed`, where our own physics advances, and `open`,
+where the plant's state comes from outside (a user's loop, a real robot) and is part of the journal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+import mujoco
+import numpy as np
+
+from iris_session.authority import Authority, AuthorityConfig
+from iris_session.control import ControlConfig, ControlError, Controller
+from iris_session.physics import SimulationDivergedError, World
+from iris_session.physics.world import STATE
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, SceneLoaded
+from iris_session.protocol.names import LateCause
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.protocol.steps import ControlStatus, Decision
+from iris_session.session.config import SessionConfig
+from iris_session.session.errors import ConfigError
+
+
+def unmeasured(cause: str) -> None:
+    """Nobody asks how long the parts of a step take."""
+
+
+#: Entries of a step from which on its ticks solve less: the samples of two people with three devices. Eight people at
+#: 72 Hz send so many in a third of the steps, and a robot still is solved at 62 Hz if all steps had them.
+CROWDED: Final = 6
+_encoder = msgspec.msgpack.Encoder()
+_decode_status = msgspec.msgpack.Decoder(tuple[ControlStatus, ...]).decode
+
+
+class CoreConfig(msgspec.Struct, frozen=True):
+    """Everything besides the model that the session function depends on. Stored in the recording's header."""
+
+    authority: AuthorityConfig
+    control: ControlConfig
+    robots: tuple[RobotSpec, ...]
+    objects: tuple[ObjectSpec, ...]
+    #: `mjSTATE_INTEGRATION` to begin with and to reset to; empty: the model's own initial state.
+    initial_state: bytes = b""
+
+
+_decode_config = msgspec.msgpack.Decoder(CoreConfig).decode
+
+
+class StepOutcome(msgspec.Struct, frozen=True):
+    """What one step gave: decision of the authority, report of control, digest of all of it (16 bytes, or none)."""
+
+    decision: Decision
+    status: tuple[ControlStatus, ...]
+    digest: bytes
+    #: Why physics stands still (numbers that are not finite), empty while all is well. A reset ends it.
+    diverged: str = ""
+
+
+class CoreState(msgspec.Struct, frozen=True):
+    """Snapshots of the three stateful parts, and the encoded control report that the next step's authority sees."""
+
+    plant: bytes
+    authority: bytes
+    controller: bytes
+    status: bytes
+
+
+class Plant(NamedTuple):
+    """A scene that can be stepped: its world in the initial state, its controller, and what it was made of."""
+
+    world: World
+    controller: Controller
+    scene: SceneLoaded
+
+
+def make_plant(model: mujoco.MjModel, scene: SceneLoaded, control: ControlConfig) -> Plant:
+    """Takes what the scene of a session needs to be stepped, without touching any session.
+
+    Raises the typed errors of `physics` and `control` when the model cannot be driven (for example a torque actuator
+    without a hold law), `SnapshotError` for an initial state of another model.
+    """
+    world = World(model, scene.robots, scene.objects)
+    if scene.initial_state:
+        world.set_state_bytes(scene.initial_state)
+    return Plant(world, Controller(model, scene.robots, scene.objects, control), scene)
+
+
+def no_models(model_hash: str) -> mujoco.MjModel:
+    """Of a session whose scene never changed."""
+    raise KeyError(f"the recording does not hold the model {model_hash}")
+
+
+class SessionCore:
+    """One session: robots and objects of one model, their authority and their control. Raises as `make_plant`.
+
+    `models`: the model of a scene that was loaded later, by `SceneLoaded.model_hash`, unless it was `prepared`.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        config: CoreConfig,
+        models: Callable[[str], mujoco.MjModel] = no_models,
+    ) -> None:
+        #: As a recording gives it back: a whole number in a float field would change `round(x / step)` and the digest.
+        self.config = config = _decode_config(_encoder.encode(config))
+        self._models = models
+        #: Plants that were made off the loop, for the `SceneLoaded` to come, by `model_hash`.
+        self.prepared: dict[str, Plant] = {}
+        self._model = model
+        self._use(self._first_plant())
+        self.authority = Authority(_within_control(config), config.robots, config.objects)
+        self._status: tuple[ControlStatus, ...] = ()
+
+    def step(
+        self,
+        now_ns: int,
+        entries: Sequence[Entry],
+        n_ticks: int,
+        plant: bytes = b"",
+        *,
+        digest: bool = True,
+        lap: Callable[[str], None] = unmeasured,
+    ) -> StepOutcome:
+        """One pass at session time `now_ns`, `n_ticks` >= 0 ticks of physics.
+
+        Without `digest` the outcome has an empty one: it takes a sixth of a step, and only a recording needs it.
+        `lap` is called after each part with the `LateCause` that its time counts as; it has no influence.
+
+        `plant` (open sessions): `mjSTATE_INTEGRATION` of the user's plant at the start of this step. The ticks then
+        write `world.data.ctrl` for the caller to apply, and do not advance physics.
+        """
+        for entry in entries:
+            if isinstance(entry.message, SceneLoaded) and entry.connection == entry.connection_epoch == HOST:
+                self._load(entry.message)
+        world = self.world
+        if plant:
+            world.set_state_bytes(plant)
+        decision = self.authority.step(now_ns, entries, n_ticks, world.view(), self._status)
+        lap(LateCause.AUTHORITY)
+        if decision.reset:
+            self._reset_world()
+            self.controller.reset(world.data)
+        elif any(entry.connection == HOST and isinstance(entry.message, ExternalReset) for entry in entries):
+            self.controller.reset(world.data)  # the owner moved the robots: they hold where they stand now
+        self.controller.begin(now_ns, n_ticks, decision, world.view())
+        crowded = len(entries) >= CROWDED
+        for _ in range(0 if world.diverged else n_ticks):
+            self.controller.tick(world.data, crowded)
+            lap(LateCause.CONTROL)
+            if not plant and not self._tick():
+                break
+            lap(LateCause.PHYSICS)
+        self._status = self.controller.status()
+        return StepOutcome(decision, self._status, self._digest(decision) if digest else b"", world.diverged)
+
+    def rest(self, plant: bytes) -> None:
+        """Writes the last `world.data.ctrl` for the plant in state `plant`: robots at rest, objects let go.
+
+        No step may follow: this one is in no journal.
+        """
+        self.world.set_state_bytes(plant)
+        self.controller.rest(self.world.data)
+
+    def _tick(self) -> bool:
+        """One tick of physics; False when the state is no longer finite: physics then stands still until a reset."""
+        try:
+            self.world.tick()
+        except SimulationDivergedError:
+            return False
+        return True
+
+    def _reset_world(self) -> None:
+        self.world.reset()
+        if self.scene.initial_state:
+            self.world.set_state_bytes(self.scene.initial_state)
+
+    def _first_plant(self) -> Plant:
+        config = self.config
+        scene = SceneLoaded("", config.robots, config.objects, config.initial_state)
+        return make_plant(self._model, scene, config.control)
+
+    def _load(self, scene: SceneLoaded) -> None:
+        """Another scene, from the beginning of this step on."""
+        plant = self.prepared.pop(scene.model_hash, None)
+        if plant is None or plant.scene != scene:
+            plant = make_plant(self._models(scene.model_hash), scene, self.config.control)
+        self._use(plant)
+        self._status = ()
+
+    def _use(self, plant: Plant) -> None:
+        self.world, self.controller, self.scene = plant
+        self.controller.reset(self.world.data)
+
+    def as_it_is(self) -> CoreConfig:
+        """The configuration of a session that begins with the present scene."""
+        scene = self.scene
+        return msgspec.structs.replace(
+            self.config, robots=scene.robots, objects=scene.objects, initial_state=scene.initial_state
+        )
+
+    def _digest(self, decision: Decision) -> bytes:
+        h = hashlib.blake2b(digest_size=16)
+        h.update(_encoder.encode(decision))
+        h.update(_encoder.encode(self._status))
+        h.update(self.world.state_bytes())
+        return h.digest()
+
+    def snapshot(self) -> CoreState:
+        """State after the last step; `restore` of it is invisible to everything that follows."""
+        return CoreState(
+            self.world.snapshot(),
+            self.authority.snapshot(),
+            self.controller.snapshot(),
+            _encoder.encode(self._status),
+        )
+
+    def restore(self, state: CoreState) -> None:
+        """Inverse of `snapshot`, into a core built with the same model and configuration.
+
+        A scene that was loaded since then is left for the one of the snapshot.
+        """
+        self.authority.restore(state.authority)
+        scene = self.authority.scene
+        if scene is None and self.scene.model_hash:
+            self._use(self._first_plant())
+        elif scene is not None and scene != msgspec.structs.replace(self.scene, model_hash=self.world.scene_hash):
+            self._load(scene)
+        self.world.restore(state.plant)
+        self.controller.restore(state.controller)
+        self._status = _decode_status(state.status)
+
+
+def _within_control(config: CoreConfig) -> AuthorityConfig:
+    """The authority's configuration without the motion scales that control would not follow."""
+    authority, control = config.authority, config.control
+    low, high = max(authority.min_scale, control.min_scale), min(authority.max_scale, control.max_scale)
+    return msgspec.structs.replace(authority, min_scale=low, max_scale=high)
+
+
+def plant_state(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
+    """`mjSTATE_INTEGRATION` of `data`: what `step(plant=...)` and `CoreConfig.initial_state` take."""
+    state = np.empty(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    return state.tobytes()
+
+
+def core_of(
+    session: SessionConfig,
+    model: mujoco.MjModel,
+    data: mujoco.MjData | None,
+    robots: tuple[RobotSpec, ...],
+    objects: tuple[ObjectSpec, ...],
+    user_owned: bool,
+    known: SessionCore | None = None,
+) -> SessionCore:
+    """The core of a session that begins with `data` as it is now; `known` when that is the one."""
+    authority = msgspec.structs.replace(session.authority, user_owned_loop=user_owned, anchors=session.anchor_poses())
+    initial = b"" if data is None else plant_state(model, data)
+    config = CoreConfig(authority, session.control, robots, objects, initial)
+    if known is not None and known.config == config:
+        return known
+    try:
+        return SessionCore(model, config)
+    except ControlError:
+        raise
+    except ValueError as error:  # the authority's own check of its numbers and names
+        raise ConfigError(str(error)) from error

@@ -1,0 +1,323 @@
+"""`ScenePublisher`: a session whose world is not MuJoCo's: another simulator's, or a real robot's.
+
+    scene = SceneBuilder("lab")
+    scene.add_box("box", half_size=(0.1, 0.1, 0.1), movable=True)
+    with ScenePublisher(scene) as session, session.signals():
+        while not session.stopping:
+            session.set_pose("box", position, quaternion)
+            session.publish()
+
+The process that makes it is the authority, as of `Session`. People see, point, talk and mark; nobody drives anything or
+takes it in the hand: a robot that people drive is a `Session(model, data)` with `begin_tick()` and `end_tick()`.
+"""
+
+from __future__ import annotations
+
+import operator
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, Final, NoReturn
+
+from numpy.typing import ArrayLike
+
+from iris_session.physics import PhysicsError
+from iris_session.physics.carrier import Carrier
+from iris_session.protocol.entries import EntryMessage
+from iris_session.scene import AssetStore, SceneBuildError
+from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.composed import ComposedScene
+from iris_session.session.config import SessionConfig
+from iris_session.session.core import core_of
+from iris_session.session.draft import SceneDraft
+from iris_session.session.errors import ConfigError, OwnershipError, PublishError, StartError
+from iris_session.session.owner import Owner
+from iris_session.session.processes import Composed, SessionProcesses
+from iris_session.session.publish_loop import PublishLoop, ShownVertices
+from iris_session.session.stepper import NextPatch, session_clock
+
+#: How often `run` asks `until`.
+RUN_PERIOD_S: Final = 1.0 / 60.0
+#: Longest time that a publisher can give [s], 285 years: recordings count it in nanoseconds, in 63 bits.
+LONGEST_S: Final = 9e9
+#: How far ahead of the session's clock a capture may lie: clocks are read one after the other.
+AHEAD_NS: Final = 1_000_000
+_NOBODY_DRIVES: Final = (
+    "a published scene has nothing that people drive; for a robot that they do, use Session(model, data) with "
+    "begin_tick() and end_tick()"
+)
+
+
+class ScenePublisher(Owner):
+    """A shared session over a scene of a `SceneBuilder`; its bodies and vertices are where `publish` says.
+
+    `set_pose`, `set_poses`, `set_joints`, `set_vertices` and `publish` may be called from any thread: what was set by
+    whomever until a `publish` goes out with it. `start`, `close` and `signals` belong to one thread.
+
+    Raises `ConfigError`.
+    """
+
+    def __init__(self, scene: SceneBuilder, config: SessionConfig | None = None) -> None:
+        self.config = _checked(scene, SessionConfig() if config is None else config)
+        self.origin_ns = time.monotonic_ns()
+        self.clock = session_clock(self.origin_ns)
+        self._builder = scene
+        self._shown: frozenset[str] = frozenset()  # names that the builder had as the session began
+        self._stop = threading.Event()
+        self._draft: SceneDraft | None = None
+        self._loop: PublishLoop | None = None
+        self._order = threading.Lock()  # of frames, and of what is said of the next one
+        self._capture_ns = 0
+        self._time_s: float | None = None
+        self._own_time = False
+        self._anew = False
+        self._early_patches = []  # none: the stepper is there as soon as anybody can ask
+        #: Why the recording is incomplete, known after `close()`; empty when it is not.
+        self.recording_fault = ""
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Builds the scene, opens the sockets and the recording. Called by `with`. People can join from here on.
+
+        Raises `ConfigError` for a scene that cannot be built, `StartError` for a port in use or a folder that cannot be
+        written.
+        """
+        if self._processes is not None:
+            return
+        self._check_open()
+        where = self.config.assets
+        try:
+            store = AssetStore(None if isinstance(where, bool) else where)
+            self._shown = self._builder.names
+            composed = self._builder.build(store)
+            carrier = Carrier(composed.moving, composed.poses)
+        except (SceneBuildError, PhysicsError) as error:
+            raise ConfigError(f"the scene cannot be built: {error}") from None
+        except OSError as error:
+            raise StartError(f"assets: {error.filename or where}: {error.strerror or error}") from None
+        with _held(store, composed.addresses):  # until the processes hold them
+            self._begin(composed, carrier)
+
+    def _begin(self, composed: ComposedScene, carrier: Carrier) -> None:
+        core = core_of(self.config, carrier.model, None, (), (), user_owned=True)
+        vertices = ShownVertices(composed)
+        processes = SessionProcesses(self.config, core, self.origin_ns, composed=Composed(composed, vertices.bending))
+        processes.start()
+        processes.notes += composed.notes
+        self._processes = processes
+        try:
+            self._stepper = processes.make_stepper(core, self.clock, user_owned=True)
+            self._draft = SceneDraft(composed)
+            self._loop = PublishLoop(carrier, vertices, self._stepper, processes, processes.state_period_ns)
+            processes.reporter.notices += [self._loop.warnings, self._draft.warnings]
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> bool:
+        """Tells everyone that the session ends, finishes the recording, ends every process. Can be called twice.
+
+        False: the recording is incomplete, `recording_fault` says why.
+        """
+        self._stop.set()
+        self._ended = True
+        try:
+            if self._loop is not None:
+                self._loop.close()
+        finally:
+            if self._processes is not None:
+                self.recording_fault = self._processes.close()
+                self._recorded, self._processes = self._processes.recording, None
+        return not self.recording_fault
+
+    def run(self, seconds: float | None = None, until: Callable[[], object] | None = None) -> None:
+        """Waits until `stop()`, Ctrl-C or SIGTERM, `seconds`, or `until()`, which is asked at 60 Hz and may publish."""
+        loop = self._started()[1]
+        with self.signals():
+            end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
+            while (end_ns is None or self.clock() < end_ns) and not (until is not None and until()):
+                if self._stop.wait(RUN_PERIOD_S):
+                    break
+                loop.check()
+
+    # --- the world ---------------------------------------------------------------------------------------------------
+
+    def set_pose(
+        self, name: str, position: Sequence[float], quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+    ) -> None:
+        """T_world_body of a movable thing, or of the root of an articulation: [m], unit quaternion (w, x, y, z).
+
+        One whose length is off by up to 0.001 is normalised. Raises `PublishError`.
+        """
+        with self._telling(name):
+            self._started()[0].set_pose(name, position, quaternion)
+
+    def set_poses(self, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike) -> None:
+        """`set_pose` for many bodies at once: (n, 3) and (n, 4). All or none: raises `PublishError`."""
+        with self._telling(*(names if isinstance(names, list | tuple) else ())):
+            self._started()[0].set_poses(names, positions, quaternions)
+
+    def set_joints(self, name: str, positions: Mapping[str, float]) -> None:
+        """Positions [rad] or [m] of joints of an articulation, by name; others stay. Raises `PublishError`."""
+        with self._telling(name):
+            self._started()[0].set_joints(name, positions)
+
+    def set_vertices(self, name: str, vertices: ArrayLike) -> None:
+        """Vertices (n, 3) of a deformable [m], world frame, in the order it was added with. Raises `PublishError`."""
+        with self._telling(name):
+            self._started()[0].set_vertices(name, vertices)
+
+    def publish(self, time_s: float | None = None, *, capture_ns: int | None = None) -> None:
+        """Everything as it is set now is one state of the world.
+
+        It goes out at `config.state_hz` at most: of states in between the newest wins, `superseded` counts the others.
+        `time_s`: time of the world, which clients see as `sim_time` (default: session time). When it goes back, the
+        world was reset: a new `scene_epoch`. Give it always or never. `capture_ns`: session time (as of `clock()`) when
+        the world was so (default: now); it never goes back.
+
+        Raises `PublishError` for times that cannot be, `OwnershipError` when the session is not under way.
+        """
+        draft, loop = self._started()
+        loop.check()
+        now_ns = self.clock()
+        captured_ns = now_ns if capture_ns is None else _capture(capture_ns, now_ns)
+        given_s = None if time_s is None else _time(time_s)
+        with self._order:
+            if capture_ns is None:  # of two threads the second may have looked at the clock first
+                captured_ns = max(captured_ns, self._capture_ns)
+            elif captured_ns < self._capture_ns:
+                before_ms = (self._capture_ns - captured_ns) * 1e-6
+                raise PublishError(
+                    f"capture_ns lies {before_ms:.3f} ms before that of the state before: publish them in their order"
+                )
+            if self._time_s is not None and self._own_time != (given_s is not None):
+                raise PublishError("give time_s with every publish() or with none: without it, it is session time")
+            self._own_time = given_s is not None
+            at_s = captured_ns * 1e-9 if given_s is None else given_s
+            anew = self._anew or (self._time_s is not None and at_s < self._time_s)
+            self._capture_ns, self._time_s, self._anew = captured_ns, at_s, False
+            loop.offer(draft.frame(captured_ns, at_s, anew))
+
+    def reset(self) -> None:
+        """The next `publish` is of a world that was put into another state: a new `scene_epoch`."""
+        self._started()
+        with self._order:
+            self._anew = True
+
+    @property
+    def superseded(self) -> int:
+        """States that did not go out because a newer one was published before it was their time."""
+        return 0 if self._loop is None else self._loop.superseded
+
+    # --- what the owner may do ---------------------------------------------------------------------------------------
+
+    def post(self, message: EntryMessage) -> None:
+        """Puts an input of the owner (connection 0, rights of a director) into the next step."""
+        self._live()
+        self._started()[1].check()  # else nobody would take it
+        assert self._stepper is not None
+        self._stepper.post(message)
+
+    def pause(self) -> NoReturn:
+        """Your program advances the world: to pause it, publish nothing."""
+        raise OwnershipError("pause: your own program advances the world; to pause it, publish nothing for a while")
+
+    def resume(self) -> NoReturn:
+        """Your program advances the world: publish again."""
+        raise OwnershipError("resume: your own program advances the world; publish again")
+
+    def begin_tick(self) -> NoReturn:
+        """Of `Session`."""
+        raise OwnershipError(f"begin_tick: publish() is the tick here. {_NOBODY_DRIVES}")
+
+    def end_tick(self) -> NoReturn:
+        """Of `Session`."""
+        raise OwnershipError(f"end_tick: publish() is the tick here. {_NOBODY_DRIVES}")
+
+    def assign(self, robots: Sequence[str], participant: str = "") -> NoReturn:
+        """Of `Session`."""
+        raise OwnershipError(f"assign: {_NOBODY_DRIVES}")
+
+    def set_scale(self, robot: str, scale: float) -> NoReturn:
+        """Of `Session`."""
+        raise OwnershipError(f"set_scale: {_NOBODY_DRIVES}")
+
+    def load_scene(self, scene: object) -> NoReturn:
+        """Of `Session`."""
+        raise OwnershipError("load_scene: end this session and begin another with the other scene")
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _telling(self, *names: object) -> Iterator[None]:
+        """What is refused because it was added after the session had begun, told as that."""
+        try:
+            yield
+        except PublishError as error:
+            late = [name for name in names if isinstance(name, str) and name in self._builder.names - self._shown]
+            if not late:
+                raise
+            raise PublishError(
+                f"{late[0]!r} was added after the session had begun, and is not shown: add everything before `with`"
+            ) from error
+
+    def _queue(self, patch: NextPatch) -> None:
+        self._started()[1].check()
+        super()._queue(patch)
+
+    def _unchanging(self) -> AbstractContextManager[object]:
+        return nullcontext() if self._loop is None else self._loop.lock
+
+    def _started(self) -> tuple[SceneDraft, PublishLoop]:
+        self._check_open()
+        if self._draft is None or self._loop is None:
+            raise OwnershipError("the session is not started: use `with ScenePublisher(...) as session`, or start()")
+        return self._draft, self._loop
+
+
+def _held(store: AssetStore, addresses: Sequence[str]) -> AbstractContextManager[object]:
+    try:
+        return store.hold(addresses)
+    except OSError:  # no locks, or no room: the session says so when it cannot hold them either
+        return nullcontext()
+
+
+def _checked(scene: SceneBuilder, config: SessionConfig) -> SessionConfig:
+    if not isinstance(scene, SceneBuilder):
+        raise ConfigError(
+            f"scene is {type(scene).__name__}: a SceneBuilder is expected; for a MuJoCo model use Session"
+        )
+    if not isinstance(config, SessionConfig):
+        raise ConfigError(f"config is {type(config).__name__}: a SessionConfig is expected")
+    if config.resume is not None:
+        raise ConfigError(
+            "resume: a published scene cannot go on from its recording, which has no program that moves it; begin anew"
+        )
+    if config.assets is False:
+        raise ConfigError("assets is False: a published scene is nothing but what clients draw; True, or a folder")
+    return config
+
+
+def _time(time_s: Any) -> float:
+    try:
+        given_s = -1.0 if isinstance(time_s, str | bytes) else float(time_s)
+    except (TypeError, ValueError):
+        given_s = -1.0
+    if not 0.0 <= given_s <= LONGEST_S:  # NaN is neither
+        raise PublishError(f"time_s is {time_s!r}: seconds from 0 to {LONGEST_S:g} are expected")
+    return given_s
+
+
+def _capture(capture_ns: int, now_ns: int) -> int:
+    try:
+        given_ns = operator.index(capture_ns)
+    except TypeError:
+        given_ns = -1
+    if given_ns < 0:
+        raise PublishError(f"capture_ns is {capture_ns!r}: whole nanoseconds of session.clock() are expected")
+    if given_ns > now_ns + AHEAD_NS:
+        ahead_ms = (given_ns - now_ns) * 1e-6
+        raise PublishError(f"capture_ns lies {ahead_ms:.1f} ms ahead of session.clock(), by which it is to be given")
+    return min(given_ns, now_ns)

@@ -1,0 +1,209 @@
+"""Generated files are current, and hold what the definitions hold."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import get_args
+
+import msgspec
+import pytest
+
+from iris_session.codegen import __main__ as generate
+from iris_session.codegen import csharp, schema, tables, typescript
+from iris_session.protocol import (
+    arrays,
+    client_messages,
+    codec,
+    names,
+    scene,
+    scene_looks,
+    scene_names,
+    scene_patch,
+    server_messages,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("target", generate.TARGETS)
+def test_generated_files_are_current(target: str) -> None:
+    outdated = [str(path.relative_to(ROOT)) for path, _ in generate.outdated(ROOT, [target])]
+    assert outdated == [], f"run: python -m iris_session.codegen {target}"
+
+
+def checkout(tmp_path: Path) -> Path:
+    for relative, _ in generate.TARGETS.values():
+        (tmp_path / relative).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / relative, tmp_path / relative)
+    return tmp_path
+
+
+def test_check_fails_for_a_stale_file_and_writing_repairs_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = checkout(tmp_path)
+    (root / "docs/protocol/golden.json").unlink()
+    text = root / "docs/protocol.md"
+    text.write_text(text.read_text().replace("| `clutch` |", "| `clasp` |"))
+    assert generate.main(["all", "--check", "--root", str(root)]) == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "not current: docs/protocol/golden.json",
+        "not current: docs/protocol.md",
+    ]
+    assert generate.main(["typescript", "--check", "--root", str(root)]) == 0
+    assert generate.main(["all", "--root", str(root)]) == 0
+    assert generate.main(["all", "--check", "--root", str(root)]) == 0
+    assert text.read_text() == (ROOT / "docs/protocol.md").read_text()
+
+
+def test_generator_needs_a_checkout_and_its_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        generate.main(["all", "--root", str(tmp_path)])
+    assert "is not a checkout" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="must hold <!-- generated:values -->"):
+        generate.document("# Protocol\n")
+
+
+def test_every_struct_is_in_the_schema() -> None:
+    """A struct that is defined for the wire and not listed would be missing in every generated file."""
+    listed = {struct.name for struct in schema.all_structs()}
+    for module in (client_messages, server_messages, scene, scene_looks, scene_patch, arrays):
+        for name, value in vars(module).items():
+            if isinstance(value, type) and issubclass(value, msgspec.Struct) and value.__module__ == module.__name__:
+                assert name in listed | {"Message", "EventBody"}, name
+    assert len(listed) == len(schema.all_structs())
+
+
+def test_open_enumerations_are_explained_whole() -> None:
+    """Not up to the first line, which may end within a sentence."""
+    for name in schema.enums():
+        doc = schema.enum_doc(name)
+        kind = getattr(names, name, None) or getattr(scene_names, name)
+        assert doc.split() == (kind.__doc__ or "").split()
+        assert not doc or doc.endswith("."), name
+    document = (ROOT / "docs/protocol.md").read_text()
+    alarms = " ".join(document.split("#### AlarmKind\n")[1].split("\n#### ")[0].split())
+    for text in (
+        "`changed`: an anchor is seen",
+        "`differs`: and elsewhere",
+        "`jump`: the tracking frame moved at once",
+    ):
+        assert text in alarms
+
+
+def test_schema_follows_the_definitions() -> None:
+    by_name = {struct.name: struct for struct in schema.all_structs()}
+    sample = {field.name: field for field in by_name["Sample"].fields}
+    assert [field.name for field in by_name["Sample"].fields] == list(client_messages.Sample.__struct_fields__)
+    assert sample["q"].type == schema.Type("array", item=schema.Type("float"), max_length=64)
+    assert sample["pose"].type == schema.Type("struct", name="Pose", optional=True)
+    assert sample["twist"].type.length == 6
+    assert (sample["seq"].required, sample["seq"].type.minimum) == (True, 0)
+    assert (sample["tracked"].required, sample["tracked"].default, sample["device"].enum) == (False, True, "Device")
+    assert by_name["ClientEnvelope"].fields[3].type == schema.Type("union", name="ClientMessage")
+    assert by_name["Pose"].array_like
+    assert by_name["Feedback"].fields[-1].default == {}
+    visual = {field.name: field for field in by_name["Visual"].fields}
+    assert visual["material"].type == schema.Type("int", minimum=-1, maximum=2**31 - 1)
+    level = {field.name: field for field in by_name["MeshLevel"].fields}
+    assert level["address"].type == schema.Type("str", pattern="^[0-9a-f]{64}$")
+    change = {field.name: field for field in by_name["SetVisual"].fields}
+    assert (by_name["SetVisual"].tag_field, change["group"].type.optional) == ("op", True)
+
+
+def test_enumerations_of_fields_exist() -> None:
+    known = schema.enums()
+    used = {field.enum for struct in schema.all_structs() for field in struct.fields if field.enum}
+    assert used <= set(known)
+    assert known["Role"] == {
+        role.upper(): role for role in sorted(names.Role.ALL, key=list(known["Role"].values()).index)
+    }
+    fields = {f"{struct.name}.{field.name}" for struct in schema.all_structs() for field in struct.fields}
+    assert set(schema._ENUMS) <= fields
+
+
+@pytest.mark.parametrize("kind", [list[int], set[str], int | str, tuple[int, str] | None])
+def test_types_without_a_form_are_refused(kind: object) -> None:
+    with pytest.raises(TypeError, match=r"has no form|none of the unions"):
+        schema._type(msgspec.inspect.type_info(kind))
+
+
+def test_csharp_has_every_message_field_and_tag() -> None:
+    text = csharp.csharp()
+    for struct in schema.all_structs():
+        body = re.search(rf"public sealed class {struct.name} : \w+\n    \{{\n(.*?)\n    \}}\n", text, re.DOTALL)
+        assert body, struct.name
+        assert (f'TagName = "{struct.tag}"' in body[1]) == bool(struct.tag)
+        for field in struct.fields:
+            assert re.search(rf"public \S+(, long>)? {csharp.pascal(field.name, struct.name)} = ", body[1]), field.name
+    for value in (value for values in schema.enums().values() for value in values.values()):
+        assert f'= "{value}";' in text
+
+
+def test_csharp_reads_within_the_bounds_of_the_schema() -> None:
+    text = csharp.csharp()
+    for line in (
+        "value.Material = reader.ReadLong(-1, 2147483647);",
+        "value.Resolution = reader.ReadLongs(2, 0, -2147483648, 2147483647);",
+        "value.GroupsShown = reader.ReadLongs(0, 256, -2147483648, 2147483647);",
+        "value.Address = reader.ReadAddress();",
+        "value.Levels = reader.ReadArray(Protocol.MeshLevel.Read, 32);",
+        "value.Group = reader.TryReadNil() ? (long?)null : reader.ReadLong(-2147483648, 2147483647);",
+        "value.Rgba = reader.TryReadNil() ? null : reader.ReadDoubles(4, 0);",
+        "value.RequestId = reader.ReadLong(0, long.MaxValue);",
+        "value.CaptureNs = reader.ReadLong(long.MinValue, long.MaxValue);",
+        "value.Devices = reader.ReadStrings(32, 64);",
+        'string tag = reader.PeekTag("op");',
+    ):
+        assert line in text, line
+
+
+def test_typescript_has_the_defaults_of_maps_without_a_tag() -> None:
+    text = typescript.typescript().split("export const VALUE_DEFAULTS")[1]
+    light = text.split("  Light: {\n")[1].split("  },")[0]
+    assert '    follow: "fixed",\n' in light
+    assert "    attenuation: [1.0, 0.0, 0.0],\n" in light
+    assert '    headlight: {"active": true, ' in text
+
+
+def test_csharp_names() -> None:
+    assert csharp.pascal("request_id", "Acquire") == "RequestId"
+    assert csharp.pascal("T_world_tracking", "Alignment") == "T_world_tracking"
+    assert csharp.pascal("tracking_epoch", "TrackingEpoch") == "TrackingEpochValue"
+    assert csharp.pascal("CONTROLLER_LEFT") == "ControllerLeft"
+
+
+def test_typescript_has_every_message_field_and_union() -> None:
+    text = typescript.typescript()
+    for struct in schema.all_structs():
+        form = rf"type {struct.name} = \[" if struct.array_like else rf"interface {struct.name} \{{"
+        body = re.search(rf"export {form}\n(.*?)\n[\]}}]", text, re.DOTALL)
+        assert body, struct.name
+        for field in struct.fields:
+            assert re.search(rf"^  {field.name}{'' if field.required else '[?]'}: ", body[1], re.MULTILINE), field.name
+    for name, members in schema.UNIONS.items():
+        assert f"export type {name} =\n" + "\n".join(f"  | {member.__name__}" for member in members) + ";" in text
+
+
+def test_tables_have_every_type_and_limit() -> None:
+    sections = tables.sections()
+    for tag in (*codec.CLIENT_TYPES, *codec.SERVER_TYPES):
+        assert f"| `{tag}` |" in sections["limits"]
+        assert f'`type` = `"{tag}"`' in sections["client"] + sections["server"]
+    for kind in get_args(server_messages.EventKind):
+        assert f"#### {kind.__name__}\n" in sections["events"]
+
+
+def test_links_of_the_document_lead_somewhere() -> None:
+    text = (ROOT / "docs/protocol.md").read_text()
+    headings = {
+        re.sub(r"[^\w -]", "", line.lstrip("# ")).strip().lower().replace(" ", "-")
+        for line in text.splitlines()
+        if line.startswith("#")
+    }
+    for link in re.findall(r"\]\(#([^)]+)\)", text):
+        assert link in headings, link
+    for link in re.findall(r"\]\((protocol/[^)]+)\)", text):
+        assert (ROOT / "docs" / link).exists(), link

@@ -1,0 +1,142 @@
+"""docs/protocol/golden.json is complete and true both ways; the reference payload is that of the encoder."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from anchors.pose import Quat, Vec3, quat_normalize, quat_rotate
+from iris_session.codegen import rigid_reference
+from iris_session.codegen.conversions import from_three, from_unity, to_three, to_unity
+from iris_session.protocol import codec
+from iris_session.protocol.assets import AssetChunk, AssetRefused, AssetRequest
+from iris_session.protocol.client_messages import ClientEnvelope
+from iris_session.protocol.discovery import Beacon
+from iris_session.protocol.errors import ProtocolError
+from iris_session.protocol.media import MediaHeader, MediaPush
+from iris_session.protocol.server_messages import Presence, ServerEnvelope, StateHeader
+from iris_session.streams.rigid import RigidDecoder, RigidEncoder
+from tests.streams.poses import random_poses
+
+GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "golden.json").read_text())
+
+#: Section -> type, encoder, decoder.
+CODECS: dict[str, tuple[Any, Any, Any]] = {
+    "client": (ClientEnvelope, codec.encode_client, codec.decode_client),
+    "server": (ServerEnvelope, codec.encode_server, codec.decode_server),
+    "state_header": (StateHeader, codec.encode_state_header, codec.decode_state_header),
+    "presence": (Presence, codec.encode_presence, codec.decode_presence),
+    "media_header": (MediaHeader, codec.encode_media_header, codec.decode_media_header),
+    "media_push": (MediaPush, codec.encode_media_push, codec.decode_media_push),
+    "asset_request": (AssetRequest, codec.encode_asset_request, codec.decode_asset_request),
+    "asset_chunk": (AssetChunk, codec.encode_asset_header, lambda data: codec.decode_asset_chunk(data, 0)),
+    "asset_refused": (AssetRefused, codec.encode_asset_header, codec.decode_asset_refused),
+    "beacon": (Beacon, codec.encode_beacon, lambda data: msgspec.msgpack.decode(data, type=Beacon)),
+}
+
+
+@pytest.mark.parametrize("section", CODECS)
+def test_vectors_hold_both_ways(section: str) -> None:
+    kind, encode, decode = CODECS[section]
+    for vector in GOLDEN[section]:
+        value = msgspec.convert(vector["value"], kind)
+        assert encode(value).hex() == vector["hex"], vector["name"]
+        assert decode(bytes.fromhex(vector["hex"])) == value, vector["name"]
+
+
+def test_every_message_and_event_has_vectors() -> None:
+    for section, tags in (("client", codec.CLIENT_TYPES), ("server", codec.SERVER_TYPES)):
+        names = {vector["name"] for vector in GOLDEN[section]}
+        assert names >= {f"{tag}/{make}" for tag in tags for make in ("full", "least", "extreme")}
+    events = {vector["name"] for vector in GOLDEN["server"]}
+    assert events >= {f"event/{tag}/full" for tag in codec.EVENT_TYPES}
+
+
+def test_decode_only_vectors_decode_to_their_value() -> None:
+    for vector in GOLDEN["decode_only"]:
+        expected = msgspec.convert(vector["value"], ClientEnvelope)
+        data = bytes.fromhex(vector["hex"])
+        assert codec.decode_client(data) == expected, vector["name"]
+        assert codec.encode_client(expected) != data, vector["name"]
+
+
+def test_malformed_vectors_are_refused_with_their_code() -> None:
+    for vector in GOLDEN["malformed"]:
+        with pytest.raises(ProtocolError) as caught:
+            codec.decode_client(bytes.fromhex(vector["hex"]))
+        assert caught.value.code == vector["code"], vector["name"]
+
+
+def test_rigid_vectors_decode() -> None:
+    for vector in GOLDEN["rigid"]:
+        decoder = RigidDecoder(vector["n_bodies"])
+        assert decoder.apply(1, 0, bytes.fromhex(vector["hex"])) == (len(vector["poses"]) == vector["n_bodies"])
+        for body, row in vector["poses"].items():
+            expected = [math.nan if v is None else v for v in row]
+            np.testing.assert_allclose(decoder.poses[int(body)], expected, rtol=0, atol=1e-12)
+        assert np.isnan(decoder.poses).all(axis=1).sum() >= vector["n_bodies"] - len(vector["poses"])
+
+
+def test_reference_and_encoder_give_the_same_bytes() -> None:
+    rng = np.random.default_rng(12)
+    for n in (0, 1, 9, 64, 150):
+        poses = random_poses(rng, n)
+        poses[::7, 4:] = 0.0
+        poses[::7, 3] = 1.0
+        payload = RigidEncoder(n).encode(poses, 1).payload
+        assert payload == rigid_reference.encode(n, dict(enumerate(poses.tolist())), {})
+        decoder = RigidDecoder(n)
+        decoder.apply(1, 0, payload)
+        reference = rigid_reference.decode(payload)
+        rows = np.array([reference[body] for body in range(n)]).reshape(n, 7)
+        np.testing.assert_allclose(decoder.poses, rows, rtol=0, atol=1e-15)
+
+
+def test_reference_and_encoder_agree_on_escapes() -> None:
+    poses = random_poses(np.random.default_rng(13), 10)
+    poses[3] = np.nan
+    poses[6, 0] = 1e15
+    payload = RigidEncoder(10).encode(poses, 1).payload
+    rows = dict(enumerate(poses.tolist()))
+    escaped = {body: rows.pop(body) for body in (3, 6)}
+    assert payload == rigid_reference.encode(10, rows, escaped)
+
+
+def test_reference_refuses_codes_of_no_rotation() -> None:
+    with pytest.raises(ValueError, match="no rotation"):
+        rigid_reference.decode_rotation((16383, 8191, 8191))
+    with pytest.raises(ValueError, match="no rotation"):
+        rigid_reference.decode_rotation((0, 0, 0))
+
+
+def test_conversions_turn_vectors_like_poses() -> None:
+    """Converting a turned vector is the same as turning the converted one, in both engines; and the way back."""
+    rng = np.random.default_rng(14)
+    for row in random_poses(rng, 50).tolist():
+        q = quat_normalize((row[3], row[4], row[5], row[6]))
+        v: Vec3 = (row[0], row[1], row[2])
+        turned = quat_rotate(q, v)
+        for there, back in ((to_unity, from_unity), (to_three, from_three)):
+            converted = there((*v, *q))
+            engine_q: Quat = (converted[6], converted[3], converted[4], converted[5])
+            engine_turned = there((*turned, *q))[:3]
+            assert quat_rotate(engine_q, converted[:3]) == pytest.approx(engine_turned, abs=1e-12)
+            assert back(converted) == (*v, *q)
+
+
+def test_axes_of_the_engines() -> None:
+    forward, left, up = ((*axis, 1.0, 0.0, 0.0, 0.0) for axis in np.eye(3).tolist())
+    assert [to_unity(axis)[:3] for axis in (forward, left, up)] == [(0, 0, 1), (-1, 0, 0), (0, 1, 0)]
+    assert [to_three(axis)[:3] for axis in (forward, left, up)] == [(0, 0, -1), (-1, 0, 0), (0, 1, 0)]
+
+
+def test_conversion_vectors_are_those_of_the_functions() -> None:
+    for vector in GOLDEN["conversions"]:
+        assert list(to_unity(vector["world"])) == vector["unity"]
+        assert list(to_three(vector["world"])) == vector["three"]

@@ -1,0 +1,146 @@
+"""docs/protocol/scene.json is complete, true both ways, read the same by another library, refused where it must be."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import msgspec
+import pytest
+
+from iris_session.codegen import schema
+from iris_session.protocol import scene_names
+from iris_session.protocol.scene import (
+    MAX_SCENE_BYTES,
+    MAX_THINGS,
+    SceneError,
+    SceneSpec,
+    check_scene,
+    decode_scene,
+    encode_scene,
+)
+from iris_session.protocol.scene_looks import Material
+from iris_session.protocol.scene_patch import PatchOp, patched
+from tests.codegen.test_interop import reordered, same, unpack
+
+GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "scene.json").read_text())
+KINDS = {kind.__name__: kind for group in ("scene", "arrays", "patch") for kind in schema.GROUPS[group]}
+SCENES = {row["name"]: row for row in GOLDEN["scenes"]}
+MALFORMED = {row["name"]: row for row in GOLDEN["malformed"]}
+_spec_types = msgspec.msgpack.Decoder(SceneSpec)
+
+
+def named(rows: list[dict[str, Any]]) -> list[Any]:
+    return [pytest.param(row, id=row["name"]) for row in rows]
+
+
+@pytest.mark.parametrize("row", named(GOLDEN["structs"]))
+def test_every_struct_holds_both_ways_and_in_another_library(row: dict[str, Any]) -> None:
+    kind, data = KINDS[row["type"]], bytes.fromhex(row["hex"])
+    value: Any = msgspec.convert(row["value"], kind)
+    assert msgspec.msgpack.encode(value) == data
+    assert msgspec.msgpack.decode(data, type=kind) == value
+    packed = unpack(data)
+    assert same(packed, row["value"])
+    assert msgspec.msgpack.decode(msgpack.packb(reordered(packed)), type=kind) == value
+
+
+@pytest.mark.parametrize("row", named(GOLDEN["scenes"]))
+def test_scenes_decode_to_their_value(row: dict[str, Any]) -> None:
+    data = bytes.fromhex(row["hex"])
+    spec = decode_scene(data)
+    assert spec == msgspec.convert(row["value"], SceneSpec)
+    assert hashlib.sha256(data).hexdigest() == row["address"]
+    assert (encode_scene(spec) == data) == row["canonical"]
+    if row["canonical"]:
+        assert same(unpack(data), row["value"])
+
+
+@pytest.mark.parametrize("row", named(GOLDEN["patches"]))
+def test_patches_lead_to_the_scene_that_they_say(row: dict[str, Any]) -> None:
+    data = bytes.fromhex(row["hex"])
+    ops: tuple[PatchOp, ...] = msgspec.msgpack.decode(data, type=tuple[PatchOp, ...])
+    assert same(unpack(data), row["value"])
+    assert msgspec.msgpack.encode(ops) == data
+    before = decode_scene(bytes.fromhex(SCENES[row["before"]]["hex"]))
+    after = encode_scene(patched(before, ops))
+    assert hashlib.sha256(after).hexdigest() == row["after"]
+    changes_nothing = row["name"] != "every operation"
+    assert (row["after"] == SCENES[row["before"]]["address"]) == changes_nothing
+
+
+@pytest.mark.parametrize("row", named(GOLDEN["malformed"]))
+def test_what_is_malformed_is_refused(row: dict[str, Any]) -> None:
+    """By types and bounds, which generated readers check, or by what it says."""
+    data = bytes.fromhex(row["hex"])
+    with pytest.raises(SceneError):
+        decode_scene(data)
+    if row["checked"]:
+        _spec_types.decode(data)
+    else:
+        with pytest.raises(msgspec.DecodeError):
+            _spec_types.decode(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("version 2", "version 2, this side reads 1"),
+        ("a body that is not there", "on body 77: no such body"),
+        ("a target that is not there", "looks at body 77: no such body"),
+        ("two bodies of one id", "two bodies have the same id"),
+        ("two visuals of one id", "two visuals have the same id"),
+        ("a child before its parent", "not listed before it"),
+        ("a tendon through a site that is not there", "a site that is not there"),
+        ("a mesh without a level", "no level"),
+        ("33 levels of detail", "length <= 32"),
+    ],
+)
+def test_refusals_say_what_is_wrong(name: str, said: str) -> None:
+    with pytest.raises(SceneError, match=said):
+        decode_scene(bytes.fromhex(MALFORMED[name]["hex"]))
+
+
+def test_what_is_deep_or_long_is_refused_before_it_costs_anything() -> None:
+    with pytest.raises(SceneError):
+        decode_scene(b"\x81\xa4deep" + b"\x91" * 100_000 + b"\xc0")
+    with pytest.raises(SceneError, match="at most 32000000 are read"):
+        decode_scene(bytes(MAX_SCENE_BYTES + 1))
+
+
+def test_many_small_things_are_refused_before_they_take_memory() -> None:
+    """32 MB may hold two million materials, which would take 600 MiB."""
+    one = msgspec.msgpack.encode({"name": "", "rgba": [0, 0, 0, 0]})
+    data = b"\x81\xa9materials\xdd" + (MAX_THINGS + 1).to_bytes(4, "big") + one * (MAX_THINGS + 1)
+    with pytest.raises(SceneError, match="length <= 65536"):
+        decode_scene(data)
+    with pytest.raises(SceneError, match="65537 materials, at most 65536"):
+        check_scene(SceneSpec(materials=(Material("", (0.0, 0.0, 0.0, 0.0)),) * (MAX_THINGS + 1)))
+
+
+def test_what_nobody_would_read_is_not_written() -> None:
+    whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
+    many = msgspec.structs.replace(whole, visuals=whole.visuals * 15_000)
+    with pytest.raises(SceneError, match=r"150000 visuals, 3 bodies\), at most 32000000"):
+        encode_scene(many)
+
+
+def test_every_struct_and_kind_of_thing_has_a_vector() -> None:
+    listed = {row["name"] for row in GOLDEN["structs"]}
+    assert listed >= {f"{name}/{make}" for name in KINDS for make in ("full", "least")}
+    whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
+    for field in whole.__struct_fields__:
+        assert getattr(whole, field) != getattr(SceneSpec(), field) or field == "version", field
+    kinds = scene_names.GeometryKind.ALL
+    assert {visual.geometry.kind for visual in whole.visuals} - kinds == {"torus"}, "and one that nobody knows"
+    assert {visual.geometry.kind for visual in whole.visuals} >= kinds
+    assert {light.kind for light in whole.lights} == scene_names.LightKind.ALL
+    assert {texture.kind for texture in whole.textures} == scene_names.TextureKind.ALL
+    assert {part.dim for part in whole.deformables} == {1, 2, 3}
+    encodings = {level.encoding for texture in whole.textures for level in texture.levels}
+    assert encodings == set(schema.enums()["AssetEncoding"].values())
+    done = {op["op"] for row in GOLDEN["patches"] for op in row["value"]}
+    assert done == {struct.tag for struct in schema.structs("patch")}

@@ -1,0 +1,48 @@
+"""Scenes by name: every one that the help lists can be served, and its sheet lies in it."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.demo.named_scenes import SCENES, scene_by_name
+from iris_session.demo.scene_names import SCENE_NAMES
+from iris_session.emulator.headset import DEFAULT_ANCHOR_ID, DEFAULT_SHEET_M
+from iris_session.physics import ModelNotFoundError, find_robots
+from iris_session.session.errors import ConfigError
+
+
+def test_the_names_of_the_help_are_those_that_can_be_made() -> None:
+    assert list(SCENES) == list(SCENE_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("name", "robots"),
+    [("handover", 2), ("arm", 1), ("arms", 8), ("arms3", 3), ("iiwa", 2), ("iiwa1", 1), ("aloha", 4), ("bodies", 0)],
+)
+def test_a_scene_has_its_robots_and_a_sheet_of_known_size(name: str, robots: int) -> None:
+    scene = scene_by_name(name)
+    assert len(find_robots(scene.model)) == robots
+    assert scene.anchor_sizes == {DEFAULT_ANCHOR_ID: DEFAULT_SHEET_M}
+    if name not in ("handover", "arm", "bodies"):
+        drawn = scene.model.body("sheet").pos
+        assert tuple(scene.anchors[DEFAULT_ANCHOR_ID][0]) == pytest.approx(tuple(drawn))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("alohas", "Scenes: handover, arm, arms, iiwa, aloha, cloth, soft, bodies"),
+        ("handover2", "Scenes: handover"),
+        ("arms0", "scene 'arms0': .* 1 to 12"),
+        ("iiwa9", "1 to 8"),
+    ],
+)
+def test_an_unknown_name_says_which_there_are(name: str, text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        scene_by_name(name)
+
+
+def test_without_the_models_it_says_where_they_belong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("IRIS_DATA", raising=False)
+    with pytest.raises(ModelNotFoundError, match="set IRIS_DATA"):
+        scene_by_name("aloha")

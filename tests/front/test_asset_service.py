@@ -1,0 +1,149 @@
+"""What the thread of assets is told to serve: two scenes, and for a while the specifications before them."""
+
+from __future__ import annotations
+
+import zmq
+
+from iris_session.front.asset_server import Table, Tallied
+from iris_session.front.asset_service import (
+    LATE_NS,
+    LATE_TURN_NS,
+    LOOK_NS,
+    MAX_REPLACED,
+    REPLACED_NS,
+    AssetDesk,
+)
+from iris_session.front.connections import ClientTable, Connection, Peer, Route
+from iris_session.front.state_publisher import StatePublisher
+from iris_session.link.config import SceneInfo
+from iris_session.protocol.client_messages import Hello
+from iris_session.protocol.token_bucket import Drops
+from iris_session.security import AllowedKey, KeyPair
+from iris_session.security.keyring import Keyring
+
+ROOT = "/store"
+
+
+class Told:
+    """In place of the thread: keeps what it is told, at the time that it is."""
+
+    def __init__(self) -> None:
+        self.table = Table()
+        self.late_until_ns = 0
+
+    def start(self) -> None: ...
+
+    def publish(self, table: Table) -> None:
+        self.table = table
+
+    def tallied(self) -> Tallied:
+        return Tallied(0, 0, 0, 0, {})
+
+    @property
+    def served(self) -> set[str]:
+        return {address for root, addresses in self.table.stores for address in addresses if root == ROOT}
+
+
+class Desk:
+    def __init__(self, keyring: Keyring | None = None) -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self.publisher = StatePublisher(context.socket(zmq.PUB), look(0), lambda: 0)
+        self.publisher.use_socket(None)
+        self.told, self.drops, self.clients = Told(), Drops(), ClientTable()
+        self.revoked: set[str] = set()
+        self.desk = AssetDesk(
+            self.told,  # type: ignore[arg-type]
+            self.clients,
+            keyring or Keyring(),
+            self.drops,
+            self.publisher,
+            self.revoked.__contains__,
+        )
+
+    def join(self, number: int, key: str, gateway: int = 0) -> None:
+        route, peer = Route(b"%d" % number), Peer(number, key)
+        connection = Connection(number, route, peer, ("127.0.0.1", 1), key, Hello("observer", "Ann"), gateway)
+        connection.admitted = True
+        self.clients.add(connection)
+
+    def show(self, info: SceneInfo) -> set[str]:
+        self.publisher.set_scene(info)
+        self.desk.look()
+        return self.told.served
+
+
+def look(number: int) -> SceneInfo:
+    return SceneInfo(f"look{number}", asset_root=ROOT, assets=(f"look{number}", f"mesh{number}"))
+
+
+def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_their_specification() -> None:
+    desk = Desk()
+    assert desk.show(look(0)) == {"look0", "mesh0"}
+    assert desk.show(look(1)) == {"look0", "mesh0", "look1", "mesh1"}
+    assert desk.show(look(2)) == {"look0", "look1", "mesh1", "look2", "mesh2"}
+    assert desk.desk.report().served == 2
+    plain = SceneInfo("a model")
+    desk.show(plain)
+    desk.show(look(3))
+    assert desk.show(look(4)) == {"look0", "look1", "look2", "look3", "mesh3", "look4", "mesh4"}, "it offers nothing"
+
+
+def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
+    desk = Desk()
+    desk.desk.turn(0)
+    for number in range(3):
+        desk.show(look(number))
+    desk.desk.turn(REPLACED_NS)
+    assert "look0" in desk.told.served
+    desk.show(look(3))
+    desk.desk.turn(REPLACED_NS + LOOK_NS)
+    assert desk.told.served >= {"look1", "look2", "look3"}
+    assert "look0" not in desk.told.served
+    desk.desk.turn(2 * REPLACED_NS + LOOK_NS)
+    assert desk.told.served == {"look2", "mesh2", "look3", "mesh3"}
+
+
+def test_they_are_so_many_at_most() -> None:
+    desk = Desk()
+    n = MAX_REPLACED + 10
+    for number in range(n):
+        served = desk.show(look(number))
+    assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
+
+
+def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
+    listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
+    desk = Desk(Keyring(KeyPair.new(), read=lambda: listed))
+    desk.join(1, "ann")
+    desk.join(2, "gate")
+    desk.join(3, "bob", gateway=2)
+    desk.revoked.add("eve")
+    desk.desk.turn(0)
+    assert desk.told.table.marks == {"ann", "gate"}
+    assert desk.told.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
+    desk.revoked.add("ann")
+    desk.desk.turn(LOOK_NS)
+    assert desk.told.table.marks == {"gate"}
+
+
+def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
+    desk = Desk()
+    now_ns, steps = 1, desk.publisher
+
+    def yields(after_ns: int, *, delay_ns: int | None) -> bool:
+        """A turn so long after the last one, with a state that left so late, or none."""
+        nonlocal now_ns
+        now_ns += after_ns
+        if delay_ns is not None:
+            steps.frames += 1
+            steps._delays.append((now_ns, delay_ns))
+        desk.told.late_until_ns = 0
+        desk.desk.turn(now_ns)
+        return desk.told.late_until_ns > now_ns
+
+    assert not yields(0, delay_ns=None)
+    assert not yields(LATE_TURN_NS, delay_ns=LATE_NS)
+    assert yields(1, delay_ns=LATE_NS + 1)
+    assert not yields(1, delay_ns=None), "of a state that was late long ago"
+    assert yields(LATE_TURN_NS + 1, delay_ns=None)
+    assert yields(LATE_TURN_NS + 1, delay_ns=0), "state in time does not make up for a loop that was late"

@@ -1,0 +1,163 @@
+"""From the authority to clients: order, and only the newest state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.alignment.service import Anchoring
+from iris_session.front.connections import ClientTable
+from iris_session.front.downlink import Downlink
+from iris_session.front.state_publisher import RECENT_NS, StatePublisher
+from iris_session.link import messages as link
+from iris_session.link.config import FrontConfig, SceneInfo
+from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
+from iris_session.protocol.token_bucket import Drops
+
+
+class Far:
+    """The authority's end of the link; keeps what is published."""
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self.socket = context.socket(zmq.PAIR)
+        self.socket.bind("inproc://link")
+        near = context.socket(zmq.PAIR)
+        near.connect("inproc://link")
+        self.published: list[tuple[bytes, ...]] = []
+        self.heard_of: list[str] = []  # scenes
+        self.drops = Drops()
+        self.publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
+        unused = None
+        self.downlink = Downlink(
+            near,
+            ClientTable(),
+            unused,  # type: ignore[arg-type]
+            unused,  # type: ignore[arg-type]
+            self.publisher,
+            self.drops,
+            lambda: 77,
+            lambda connection: None,
+            unused,  # type: ignore[arg-type]
+            Anchoring(FrontConfig(), ClientTable(), lambda entry: True, self.drops),
+            lambda: self.heard_of.append(self.publisher.scene.scene_hash),
+        )
+
+    def send_multipart(self, frames: tuple[bytes, ...]) -> None:
+        self.published.append(frames)
+
+    def state(self, tick: int, n: int = 1) -> None:
+        header = StateHeader(1, 0, tick, 0.0, tick, 0, 0, 0)
+        self.socket.send_multipart((link.STATE, msgspec.msgpack.encode(header), np.zeros((n, 7)).tobytes()))
+
+    def scene(self, n: int) -> None:
+        self.socket.send_multipart((link.SCENE, msgspec.msgpack.encode(scene(n))))
+
+    def headers(self) -> list[StateHeader]:
+        return [msgspec.msgpack.decode(frames[1], type=StateHeader) for frames in self.published]
+
+
+def scene(n: int) -> SceneInfo:
+    return SceneInfo(f"scene{n}", (), tuple(BodyInfo(i, f"b{i}", True) for i in range(n)), np.ones((n, 7)).tobytes())
+
+
+@pytest.fixture
+def far() -> Iterator[Far]:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    yield Far(context)
+    context.destroy(linger=0)
+
+
+def test_only_the_newest_waiting_state_is_published_stamped(far: Far) -> None:
+    for tick in (1, 2, 3):
+        far.state(tick)
+    far.downlink.drain()
+    (header,) = far.headers()
+    assert (header.tick, header.state_seq, header.published_ns) == (3, 1, 77)
+    assert far.drops.by_reason == {"state_superseded": 2}
+    far.state(4)
+    far.downlink.drain()
+    assert [h.state_seq for h in far.headers()] == [1, 2]
+
+
+def test_state_goes_before_everything_else_that_waits(far: Far) -> None:
+    order: list[str] = []
+    far.publisher.publish_presence = lambda *_: order.append("presence")  # type: ignore[method-assign]
+    far.publisher.publish = lambda *_: order.append("state") or True  # type: ignore[method-assign, func-returns-value]
+    far.socket.send_multipart((link.PRESENCE, msgspec.msgpack.encode([])))
+    far.state(1)
+    far.downlink.drain()
+    assert order == ["state", "presence"]
+
+
+def test_a_state_of_the_next_scene_waits_for_it(far: Far) -> None:
+    far.state(1)
+    far.scene(2)
+    far.state(2, n=2)
+    far.downlink.drain()
+    assert far.publisher.scene.scene_hash == "scene2"
+    assert [h.tick for h in far.headers()] == [2]
+    assert "state_of_other_scene" not in far.drops.by_reason
+
+
+def test_another_scene_is_told_of_inside_before_anybody_outside_hears(far: Far) -> None:
+    far.downlink.broadcast = lambda event: far.heard_of.append(event.body.scene_hash)  # type: ignore[method-assign, union-attr]
+    far.scene(1)
+    event = Event(1, 1, 0, SceneChanged(1, 1, "patch", "to everybody"))
+    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    far.scene(2)
+    far.downlink.drain()
+    assert far.heard_of == ["scene1", "to everybody", "scene2"]
+
+
+def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(far: Far) -> None:
+    far.state(1)
+    far.downlink.drain()
+    assert far.publisher.keyframe()[0] == 1
+    far.scene(2)
+    far.downlink.drain()
+    assert far.publisher.keyframe() == (0, np.ones((2, 7)).tobytes())
+    far.state(3, n=2)
+    far.downlink.drain()
+    assert far.publisher.keyframe()[0] == 2
+
+
+def test_acknowledgements_and_the_end_are_noticed(far: Far) -> None:
+    assert far.downlink.heard_ns == 0
+    far.socket.send_multipart((link.ACK, b"\x04"))
+    far.socket.send_multipart((link.ACK, b"\x03"))
+    far.socket.send_multipart((link.END, b""))
+    far.downlink.drain()
+    assert (far.downlink.acknowledged, far.downlink.ended, far.downlink.heard_ns) == (7, True, 77)
+
+
+def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) -> None:
+    event = Event(1, 1, 0, MarkerAdded("p1", "x" * 3000))
+    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    far.state(1)
+    far.downlink.drain()
+    assert far.drops.by_reason == {"decision_invalid": 1}
+    assert [h.tick for h in far.headers()] == [1]
+
+
+def test_delays_are_those_of_the_last_seconds(far: Far) -> None:
+    now = [10]
+    publisher = StatePublisher(far, scene(1), lambda: now[0])  # type: ignore[arg-type]
+    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([], 0)
+    for at_ns, session_time in ((10, 1), (RECENT_NS, RECENT_NS - 20), (RECENT_NS + 20, RECENT_NS + 13)):
+        now[0] = at_ns
+        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
+        assert publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
+    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
+
+
+def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: Far) -> None:
+    """Its source is silent, and it is as old as that."""
+    for session_time in (7, 7, 7, 9):
+        header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
+        assert far.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
+    assert far.publisher.delays_ns() == [70, 68]
+    assert [header.session_time for header in far.headers()] == [7, 7, 7, 9]

@@ -1,0 +1,378 @@
+"""The real front process against well-behaved clients: join, identity, resume, snapshots, state, alignment."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Bye,
+    ClockPing,
+    EStop,
+    GetSnapshot,
+    Heartbeat,
+    Hello,
+    Marker,
+    Observation,
+    Sample,
+    envelope,
+)
+from iris_session.protocol.codec import decode_presence, decode_state_header, encode_client
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.entries import AlignmentProposal, Join, Lost
+from iris_session.protocol.server_messages import (
+    ClockPong,
+    Event,
+    PresenceItem,
+    ProtocolFault,
+    Refused,
+    Snapshot,
+    Welcome,
+)
+from iris_session.protocol.steps import Admitted, Decision, Dropped, Outgoing
+from iris_session.streams.rigid import RigidDecoder
+from tests.front.harness import N_BODIES, FrontSession
+
+pytestmark = pytest.mark.e2e
+OpenSession = Callable[..., FrontSession]
+
+
+def test_join_gives_welcome_with_ports_and_token(session: FrontSession) -> None:
+    client = session.client()
+    welcome = client.join("operator", "Ann", devices=("head",), software="test 1")
+    assert welcome.participant_id == "p1"
+    assert welcome.connection_epoch == 1
+    assert welcome.session_name == "test"
+    assert welcome.endpoints.state == session.ports.state
+    assert len(welcome.resume_token) == 16
+    assert not welcome.resumed
+    (entry,) = session.wait_entries(Join)
+    join = entry.message
+    assert isinstance(join, Join)
+    assert (join.role, join.name, join.devices, join.software) == ("operator", "Ann", ("head",), "test 1")
+    assert session.client().join(name="Bob").connection_epoch == 2
+
+
+def test_entries_hold_no_secret_or_token(session: FrontSession) -> None:
+    first = session.client()
+    token = first.join().resume_token
+    second = session.client()
+    second.secret = first.secret
+    second.join(resume_token=token)
+    blob = msgspec.msgpack.encode(session.entries) + session.process.link.handback
+    assert first.secret not in blob
+    assert token not in blob
+
+
+def test_another_version_is_refused_with_advice(session: FrontSession) -> None:
+    client = session.client()
+    client.socket.send(msgspec.msgpack.encode([7, 0, "", {"type": "hello", "some": "future"}]))
+    refused = client.wait_for(Refused)
+    assert refused.code == "version"
+    assert refused.supported_versions == (1,)
+    assert "session" in refused.advice
+
+
+def test_a_hello_without_secret_is_refused(session: FrontSession) -> None:
+    client = session.client()
+    client.send(Hello("operator", "Ann"))
+    assert client.wait_for(Refused).code == "identity"
+    assert not session.entries
+
+
+def test_the_same_secret_has_the_same_key_id_on_every_connection(session: FrontSession) -> None:
+    first, second, other = session.client(), session.client(), session.client()
+    second.secret = first.secret
+    for client in (first, second, other):
+        client.join()
+    keys = [e.message.key_id for e in session.wait_entries(Join, 3) if isinstance(e.message, Join)]
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_resume_token_is_single_use_and_bound_to_the_key(session: FrontSession) -> None:
+    first = session.client()
+    token = first.join().resume_token
+    thief = session.client()
+    thief.send(Hello("operator", "Thief", secret=thief.secret, resume_token=token))
+    assert thief.wait_for(Refused).code == "resume_token"
+    back = session.client()
+    back.secret = first.secret
+    welcome = back.join(resume_token=token)
+    assert welcome.resumed
+    assert welcome.participant_id == "p1"
+    back.send(Heartbeat())
+    session.wait_entries(Heartbeat)
+    again = session.client()
+    again.secret = first.secret
+    again.send(Hello("operator", "Ann", secret=first.secret, resume_token=token))
+    assert again.wait_for(Refused).code == "resume_token"
+
+
+def test_a_lost_welcome_does_not_burn_the_token(session: FrontSession) -> None:
+    first = session.client()
+    token = first.join().resume_token
+    for _ in range(3):  # the client never says anything with its new connection epoch
+        back = session.client()
+        back.secret = first.secret
+        assert back.join(resume_token=token).resumed
+
+
+def test_before_hello_nothing_but_hello_counts(session: FrontSession) -> None:
+    client = session.client()
+    client.send(EStop("from a stranger"), epoch=1)
+    assert client.wait_for(ProtocolFault).code == "hello"
+    assert not session.entries
+
+
+def test_clock_ping_is_answered_with_session_time(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    before = session.process.link.now_ns
+    client.send(ClockPing(123))
+    pong = client.wait_for(ClockPong)
+    assert pong.t0_ns == 123
+    assert before <= pong.t1_ns <= pong.t2_ns <= session.process.link.now_ns
+
+
+def test_closing_the_socket_is_a_loss_at_once_and_after_the_last_words(session: FrontSession) -> None:
+    client = session.client()
+    epoch = client.join().connection_epoch
+    client.send(Marker(1, "last words"))
+    client.send(EStop("stop"))
+    client.close(linger=1000)
+    session.wait_entries(Lost)
+    kinds = [type(e.message) for e in session.entries if e.connection == epoch]
+    assert kinds.index(Marker) < kinds.index(Lost)
+    assert kinds.index(EStop) < kinds.index(Lost)
+    (lost,) = session.wait_entries(Lost)
+    assert lost.message == Lost("closed")
+
+
+def test_a_silent_client_is_lost_and_told_to_say_hello_again(open_session: OpenSession) -> None:
+    session = open_session(silence_ns=200_000_000)
+    client = session.client()
+    client.join()
+    (lost,) = session.wait_entries(Lost)
+    assert lost.message == Lost("silent")
+    client.send(Heartbeat())
+    assert client.wait_for(ProtocolFault).code == "hello"
+    client.send(EStop("I know of nothing"))
+    (stop,) = session.wait_entries(EStop)
+    assert stop.connection == 1
+    assert client.join().connection_epoch == 2
+
+
+def test_a_second_hello_on_a_connection_replaces_it(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.send(Hello("operator", "Ann", secret=client.secret))
+    client.wait_for(Welcome, 2)
+    (lost,) = session.wait_entries(Lost)
+    assert (lost.connection, lost.message) == (1, Lost("replaced"))
+    assert client.epoch == 2
+
+
+def test_dropped_and_refused_connections_end(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.send(Bye())
+    session.wait_entries(Bye)
+    session.once(Decision((), dropped=(Dropped(1, "bye"),)))
+    assert client.wait_for(ProtocolFault).code == "dropped"
+    session.admits = False
+    client.send(Hello("pilot", "Ann", secret=client.secret))
+    join = session.wait_entries(Join, 2)[1]
+    session.once(Decision((), outgoing=(Outgoing(join.connection, Refused("unknown_value", "no role 'pilot'")),)))
+    assert client.wait_for(Refused).code == "unknown_value"
+    client.send(Heartbeat(), epoch=2)
+    session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault")
+
+
+def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: FrontSession) -> None:
+    client, other = session.client(), session.client()
+    client.join()
+    other.join(name="Bob")
+    poses = np.random.default_rng(1).normal(size=(N_BODIES, 7))
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
+    session.send_state(poses)
+    events = tuple(session.notice(str(i)) for i in range(3))
+    snapshot = msgspec.structs.replace(session.snapshot(5), event_seq=events[-1].event_seq)
+    session.once(Decision((), outgoing=(Outgoing(1, snapshot),), events=events))
+    filled = client.wait_for(Snapshot)
+    client.wait_for(Event, 3)
+    assert (filled.request_id, filled.scene_hash, filled.state_seq) == (5, "hash", 1)
+    assert [body.name for body in filled.bodies] == ["body0", "body1", "body2"]
+    kinds = [type(message) for message, _ in client.inbox]
+    assert [kind for kind in kinds if kind in (Event, Snapshot)] == [Event, Event, Event, Snapshot]
+    (bulk,) = next(bulk for message, bulk in client.inbox if isinstance(message, Snapshot))
+    np.testing.assert_allclose(np.frombuffer(bulk).reshape(-1, 7), poses, atol=1e-12)
+    other.wait_for(Event, 3)
+    assert [e.event_seq for e in other.got(Event)] == [1, 2, 3]
+    assert not other.got(Snapshot)
+
+
+def test_a_snapshot_before_the_first_state_has_the_poses_of_the_scene(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.send(GetSnapshot(1))
+    assert client.wait_for(Snapshot).state_seq == 0
+    (bulk,) = next(bulk for message, bulk in client.inbox if isinstance(message, Snapshot))
+    assert np.frombuffer(bulk).reshape(-1, 7)[:, 3].tolist() == [1.0] * N_BODIES
+
+
+def test_state_reaches_subscribers_stamped_and_decodable(session: FrontSession) -> None:
+    sub = session.subscriber()
+    poses = np.zeros((N_BODIES, 7))
+    poses[:, 3] = 1.0
+    decoder = RigidDecoder(N_BODIES)
+    frames: list[list[bytes]] = []
+
+    def received() -> bool:
+        poses[:, 0] += 0.01
+        session.send_state(poses)
+        while sub.poll(0):
+            frames.append(sub.recv_multipart())
+        return len(frames) >= 5
+
+    session.pump(received, "state frames")
+    for topic, header_bytes, payload in frames:
+        assert topic == b"rigid"
+        header = decode_state_header(header_bytes)
+        assert header.session_time <= header.published_ns
+        assert decoder.apply(header.state_seq, header.base_seq, payload)
+    assert abs(decoder.poses[0, 0] - poses[0, 0]) < 0.5
+
+
+def test_states_of_another_scene_are_dropped_and_counted(session: FrontSession) -> None:
+    session.send_state(np.zeros((N_BODIES + 1, 7)))
+    assert session.wait_drops("state_of_other_scene") == 1
+
+
+def test_presence_is_published_latest_per_device(session: FrontSession) -> None:
+    sub = session.subscriber()
+    got: list[bytes] = []
+
+    def received() -> bool:
+        items = tuple(PresenceItem("p1", device, Pose((1.0, 2.0, 3.0), IDENTITY.q)) for device in ("head", "hand/left"))
+        session.once(Decision((), presence=items + items))
+        while sub.poll(0):
+            topic, data = sub.recv_multipart()
+            assert topic == b"presence"
+            got.append(data)
+        return bool(got)
+
+    session.pump(received, "presence")
+    presence = decode_presence(got[0])
+    assert [item.device for item in presence.items] == ["head", "hand/left"]
+    assert presence.items[0].pose.p == (1.0, 2.0, 3.0)
+
+
+def test_observations_become_proposals_not_entries(open_session: OpenSession) -> None:
+    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)})
+    client = session.client()
+    client.join()
+    for i in range(8):
+        seen = Pose((0.5, 0.1 * (i % 2) * 0.001, -0.2), IDENTITY.q)
+        client.send(Observation("table", "qr", seen, i, 1, viewpoint_id=i, size_m=0.16))
+    session.pump(
+        lambda: any(not e.message.refused for e in session.entries if isinstance(e.message, AlignmentProposal)),
+        "an accepted proposal",
+    )
+    proposal = session.wait_entries(AlignmentProposal)[-1].message
+    assert isinstance(proposal, AlignmentProposal)
+    assert math.dist(proposal.T_world_tracking.p, (0.5, 0.0, 1.0)) < 0.01
+    assert proposal.tracking_epoch == 1
+    assert len(proposal.covariance) == 36
+    assert not any(isinstance(e.message, Observation) for e in session.entries)
+    client.send(Observation("elsewhere", "qr", IDENTITY, 9, 1))
+    session.pump(
+        lambda: any("table" in e.message.advice for e in session.entries if isinstance(e.message, AlignmentProposal)),
+        "advice that names the known anchors",
+    )
+
+
+def test_raw_samples_go_to_the_recorder(open_session: OpenSession, tmp_path: object) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    recorder = context.socket(zmq.PULL)
+    recorder.bind(f"ipc://{tmp_path}/recorder")
+    session = open_session(recorder_endpoint=f"ipc://{tmp_path}/recorder")
+    client = session.client()
+    client.join()
+    for seq in range(20):
+        client.send(Sample("head", "pose", seq, 0, 1, 0, 1, pose=IDENTITY))
+    rows = []
+    while len(rows) < 20:
+        assert recorder.poll(30_000)
+        rows.append(msgspec.msgpack.decode(recorder.recv()))
+    samples = [msgspec.msgpack.decode(data, type=Sample) for _, _, data in rows]
+    assert [s.seq for s in samples] == list(range(20))
+    assert all(connection == 1 for connection, _, _ in rows)
+    context.destroy(linger=0)
+
+
+def test_a_gateway_speaks_for_others_and_takes_them_along(session: FrontSession) -> None:
+    gateway = session.client()
+    stranger = session.client()
+    stranger.join("operator")
+    stranger.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
+    assert stranger.wait_for(Refused).code == "gateway_only"
+    gateway.join("gateway", "web")
+    gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
+    welcome = gateway.wait_for(Welcome, 2)
+    assert [bulk for message, bulk in gateway.inbox if message is welcome] == [[b"tab1"]]  # more may have come since
+    join = session.wait_entries(Join, 3)[-1].message
+    assert isinstance(join, Join)
+    assert join.gateway == 2
+    gateway.send(Acquire(1), on_behalf_of="tab1", epoch=welcome.connection_epoch)
+    (acquire,) = session.wait_entries(Acquire)
+    assert acquire.connection == acquire.connection_epoch == 3
+    gateway.close()
+    assert [e.connection for e in session.wait_entries(Lost, 2)] == [2, 3]
+
+
+def test_wrong_connection_epoch_is_left_to_the_authority(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.socket.send(encode_client(envelope(Acquire(1), 77)))
+    (acquire,) = session.wait_entries(Acquire)
+    assert (acquire.connection, acquire.connection_epoch) == (1, 77)
+
+
+def test_welcome_for_a_connection_that_is_gone_is_passed_over(session: FrontSession) -> None:
+    session.once(Decision((), admitted=(Admitted(99, "p99", "operator", False),)))
+    session.client().join()
+
+
+def test_a_gateway_that_ends_without_closing_its_tcp_takes_its_people_along(open_session: OpenSession) -> None:
+    session = open_session(silence_ns=300_000_000)
+    gateway, other = session.client(), session.client()
+    gateway.join("gateway", "Gate")
+    gateway.send(Hello("operator", "Web", secret=os.urandom(16)), on_behalf_of="tab1")
+    session.wait_entries(Join, 2)
+    session.wait_entries(Lost, 2)  # it says nothing any more, its TCP connection stands
+    assert {e.connection for e in session.entries if isinstance(e.message, Lost)} == {1, 2}
+    other.join(name="Ann")
+    gateway.send(EStop("from behind"), on_behalf_of="tab1", epoch=2)
+    (stop,) = session.wait_entries(EStop)
+    assert stop.connection == 2
+
+
+def test_every_headset_gets_its_estimate_however_busy_the_first(open_session: OpenSession) -> None:
+    session = open_session(anchors={"table": Pose((1.0, 0.0, 0.8), IDENTITY.q)}, proposal_period_ns=0)
+    clients = [session.client() for _ in range(3)]
+    for i, client in enumerate(clients):
+        client.join(name=f"c{i}")
+
+    def all_estimated() -> bool:
+        for client in clients:  # new observations all the time: every desk is always due
+            client.send(Observation("table", "qr", Pose((0.5, 0.0, -0.2), IDENTITY.q), session.step, 1, session.step))
+        return {e.connection for e in session.entries if isinstance(e.message, AlignmentProposal)} == {1, 2, 3}
+
+    session.pump(all_estimated, "estimates of all")

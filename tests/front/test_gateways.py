@@ -1,0 +1,175 @@
+"""People behind a gateway when its key is revoked or loses roles, and who notices when one of them is revoked."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.protocol.client_messages import Hello, Marker
+from iris_session.protocol.entries import Join, Lost
+from iris_session.protocol.names import FaultCode
+from iris_session.protocol.security import RemoveParticipant
+from iris_session.protocol.server_messages import ProtocolFault, Welcome
+from iris_session.protocol.steps import Decision, Dropped
+from iris_session.security import KeyPair
+from tests.front.harness import RawClient
+from tests.front.lab import Lab
+
+
+class Gateway:
+    """A gateway that has joined, and the people behind it. `numbers`: of their connections, by name."""
+
+    def __init__(self, lab: Lab, *roles: str) -> None:
+        self.lab = lab
+        self.pair = KeyPair.new()
+        lab.home.clients.allow("web", self.pair.public, roles)
+        self.client: RawClient = lab.client(self.pair)
+        self.client.join(role="gateway", name="web")
+        self.numbers: dict[str, int] = {"web": self.client.epoch}
+        self._secrets: dict[str, bytes] = {}
+
+    def enter(self, name: str, role: str) -> Join:
+        """Somebody says hello through the gateway. What the authority hears of it."""
+        secret = self._secrets.setdefault(name, os.urandom(16))
+        seen, before = len(self.client.got(Welcome)), len(self.lab.session.wait_entries(Join))
+        self.client.send(Hello(role, name, secret=secret), on_behalf_of=name)
+        self.client.wait_for(Welcome, seen + 1)
+        entry = self.lab.session.wait_entries(Join, before + 1)[-1]
+        self.numbers[name] = entry.connection
+        assert isinstance(entry.message, Join)
+        return entry.message
+
+    def faults(self) -> dict[str, ProtocolFault]:
+        """The newest fault for each of those behind it; the gateway's own under an empty name."""
+        told = [(m, frames) for m, frames in self.client.inbox if isinstance(m, ProtocolFault)]
+        return {frames[0].decode() if frames else "": message for message, frames in told}
+
+    def lost(self, n: int) -> dict[int, str]:
+        """Why connections were lost, `n` of them."""
+        entries = self.lab.session.wait_entries(Lost, n)
+        return {e.connection: e.message.reason for e in entries if isinstance(e.message, Lost)}
+
+    def removed(self, n: int) -> set[str]:
+        """Participants that the front had removed, at least `n`."""
+        entries = self.lab.session.wait_entries(RemoveParticipant, n)
+        return {e.message.participant for e in entries if isinstance(e.message, RemoveParticipant)}
+
+    def ids(self, *names: str) -> set[str]:
+        return {f"p{self.numbers[name]}" for name in names}
+
+
+@pytest.mark.parametrize("by", ["list", "director"])
+def test_a_revoked_gateway_takes_its_people_along_those_who_are_away_too(lab: Lab, by: str) -> None:
+    gateway = Gateway(lab, "gateway", "operator", "observer")
+    gateway.enter("tab1", "operator")
+    gateway.enter("tab2", "observer")
+    gateway.enter("away", "operator")
+    away = gateway.numbers["away"]
+    lab.session.once(Decision((), dropped=(Dropped(away, "heartbeat"),)))
+    lab.session.pump(lambda: "away" in gateway.faults(), "the tab is let go")
+    _, bob = lab.allowed("bob")
+    if by == "list":
+        lab.home.clients.revoke("web")
+    else:
+        dropped = Dropped(gateway.numbers["web"], "revoked", gateway.pair.fingerprint)
+        lab.session.once(Decision((), dropped=(dropped,)))
+    assert gateway.removed(4) == gateway.ids("web", "tab1", "tab2", "away")
+    lab.session.pump(lambda: {"", "tab1", "tab2"} <= gateway.faults().keys(), "all are told")
+    codes = {name: fault.code for name, fault in gateway.faults().items()}
+    assert codes[""] == FaultCode.REVOKED
+    assert codes["tab1"] == codes["tab2"] == (FaultCode.REVOKED if by == "list" else FaultCode.DROPPED)
+    assert gateway.numbers["tab1"] in gateway.lost(2 if by == "director" else 3)
+    bob.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+
+
+def test_people_behind_a_gateway_lose_the_role_that_its_key_loses(lab: Lab) -> None:
+    gateway = Gateway(lab, "gateway", "operator", "observer")
+    gateway.enter("tab1", "operator")
+    gateway.enter("tab2", "observer")
+    first = gateway.ids("tab1")
+    lab.home.clients.allow("web", gateway.pair.public, ("gateway", "observer"))
+    assert gateway.lost(1) == {gateway.numbers["tab1"]: "role"}
+    assert gateway.removed(1) == first
+    lab.session.pump(lambda: "tab1" in gateway.faults(), "the tab is told")
+    assert gateway.faults()["tab1"].code == FaultCode.DROPPED
+    assert gateway.enter("tab1", "operator").roles == ("observer",), "the authority refuses it by that"
+    gateway.client.send(Marker(1, "still here"), on_behalf_of="tab2", epoch=gateway.numbers["tab2"])
+    (marker,) = lab.session.wait_entries(Marker)
+    assert marker.connection == gateway.numbers["tab2"]
+    assert len(gateway.lost(1)) == 1
+
+
+def test_a_key_that_may_be_a_gateway_no_more_takes_its_people_along(lab: Lab) -> None:
+    gateway = Gateway(lab)  # any role
+    gateway.enter("tab1", "director")
+    lab.home.clients.allow("web", gateway.pair.public, ("director",))
+    assert gateway.removed(2) == gateway.ids("web", "tab1")
+    assert set(gateway.lost(2).values()) == {"role"}
+
+
+def test_roles_that_a_key_gains_end_nothing(lab: Lab) -> None:
+    gateway = Gateway(lab, "gateway", "observer")
+    gateway.enter("tab1", "observer")
+    lab.home.clients.allow("web", gateway.pair.public, ())
+    names = iter(f"tab{i}" for i in range(2, 100))  # the list is looked at a few times a second
+    lab.session.pump(lambda: gateway.enter(next(names), "director").roles == (), "the new roles")
+    gateway.client.send(Marker(1, "still here"), on_behalf_of="tab1", epoch=gateway.numbers["tab1"])
+    lab.session.wait_entries(Marker)
+    assert not [e for e in lab.session.entries if isinstance(e.message, Lost)]
+
+
+class Watcher:
+    """A subscriber of state that notes when it is disconnected."""
+
+    def __init__(self, lab: Lab, pair: KeyPair) -> None:
+        self.lab = lab
+        self.socket = lab.session.subscriber(curve=lab.curve(pair))
+        self._monitor = self.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+
+    def frame(self) -> None:
+        """Waits for a state that is sent from now on."""
+        while self.socket.poll(0):
+            self.socket.recv_multipart()
+
+        def comes() -> bool:
+            self.lab.session.send_state(np.zeros((3, 7)))
+            return bool(self.socket.poll(0))
+
+        self.lab.session.pump(comes, "state", 30.0)
+
+    @property
+    def disconnected(self) -> bool:
+        return bool(self._monitor.poll(0))
+
+    def close(self) -> None:
+        self.socket.disable_monitor()
+        self._monitor.close()
+
+
+@pytest.mark.parametrize("who", ["behind a gateway", "without state", "with state"])
+def test_others_lose_their_state_only_for_a_revoked_key_that_may_have_it(lab: Lab, who: str) -> None:
+    bob, _ = lab.allowed("bob")
+    watcher = Watcher(lab, bob)
+    watcher.frame()
+    if who == "behind a gateway":
+        gateway = Gateway(lab, "gateway", "operator")
+        key_id = gateway.enter("tab1", "operator").key_id
+        dropped = Dropped(gateway.numbers["tab1"], "revoked", key_id)
+        client = gateway.client
+    else:
+        ann, client = lab.allowed("ann")
+        if who == "with state":
+            other = Watcher(lab, ann)
+            other.frame()
+            other.close()
+        dropped = Dropped(client.epoch, "revoked", ann.fingerprint)
+    lab.session.once(Decision((), dropped=(dropped,)))
+    client.wait_for(ProtocolFault)
+    lab.session.wait_entries(RemoveParticipant)
+    watcher.frame()
+    assert watcher.disconnected == (who == "with state")
+    watcher.close()

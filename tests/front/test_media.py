@@ -1,0 +1,511 @@
+"""The media proxy at a real front process: who gets which frames, and who may hand them in."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from iris_session.front.media import proxy as media_module
+from iris_session.front.media.connection_guard import MediaDoors
+from iris_session.front.media.proxy import MediaProxy
+from iris_session.front.media.scheduler import Listener
+from iris_session.link import FrontLimits
+from iris_session.link.media_source import MediaSource
+from iris_session.link.sockets import watch_tcp
+from iris_session.protocol.client_messages import Heartbeat
+from iris_session.protocol.codec import decode_media_header, encode_media_frames
+from iris_session.protocol.limits import MAX_MEDIA_FRAME_BYTES
+from iris_session.protocol.media import MediaHeader, media_topic
+from iris_session.protocol.names import BudgetClass
+from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, ParticipantReport, StatusReport
+from iris_session.security import KeyPair
+from tests.front.harness import N_BODIES, FrontSession, RawClient
+from tests.front.lab import Lab, Open
+
+Curve = tuple[bytes, bytes, bytes]
+
+
+class Viewer:
+    """A SUB socket on the media port, and what came by it."""
+
+    def __init__(self, session: FrontSession, topics: list[bytes], curve: Curve | None = None, hwm: int = 1000) -> None:
+        self.socket = session.context.socket(zmq.SUB)
+        self.socket.linger = 0
+        self.socket.rcvhwm = hwm
+        if curve:
+            self.socket.curve_serverkey, self.socket.curve_publickey, self.socket.curve_secretkey = curve
+        self.socket.connect(f"tcp://127.0.0.1:{session.ports.media}")
+        for topic in topics:
+            self.socket.subscribe(topic)
+        self.got: list[tuple[bytes, MediaHeader, bytes]] = []
+
+    def take(self) -> int:
+        while self.socket.poll(0):
+            topic, head, data = self.socket.recv_multipart()
+            self.got.append((topic, decode_media_header(head), data))
+        return len(self.got)
+
+
+class Stage:
+    """Somebody who publishes `cloud` at every step, and those who watch, whom no slow machine silences."""
+
+    def __init__(self, session: FrontSession) -> None:
+        self.session = session
+        self.viewers: list[Viewer] = []
+        self.size = 500
+        self.publishing = True
+        self._here: list[RawClient] = []
+        self._beat_s = 0.0
+        self._once, session.once = session.once, self._step  # type: ignore[method-assign,assignment]
+
+    def _step(self, *arguments: object) -> None:
+        self._once(*arguments)  # type: ignore[arg-type]
+        if time.monotonic() > self._beat_s + 0.3:
+            self._beat_s = time.monotonic()
+            for client in self._here:
+                client.send(Heartbeat(True))
+        if self.publishing:
+            now_ns = self.session.process.link.now_ns
+            self.session.process.publish_media("cloud", b"c" * self.size, now_ns, 1, "bytes")
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        self.session.pump(lambda: bool(condition()), what, 30.0)
+
+    def joined(self, client: RawClient, name: str = "ann") -> RawClient:
+        if client.welcome is None:
+            client.join("observer", name)
+        self._here.append(client)
+        client.wait_for(DeliveryBudget)
+        return client
+
+    def viewer(
+        self, client: RawClient, curve: Curve | None = None, stream: str = "cloud", epoch: int = 0, hwm: int = 1000
+    ) -> Viewer:
+        self.viewers.append(Viewer(self.session, [media_topic(epoch or client.epoch, stream)], curve, hwm))
+        return self.viewers[-1]
+
+    def drops(self, reason: str, n: int = 1) -> None:
+        self.session.pump(lambda: self.session.process.link.status.drops.get(reason, 0) >= n, reason, 30.0)
+
+    def close(self) -> None:
+        for viewer in self.viewers:
+            viewer.socket.close()
+
+
+@pytest.fixture
+def media(session: FrontSession) -> Iterator[Stage]:
+    stage = Stage(session)
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def locked(lab: Lab) -> Iterator[tuple[Lab, Stage]]:
+    stage = Stage(lab.session)
+    yield lab, stage
+    stage.close()
+
+
+def budgets(client: RawClient) -> dict[str, str]:
+    return {one.stream: one.budget_class for one in client.got(DeliveryBudget)[-1].streams}
+
+
+def test_a_subscriber_gets_the_newest_frames(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 5, "media")
+    topic, header, data = viewer.got[-1]
+    assert topic == media_topic(ann.epoch, "cloud") + b"full"
+    assert (header.stream, header.budget_class, header.scene_epoch, header.encoding) == ("cloud", "full", 1, "bytes")
+    assert header.capture_ns <= header.published_ns <= session.process.link.now_ns
+    assert data == b"c" * 500
+    assert [b[1].seq for b in viewer.got] == sorted({b[1].seq for b in viewer.got})
+    media.until(lambda: budgets(ann) == {"cloud": "full"}, "ann is told of the stream")
+
+
+def test_the_status_tells_who_gets_what(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 5, "media")
+    assert ann.welcome is not None
+    row = ParticipantReport(ann.welcome.participant_id, "ann", "observer", True)
+    session.process.link.send_report(StatusReport(0, "", "", 0, participants=(row,)))
+
+    asked_s = 0.0
+
+    def told() -> bool:
+        nonlocal asked_s
+        if time.monotonic() > asked_s + 0.3:
+            asked_s = time.monotonic()
+            ann.send(GetStatus())
+        reports = ann.got(StatusReport)
+        if not reports or not reports[-1].participants:  # the authority's half is on its way
+            return False
+        report, mine = reports[-1], reports[-1].participants[0]
+        return bool(report.media and mine.media and mine.media_bytes_per_s) and (
+            (report.media[0].stream, report.media[0].subscribers) == ("cloud", 1)
+            and (mine.budget_class, mine.media[0].stream, mine.media[0].budget_class) == ("full", "cloud", "full")
+            and report.media[0].hz > 0.0
+        )
+
+    media.until(told, "the stream and its subscriber")
+
+
+def test_topics_that_there_are_not_are_counted_and_give_nothing(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    bad = Viewer(session, [b"", b"media/", b"cloud", media_topic(ann.epoch + 7, "cloud")])
+    media.viewers.append(bad)
+    other = media.viewer(ann, stream="other")
+    media.drops("media_topic_unknown", 3)
+    media.drops("media_refused", 1)
+    good = media.viewer(ann)
+    media.until(lambda: good.take() >= 20, "media")
+    assert (bad.take(), other.take()) == (0, 0)
+
+
+@pytest.mark.parametrize("port", ["media", "media_ingest"])
+def test_who_says_nothing_is_closed_and_nobody_else(open_session: Open, port: str) -> None:
+    session = open_session(limits=FrontLimits(hello_timeout_ns=1_500_000_000))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    with socket.create_connection(("127.0.0.1", getattr(session.ports, port))) as silent:
+        media.drops("media_silent")
+        silent.settimeout(30.0)
+        while silent.recv(4096):
+            pass
+    seen = viewer.take()
+    media.until(lambda: viewer.take() > seen + 100, "ann goes on")
+    assert session.process.link.status.drops["media_silent"] == 1
+    media.close()
+
+
+def test_a_message_without_end_is_cut_off(open_session: Open) -> None:
+    """libzmq would collect it in memory; its own sockets cannot send one."""
+    session = open_session(limits=FrontLimits(source_bytes=1 << 20))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x04PUSH"
+    frame = b"\x03" + (100_000).to_bytes(8, "big") + bytes(100_000)  # and more of the same message
+    with socket.create_connection(("127.0.0.1", session.ports.media_ingest)) as source:
+        source.settimeout(30.0)
+        source.sendall(greeting + b"\x04" + bytes([len(ready)]) + ready)
+        answer = b""
+        while b"PULL" not in answer:
+            answer += source.recv(4096)
+        source.sendall(20 * frame)
+        media.drops("media_flood")
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 20, "ann gets media")
+    media.close()
+
+
+def test_too_many_who_subscribe_are_closed_and_the_first_stay(open_session: Open) -> None:
+    session = open_session(limits=FrontLimits(subscribers=2))
+    media = Stage(session)
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 1, "media")
+    for _ in range(4):
+        media.viewer(ann)
+    media.drops("media_too_many", 2)
+    seen = viewer.take()
+    media.until(lambda: viewer.take() > seen + 20, "ann goes on")
+    media.close()
+
+
+def test_who_never_reads_delays_nobody_and_gets_less(media: Stage) -> None:
+    session = media.session
+    media.size = 100_000
+    ann, bob = (media.joined(session.client(), name) for name in ("ann", "bob"))
+    viewer, stuck = media.viewer(ann), media.viewer(bob, hwm=1)
+    media.until(lambda: viewer.take() > 0, "media")
+    media.until(lambda: viewer.take() >= 0 and budgets(bob).get("cloud") == BudgetClass.NONE, "bob gets none")
+    told = bob.got(DeliveryBudget)[-1]
+    assert (told.budget_class, told.reason) == (BudgetClass.NONE, "the link does not take all media")
+    media.until(lambda: viewer.take() and budgets(ann) == {"cloud": BudgetClass.FULL}, "ann has all of it")
+    media.drops("media_superseded")
+    before = len(viewer.got)
+    media.until(lambda: viewer.take() >= before + 20, "ann goes on")
+    assert stuck.take() >= 1
+
+
+def test_a_client_may_ask_for_less(media: Stage) -> None:
+    session = media.session
+    media.size = 20_000
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 100, "media")
+
+    def asks() -> bool:
+        viewer.take()
+        ann.send(ClientReport(1.0, 1.0, 60, media_limit_mbit_per_s=0.001))
+        session.process.link.poll()
+        return budgets(ann) == {"cloud": BudgetClass.NONE}
+
+    media.until(asks, "none")
+    assert ann.got(DeliveryBudget)[-1].reason == "the client asked for no more"
+
+
+def test_who_gets_no_state_at_all_gets_less_media(media: Stage) -> None:
+    """A client that was delivered nothing knows of nothing missed; the front knows what it sent."""
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() > 100, "media")
+    poses = np.zeros((N_BODIES, 7))
+    poses[:, 3] = 1.0
+
+    rounds = 0
+
+    def starves() -> bool:
+        nonlocal rounds
+        viewer.take()
+        for _ in range(30):
+            session.send_state(poses)
+        rounds += 1
+        ann.send(ClientReport(1.0, 1.0, 60) if rounds < 100 else ClientReport(0.0, 0.0, 0))
+        time.sleep(0.01)
+        return any("of state was missed" in told.reason for told in ann.got(DeliveryBudget))
+
+    media.until(starves, "less, for want of state")
+
+
+def test_a_front_that_is_replaced_takes_media_again(media: Stage) -> None:
+    session = media.session
+    ann = media.joined(session.client())
+    viewer = media.viewer(ann)
+    media.until(lambda: viewer.take() >= 1, "media")
+    old_seq = viewer.got[-1][1].seq
+    session.process.restart()
+    media.until(lambda: session.process.link.ports is not None, "a new front")
+    assert session.process.link.ports is not None
+    session.ports = session.process.link.ports
+    bob = media.joined(session.client(), "bob")
+    again = media.viewer(bob)
+    media.until(lambda: again.take() >= 1, "media of the new front")
+    assert again.got[0][1].seq > old_seq
+
+
+def test_what_no_front_would_take_is_said_where_it_is_handed_in(media: Stage) -> None:
+    with pytest.raises(ValueError, match="cannot be the name of a media stream"):
+        media.session.process.publish_media("a b", b"x", 0, 0, "bytes")
+    with pytest.raises(ValueError, match="has class 'full'"):
+        media.session.process.publish_media("a", {"half": b"x"}, 0, 0, "bytes")
+    with pytest.raises(ValueError, match="at most 8388608 for each class"):
+        media.session.process.publish_media("a", bytes(8_388_609), 0, 0, "bytes")
+
+
+def test_a_camera_thread_that_goes_on_when_the_session_ends_is_told_so(tmp_path: Path) -> None:
+    source = MediaSource(f"ipc://{tmp_path}/front")
+    assert source.publish("a", b"x", 0, 0, "bytes")
+    source.close()
+    source.close()
+    assert not source.publish("a", b"x", 0, 0, "bytes")
+    assert source.dropped == 1
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    ann, client = lab.allowed("ann")
+    bob, other = lab.allowed("bob")
+    stage.joined(client)
+    stage.joined(other, "bob")
+    eves = stage.viewer(client, lab.curve(KeyPair.new()))
+    bobs = stage.viewer(client, lab.curve(bob))
+    stage.drops("unknown_key")
+    stage.drops("media_refused")
+    anns = stage.viewer(client, lab.curve(ann))
+    stage.until(lambda: anns.take() >= 10, "media")
+    bobs.socket.unsubscribe(media_topic(client.epoch, "cloud"))
+    bobs.socket.subscribe(b"that was it")
+    stage.drops("media_topic_unknown")
+    bobs.socket.close()
+    seen = anns.take()
+    stage.until(lambda: anns.take() >= seen + 20, "what bob takes back is not ann's")
+    assert eves.take() == 0
+    assert bobs.got == []
+
+
+def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    ann, client = lab.allowed("ann")
+    bob, other = lab.allowed("bob")
+    stage.joined(client)
+    stage.joined(other, "bob")
+    anns, bobs = stage.viewer(client, lab.curve(ann)), stage.viewer(other, lab.curve(bob))
+    stage.until(lambda: min(anns.take(), bobs.take()) >= 1, "media")
+    lab.home.clients.revoke(ann.fingerprint)
+    lab.audits("key_revoked")
+    stage.until(lambda: bobs.take() >= 0 and _quiet(anns), "nothing more for ann")
+    last, seen = len(anns.got), bobs.take()
+    stage.until(lambda: bobs.take() >= seen + 20, "bob goes on")
+    assert anns.take() == last
+    again = stage.viewer(client, lab.curve(ann))
+    stage.until(lambda: bobs.take() >= seen + 40, "bob goes on")
+    assert again.take() == 0
+
+
+def _quiet(viewer: Viewer) -> bool:
+    """Whether nothing comes for a while."""
+    before = viewer.take()
+    return not viewer.socket.poll(100) and viewer.take() == before
+
+
+def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    stage.publishing = False
+    bob, viewing = lab.allowed("bob", "operator", "observer")
+    stage.joined(viewing, "bob")
+    viewer = stage.viewer(viewing, lab.curve(bob), "depth")
+    camera = KeyPair.new()
+    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    pushes = {pair.public: _pusher(lab, pair) for pair in (camera, bob)}
+
+    def sends(pair: KeyPair, data: bytes, condition: Callable[[], bool], what: str) -> None:
+        def once() -> bool:
+            _send(pushes[pair.public], data)
+            viewer.take()
+            return condition()
+
+        stage.until(once, what)
+
+    def refused() -> int:
+        return lab.session.process.link.status.drops.get("media_source_refused", 0)
+
+    sends(camera, b"camera", lambda: len(viewer.got) > 0, "frames of the camera")
+    before = refused()
+    sends(bob, b"bob", lambda: refused() > before, "bob is refused")
+    lab.home.clients.revoke(camera.fingerprint)
+    before = refused()
+    sends(camera, b"revoked", lambda: refused() > before + 20, "the camera is refused")
+    seen = len(viewer.got)
+    sends(camera, b"late", lambda: refused() > before + 60, "and stays so")
+    assert len(viewer.got) == seen
+    assert b"bob" not in {data for _, _, data in viewer.got}
+    for pusher in pushes.values():
+        pusher.close()
+
+
+def _pusher(lab: Lab, pair: KeyPair) -> zmq.Socket[bytes]:
+    pusher = lab.session.context.socket(zmq.PUSH)
+    pusher.linger = 0
+    pusher.curve_serverkey, pusher.curve_publickey, pusher.curve_secretkey = lab.curve(pair)
+    pusher.connect(f"tcp://127.0.0.1:{lab.session.ports.media_ingest}")
+    return pusher
+
+
+def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
+    try:
+        pusher.send_multipart(encode_media_frames("depth", data, 0, 1, "bytes"), zmq.DONTWAIT)
+    except zmq.Again:
+        return
+
+
+def test_a_frame_of_a_source_that_nobody_has_decided_about_is_not_refused(locked: tuple[Lab, Stage]) -> None:
+    lab, stage = locked
+    stage.publishing = False
+    camera = KeyPair.new()
+    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    pusher = _pusher(lab, camera)
+    drops = lab.session.process.link.status.drops
+
+    def known() -> bool:
+        _send(pusher, b"camera")
+        nonlocal drops
+        drops = lab.session.process.link.status.drops
+        return "media_source_undecided" in drops
+
+    stage.until(known, "the first frames come before anybody has looked")
+    viewing = lab.allowed("bob", "observer")[1]
+    stage.joined(viewing, "bob")
+    stage.until(lambda: _send(pusher, b"camera") or "depth" in budgets(viewing), "the camera is let in")
+    assert "media_source_refused" not in lab.session.process.link.status.drops
+    pusher.close()
+
+
+def test_what_waits_for_the_front_is_bounded_in_bytes(tmp_path: Path) -> None:
+    """Nobody takes it. What is large is not copied, and counted until it was handed on."""
+    endpoint = f"ipc://{tmp_path}/media"
+    source, frame = MediaSource(endpoint), bytes(MAX_MEDIA_FRAME_BYTES)
+    largest = {"full": frame, "half": frame, "quarter": frame}
+    taken = [source.publish(f"s{n}", largest, 0, 1, "bytes") for n in range(4)]
+    assert taken == [True, False, False, False]
+    assert source.publish("small", b"x", 0, 1, "bytes")
+    assert source.dropped == 3
+    with zmq.Context() as context, context.socket(zmq.PULL) as front:
+        front.bind(endpoint)
+        assert front.poll(30_000)
+        assert [len(part) for part in front.recv_multipart()[1:]] == [MAX_MEDIA_FRAME_BYTES] * 3
+        deadline = time.monotonic() + 30.0
+        while source.waiting:
+            assert time.monotonic() < deadline, "libzmq is done with it"
+            time.sleep(0.001)
+        assert source.publish("again", largest, 0, 1, "bytes")
+        source.close()
+    assert not source.publish("late", b"x", 0, 1, "bytes")
+
+
+def test_what_is_changed_after_it_was_handed_in_is_sent_as_it_was(tmp_path: Path) -> None:
+    endpoint, picture = f"ipc://{tmp_path}/media", bytearray(b"a" * 200_000)
+    source = MediaSource(endpoint)
+    assert source.publish("cloud", picture, 0, 1, "bytes")  # type: ignore[arg-type]
+    picture[:] = b"b" * len(picture)
+    with zmq.Context() as context, context.socket(zmq.PULL) as front:
+        front.bind(endpoint)
+        assert front.poll(30_000)
+        assert set(front.recv_multipart()[1]) == {ord("a")}
+    source.close()
+
+
+def test_a_fault_costs_what_was_under_way_and_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(media_module, "FAULT_S", 0.001)
+    limits, endpoint = FrontLimits(), f"ipc://{tmp_path}/media"
+    with zmq.Context() as context:
+        out, local, remote = (context.socket(kind) for kind in (zmq.XPUB, zmq.PULL, zmq.PULL))
+        out.setsockopt(zmq.XPUB_MANUAL, 1)
+        port = out.bind_to_random_port("tcp://127.0.0.1")
+        local.bind(endpoint)
+        remote.bind_to_random_port("tcp://127.0.0.1")
+        doors = [
+            MediaDoors(watch_tcp(one, name), limits, 8, 1 << 20, curve=False)
+            for one, name in ((out, "fault-out"), (remote, "fault-in"))
+        ]
+        proxy = MediaProxy(out, *doors, local, remote, time.monotonic_ns, encrypted=False)
+        faults = iter([True] * 3)
+        send = proxy._send
+        monkeypatch.setattr(proxy, "_send", lambda *frame: 1 // 0 if next(faults, False) else send(*frame))
+        with proxy.lock:
+            proxy.hub.allow({1: Listener("", {})})
+        proxy.start()
+        source = MediaSource(endpoint)
+        with context.socket(zmq.SUB) as viewer:
+            viewer.connect(f"tcp://127.0.0.1:{port}")
+            viewer.subscribe(media_topic(1, "cloud"))
+            deadline = time.monotonic() + 30.0
+            while not viewer.poll(5):
+                assert time.monotonic() < deadline, "media go on"
+                source.publish("cloud", b"points", time.monotonic_ns(), 1, "bytes")
+        with proxy.lock:
+            counted = proxy.hub.take_drops()[0]["media_fault"]
+        source.close()
+        proxy.close()
+    said = capfd.readouterr().err
+    assert said.count("a fault in the media thread, which goes on: ZeroDivisionError") == 1
+    assert "Traceback" in said
+    assert counted == 3

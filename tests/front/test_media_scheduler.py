@@ -1,0 +1,241 @@
+"""Streams, subscriptions and what is due, without sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from iris_session.front.media.budget import NOTHING, SECOND
+from iris_session.front.media.scheduler import Listener, MediaHub, Tally
+from iris_session.protocol.codec import decode_media_header
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, media_topic, parse_topic
+
+MS = 1_000_000
+ANN, BOB = 7, 8
+
+
+class Wire:
+    """Connections that take what they are asked to, by number."""
+
+    def __init__(self, **levels: int) -> None:
+        self.hub = MediaHub()
+        self.now_ns = 5 * SECOND
+        self.full: set[int] = set()
+        self.got: dict[int, list[tuple[MediaHeader, bytes]]] = {ANN: [], BOB: []}
+        self.allow(**levels)
+
+    def allow(self, ann: int = 0, bob: int = 0) -> None:
+        self.hub.allow({ANN: Listener("a", {"cloud": ann}), BOB: Listener("b", {"cloud": bob})})
+
+    def send(self, topic: bytes, header: bytes, frame: bytes) -> bool:
+        number = int(topic.split(b"/")[1])
+        if number in self.full:
+            return False
+        head = decode_media_header(header)
+        assert topic == media_topic(number, head.stream) + head.budget_class.encode()
+        self.got[number].append((head, frame))
+        return True
+
+    def push(
+        self, n: int = 1, stream: str = "cloud", source: str = "", frames: Mapping[str, bytes] | None = None
+    ) -> bool:
+        taken = True
+        frames = frames or {"full": b"x" * 100}
+        for _ in range(n):
+            self.now_ns += 16 * MS
+            push = MediaPush(stream, 3, self.now_ns - MS, tuple(frames))
+            taken = self.hub.push(push, list(frames.values()), source, self.now_ns) and taken
+            self.hub.flush(self.send, self.now_ns)
+        return taken
+
+
+def test_subscribers_get_what_their_level_says() -> None:
+    wire = Wire(ann=0, bob=2)
+    assert wire.hub.subscribe(ANN, "cloud", "a", 1)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.push(8)
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 2]
+    header, frame = wire.got[BOB][-1]
+    assert (header.stream, header.budget_class, header.scene_epoch, header.seq % 4) == ("cloud", "quarter", 3, 0)
+    assert (header.published_ns - header.capture_ns, header.dropped, frame) == (MS, 0, b"x" * 100)
+    wire.allow(ann=NOTHING, bob=1)
+    wire.push(8)
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 6]
+
+
+def test_a_coarser_form_comes_at_full_rate() -> None:
+    wire = Wire(ann=1, bob=2)
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.push(4, frames={"full": b"full", "half": b"half"})
+    assert [frame for _, frame in wire.got[ANN]] == [b"half"] * 4
+    assert [frame for _, frame in wire.got[BOB]] == [b"half"] * 2, "every second of the next better one"
+
+
+def test_a_full_connection_gets_the_newest_later_and_delays_nobody() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    wire.full = {BOB}
+    wire.push(5)
+    assert (len(wire.got[ANN]), len(wire.got[BOB])) == (5, 0)
+    assert wire.hub.tally(BOB) == Tally(0, 5, 0)
+    wire.full = set()
+    assert not wire.hub.flush(wire.send, wire.now_ns)
+    ((header, _),) = wire.got[BOB]
+    assert (header.seq, header.dropped) == (wire.got[ANN][-1][0].seq, 4)
+    assert wire.hub.take_drops() == ({}, {BOB: 4})
+    assert wire.hub.take_drops() == ({}, {})
+
+
+def test_only_the_key_of_a_connection_may_subscribe_to_it() -> None:
+    wire = Wire()
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
+    assert not wire.hub.subscribe(99, "cloud", "a", 1)
+    assert wire.hub.take_drops()[0] == {"media_refused": 2}
+    assert wire.hub.wanted(ANN) == []
+
+
+def test_who_is_gone_gets_nothing_any_more() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.full = {ANN}
+    wire.push()
+    wire.hub.allow({BOB: Listener("b", {})})
+    wire.full = set()
+    wire.push()
+    assert wire.got[ANN] == []
+    assert wire.hub.tally(ANN) == Tally()
+
+
+def test_one_of_two_readers_of_a_client_leaves() -> None:
+    """It has connected again; the end of the connection before is noticed later."""
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(ANN, "cloud", "a", 3)
+    wire.hub.left(1)
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+    wire.hub.unsubscribe(ANN, "cloud", 3)
+    wire.hub.unsubscribe(ANN, "cloud", 3)
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+    assert wire.hub.tally(ANN).taken == 1
+
+
+def test_nobody_takes_back_a_subscription_of_another() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
+    wire.hub.unsubscribe(ANN, "cloud", 2)
+    wire.hub.left(2)
+    wire.push()
+    assert len(wire.got[ANN]) == 1
+
+
+def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None:
+    wire = Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.hub.subscribe(BOB, "cloud", "b", 2)
+    assert not wire.hub.give_way(wire.now_ns + SECOND), "there is nothing"
+    wire.full = {BOB}
+    assert wire.push()
+    assert wire.hub.give_way(wire.now_ns + SECOND)
+    assert wire.hub.take_stuck() == {2}
+    assert wire.hub.take_stuck() == set()
+    wire.full = set()
+    assert not wire.push()
+    assert not wire.hub.give_way(wire.now_ns + SECOND)
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [1, 0]
+    assert wire.hub.take_drops()[0] == {"media_memory": 2}
+    wire.now_ns += SECOND
+    assert wire.push()
+    assert [len(wire.got[who]) for who in (ANN, BOB)] == [2, 1]
+
+
+def test_after_a_fault_everybody_gets_what_comes_next() -> None:
+    wire = Wire()
+    assert wire.hub.subscribe(ANN, "cloud", "a", 11)
+    assert wire.hub.subscribe(BOB, "cloud", "b", 12)
+
+    def fault(_topic: bytes, _header: bytes, _frame: bytes) -> bool:
+        raise OSError
+
+    wire.full = {ANN, BOB}
+    wire.push()
+    with pytest.raises(OSError):
+        wire.hub.flush(fault, wire.now_ns)
+    wire.full.clear()
+    wire.hub.begin_anew()
+    assert not wire.hub.flush(wire.send, wire.now_ns), "what was under way is lost"
+    wire.push(2)
+    assert [len(got) for got in wire.got.values()] == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ("stream", "frames"),
+    [
+        ("a/b", {"full": b""}),
+        ("", {"full": b""}),
+        ("cloud", {"half": b""}),
+        ("cloud", {"full": b"", "none": b""}),
+        ("cloud", {"full": b"", "huge": b""}),
+    ],
+)
+def test_frames_that_do_not_fit_are_counted(stream: str, frames: dict[str, bytes]) -> None:
+    wire = Wire()
+    assert not wire.push(stream=stream, frames=frames)
+    push = MediaPush("cloud", 0, 0, ("full",))
+    assert not wire.hub.push(push, [], "", wire.now_ns)
+    assert wire.hub.take_drops()[0] == {"media_malformed": 2}
+    assert wire.hub.streams() == {}
+
+
+def test_streams_and_subscriptions_are_bounded() -> None:
+    wire = Wire()
+    for n in range(MAX_STREAMS + 1):
+        assert wire.push(stream=f"s{n}") == (n < MAX_STREAMS)
+        assert wire.hub.subscribe(ANN, f"s{n}", "a", 1) == (n < MAX_STREAMS)
+    assert wire.hub.take_drops()[0] == {"media_streams_full": 1, "media_subscriptions_full": 1}
+    wire.now_ns += 100 * SECOND
+    wire.hub.look(wire.now_ns)
+    assert wire.hub.streams() == {}
+    assert wire.push(stream="another")
+
+
+def test_a_stream_belongs_to_its_source_while_that_sends() -> None:
+    wire = Wire()
+    assert wire.push(source="camera-1")
+    assert not wire.push(source="camera-2")
+    assert wire.hub.take_drops()[0] == {"media_stream_taken": 1}
+    wire.now_ns += 4 * SECOND
+    assert wire.push(source="camera-2")
+    wire.hub.stop_sources({"camera-2"})
+    assert wire.hub.streams() == {}
+
+
+def test_rates_are_those_of_the_last_seconds() -> None:
+    wire = Wire()
+    for _ in range(12):
+        wire.push(16)
+        wire.hub.look(wire.now_ns)
+    facts = wire.hub.streams()["cloud"]
+    assert facts.hz == pytest.approx(62.5)
+    assert facts.rates == pytest.approx((6250.0, 3125.0, 1562.5))
+
+
+def test_a_restarted_front_numbers_above_its_predecessor() -> None:
+    wire, later = Wire(), Wire()
+    wire.hub.subscribe(ANN, "cloud", "a", 1)
+    later.hub.subscribe(ANN, "cloud", "a", 1)
+    wire.push(30)
+    later.now_ns = wire.now_ns
+    later.push()
+    assert later.got[ANN][0][0].seq > wire.got[ANN][-1][0].seq
+
+
+def test_topics() -> None:
+    assert parse_topic(media_topic(12, "cloud.1")) == (12, "cloud.1")
+    for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):
+        assert parse_topic(bad) is None

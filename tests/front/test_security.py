@@ -1,0 +1,373 @@
+"""Unknown, allowed, paired and revoked keys at a real front process."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import zmq
+from zmq.auth import create_certificates
+
+from iris_session.protocol import pairing
+from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker
+from iris_session.protocol.entries import Audit, Join, Lost
+from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode
+from iris_session.protocol.security import Pair, Paired, RemoveParticipant
+from iris_session.protocol.server_messages import ProtocolFault, Refused
+from iris_session.protocol.steps import Decision, Dropped
+from iris_session.security import KeyPair, load_public, load_secret
+from tests.front.harness import FrontSession
+from tests.front.lab import Lab, Open
+
+
+def test_an_unknown_key_can_only_pair(lab: Lab) -> None:
+    eve = KeyPair.new()
+    client = lab.client(eve)
+    for n, message in enumerate((Hello("operator", "Eve", secret=b"s" * 16), EStop("Eve"), Marker(1, "x")), 1):
+        answer = lab.refused(client, message, n)
+        assert answer.code == RefusalCode.UNPAIRED
+        assert "iris-session pair" in answer.advice
+    assert [type(e.message) for e in lab.session.entries if not isinstance(e.message, Audit)] == []
+    audits = lab.audits(AuditKind.KEY_REFUSED, 3)
+    assert {(a.subject, a.address) for a in audits} == {(eve.fingerprint, "127.0.0.1")}
+
+
+def test_an_unknown_key_gets_no_state(lab: Lab) -> None:
+    ann, client = lab.allowed("ann")
+    subscribers = [lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, KeyPair.new())]
+    poses = np.zeros((3, 7))
+
+    def state_comes() -> bool:
+        lab.session.send_state(poses)
+        return bool(subscribers[0].poll(0))
+
+    lab.session.pump(state_comes, "state")
+    lab.audits(AuditKind.KEY_REFUSED)
+    lab.session.send_state(poses)
+    assert not subscribers[1].poll(50)
+    assert client.got(Refused) == []
+
+
+def test_a_code_pairs_one_key_which_then_joins_in_the_roles_of_the_code(lab: Lab) -> None:
+    ann = KeyPair.new()
+    code, _ = lab.home.codes.make(lab.server, roles=("operator", "observer"))
+    client = lab.client(ann)
+    client.send(Pair("ann", lab.proof(code, ann)))
+    answer = client.wait_for(Paired)
+    secret = pairing.stretch(code, lab.server.raw_public)
+    assert answer.proof == pairing.server_proof(secret, lab.server.raw_public, ann.raw_public)
+    assert answer.roles == ("operator", "observer")
+    assert lab.refused(client, Hello("operator", "ann")).code == RefusalCode.UNPAIRED  # still an unknown key's
+    lab.client(ann).join(name="ann")
+    (entry,) = lab.session.wait_entries(Join)
+    assert isinstance(entry.message, Join)
+    assert (entry.message.key_id, entry.message.roles) == (ann.fingerprint, ("operator", "observer"))
+    (audit,) = lab.audits(AuditKind.PAIRED)
+    assert (audit.subject, audit.name, audit.detail) == (ann.fingerprint, "ann", "operator, observer")
+    eve = KeyPair.new()
+    assert lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve))).code == RefusalCode.CODE
+
+
+def test_wrong_codes_make_the_code_void_and_are_told_with_their_count(lab: Lab) -> None:
+    eve = KeyPair.new()
+    code, made = lab.home.codes.make(lab.server)
+    client = lab.client(eve)
+    for n in range(1, 6):
+        answer = lab.refused(client, Pair("eve", b"x" * 32), n)
+        assert (answer.code, answer.message) == (RefusalCode.CODE, "this join code is wrong, used or expired")
+    assert lab.refused(client, Pair("eve", lab.proof(code, eve)), 6).message == "no join code can be used now"
+    assert lab.home.clients.read() == {}
+    kept = lab.home.codes.find(made.id)
+    assert kept is not None
+    assert (kept.attempts_left, kept.secret) == (0, b"")
+    assert len(lab.audits(AuditKind.CODE_EXHAUSTED)) == 1
+    refused = lab.audits(AuditKind.CODE_REFUSED, 5)
+    assert sum(a.count for a in refused) == 5
+    assert len(refused) <= 3, "at most once a second"
+
+
+def test_an_address_has_few_attempts_whatever_the_codes(lab: Lab) -> None:
+    """An address that keeps guessing voids two codes, and then none any more."""
+    client = lab.client(KeyPair.new())
+    n = 0
+    for _ in range(2):
+        lab.home.codes.make(lab.server)
+        for _ in range(5):
+            n += 1
+            lab.refused(client, Pair("eve", b"x" * 32), n)
+    code, _ = lab.home.codes.make(lab.server)
+    eve = KeyPair.new()
+    answer = lab.refused(lab.client(eve), Pair("eve", lab.proof(code, eve)))
+    assert (answer.code, answer.message) == (RefusalCode.CODE, "too many wrong codes from this address")
+    assert len(lab.home.codes.of(lab.server.fingerprint)) == 1
+
+
+def test_a_flood_of_pairing_is_cut(lab: Lab) -> None:
+    lab.home.codes.make(lab.server)
+    _, ann = lab.allowed("ann")
+    client = lab.client(KeyPair.new())
+    for _ in range(300):
+        client.send(Pair("eve", b"x" * 32))
+    assert lab.session.wait_drops("pair_rate") > 0
+    ann.send(Heartbeat())
+    lab.session.wait_entries(Heartbeat)
+
+
+def test_an_expired_code_pairs_nobody(lab: Lab) -> None:
+    ann = KeyPair.new()
+    code, made = lab.home.codes.make(lab.server, minutes=0.0005)
+    lab.session.pump(lambda: time.time() > made.expires, "the code expires")
+    answer = lab.refused(lab.client(ann), Pair("ann", lab.proof(code, ann)))
+    assert (answer.code, answer.advice) == (RefusalCode.CODE, "run `iris-session pair` where the session runs")
+    assert lab.home.clients.read() == {}
+
+
+def test_pairing_waits_for_a_busy_list_and_for_nobody_else(lab: Lab) -> None:
+    ann = KeyPair.new()
+    code, _ = lab.home.codes.make(lab.server)
+    _, bob = lab.allowed("bob")
+    client = lab.client(ann)
+    with lab.home.folder.locked():
+        client.send(Pair("ann", lab.proof(code, ann)))
+        bob.send(Marker(1, "meanwhile"))
+        lab.session.wait_entries(Marker)
+        assert client.got(Paired) == []
+    client.wait_for(Paired)
+
+
+def test_plain_sessions_have_nothing_to_pair_with(session: FrontSession) -> None:
+    client = session.client()
+    client.send(Pair("ann", b"x" * 32))
+    assert client.wait_for(Refused).message == "this session is not encrypted: nobody pairs with it"
+
+
+def test_a_revoked_key_is_out_at_once_and_everyone_else_has_state_within_a_second(lab: Lab) -> None:
+    ann, ann_client = lab.allowed("ann")
+    bob, bob_client = lab.allowed("bob")
+    ann_state, bob_state = (lab.session.subscriber(curve=lab.curve(pair)) for pair in (ann, bob))
+    poses = np.zeros((3, 7))
+    frames, at, gap = {"ann": 0, "bob": 0}, time.monotonic(), 0.0
+
+    def stream() -> dict[str, int]:
+        nonlocal at, gap
+        lab.session.send_state(poses)
+        for name, sub in (("ann", ann_state), ("bob", bob_state)):
+            while sub.poll(0):
+                sub.recv_multipart()
+                frames[name] += 1
+                if name == "bob":
+                    at, gap = time.monotonic(), max(gap, time.monotonic() - at)
+        return frames
+
+    lab.session.pump(lambda: min(stream().values()) > 0, "state for both")
+    revoked_at, gap = time.monotonic(), 0.0
+    lab.home.clients.revoke("ann")
+    lab.session.pump(lambda: bool(stream() and ann_client.got(ProtocolFault)), "ann is told")
+    told_after = time.monotonic() - revoked_at
+    assert ann_client.got(ProtocolFault)[-1].code == FaultCode.REVOKED
+    before = len(lab.session.entries)
+    then = dict(frames)
+    lab.session.pump(lambda: stream()["bob"] > then["bob"] + 100, "state for bob again")
+    # Half a second and one second, on a machine with time to spare: printed, because others may have none.
+    print(f"told after {told_after:.3f} s, the others had no state for {gap:.3f} s")
+    assert frames["ann"] - then["ann"] <= 10, "only what was under way"
+    (lost,) = lab.session.wait_entries(Lost)
+    assert lost.message == Lost("revoked")
+    assert lab.session.wait_entries(RemoveParticipant)[0].message == RemoveParticipant(0, "p1", reason="key revoked")
+    assert [a.name for a in lab.audits(AuditKind.KEY_REVOKED)] == ["ann"]
+    bob_client.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+    again = lab.client(ann)
+    assert lab.refused(again, Hello("operator", "ann")).code == RefusalCode.UNPAIRED
+    commands = [e for e in lab.session.entries[before:] if e.connection == 1 and not isinstance(e.message, Lost)]
+    assert commands == []
+
+
+def test_a_revoked_connection_is_that_of_a_stranger_until_it_is_closed(lab: Lab) -> None:
+    """Its TCP connection was authenticated while the key was good."""
+    _, client = lab.allowed("ann")
+    monitor = client.socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    lab.home.clients.revoke("ann")
+    client.wait_for(ProtocolFault)
+    client.send(EStop("ann"))
+    for _ in range(3):
+        client.send(Hello("operator", "ann"))
+    assert client.wait_for(Refused).code == RefusalCode.UNPAIRED
+    lab.session.pump(lambda: bool(monitor.poll(0)), "its TCP connection is closed")
+    client.socket.disable_monitor()
+    monitor.close()
+    assert len(lab.session.wait_entries(Join)) == 1
+    assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
+
+
+def test_a_role_that_is_taken_away_ends_connections_in_that_role(lab: Lab) -> None:
+    pair, client = lab.allowed("ann", "operator", "observer")
+    lab.home.clients.allow("ann", pair.public, ("observer",))
+    (lost,) = lab.session.wait_entries(Lost)
+    assert lost.message == Lost("role")
+    lab.client(pair).join(role="operator", name="ann")  # the authority refuses it, by what the front tells:
+    joins = [e.message for e in lab.session.wait_entries(Join, 2)]
+    assert isinstance(joins[-1], Join)
+    assert joins[-1].roles == ("observer",)
+    assert client.got(ProtocolFault) == []
+
+
+def test_a_directors_word_revokes_the_key_and_stays(lab: Lab) -> None:
+    pair, client = lab.allowed("ann")
+    lab.session.once(Decision((), dropped=(Dropped(1, "revoked", pair.fingerprint),)))
+    assert client.wait_for(ProtocolFault).code == FaultCode.REVOKED
+    lab.session.pump(lambda: lab.home.clients.read() == {}, "off the list")
+    assert lab.refused(lab.client(pair), Hello("operator", "ann")).code == RefusalCode.UNPAIRED
+
+
+def test_a_director_revokes_even_where_the_list_cannot_be_changed(open_session: Open, tmp_path: Path) -> None:
+    """A folder of certificates is not ours to change: the key stays out of this session all the same."""
+    folder = tmp_path / "clients"
+    folder.mkdir()
+    server_file, _ = create_certificates(tmp_path, "server")
+    ann_file, _ = create_certificates(folder, "ann")
+    for path in (*tmp_path.glob("*.key_secret"), *folder.glob("*.key_secret")):
+        path.chmod(0o600)
+    secret = server_file.replace(".key", ".key_secret")
+    session = open_session(curve_secret_file=secret, curve_clients_dir=str(folder))
+    pair = load_secret(ann_file.replace(".key", ".key_secret"))
+    curve = (load_public(server_file).encode(), pair.public.encode(), pair.secret.encode())
+    session.client(curve=curve).join(name="ann")
+    session.once(Decision((), dropped=(Dropped(1, "revoked", pair.fingerprint),)))
+    again = session.client(curve=curve)
+    again.send(Hello("operator", "ann"))
+    assert again.wait_for(Refused).code == RefusalCode.UNPAIRED
+    session.process.restart()  # also a front that replaces this one
+    late = session.client(curve=curve)
+    late.send(Hello("operator", "ann"))
+    assert late.wait_for(Refused).code == RefusalCode.UNPAIRED
+
+
+def test_a_revoked_key_that_is_let_in_anew_joins_again(lab: Lab) -> None:
+    pair, client = lab.allowed("ann")
+    lab.home.clients.revoke("ann")
+    client.wait_for(ProtocolFault)
+    code, _ = lab.home.codes.make(lab.server)
+    back = lab.client(pair)
+    back.send(Pair("ann", lab.proof(code, pair)))
+    back.wait_for(Paired)
+    lab.client(pair).join(name="ann")
+
+
+def test_a_removed_participant_is_told_and_may_come_back(lab: Lab) -> None:
+    pair, client = lab.allowed("ann")
+    lab.session.once(Decision((), dropped=(Dropped(1, "removed"),)))
+    fault = client.wait_for(ProtocolFault)
+    assert (fault.code, fault.message) == (FaultCode.REVOKED, "a director removed this participant")
+    lab.client(pair).join(name="ann")
+
+
+def test_who_is_revoked_on_plain_loopback_stays_out_as_long_as_the_secret_is_the_same(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    (entry,) = session.wait_entries(Join)
+    assert isinstance(entry.message, Join)
+    session.once(Decision((), dropped=(Dropped(1, "revoked", entry.message.key_id),)))
+    client.wait_for(ProtocolFault)
+    again = session.client()
+    again.secret = client.secret
+    again.send(Hello("operator", "Ann", secret=again.secret))
+    assert again.wait_for(Refused).code == RefusalCode.UNPAIRED
+    session.client().join()
+
+
+def test_a_stolen_resume_token_is_refused_and_told(lab: Lab) -> None:
+    _, ann = lab.allowed("ann")
+    assert ann.welcome is not None
+    eve = KeyPair.new()
+    lab.home.clients.allow("eve", eve.public)
+    thief = lab.client(eve)
+    answer = lab.refused(thief, Hello("operator", "ann", resume_token=ann.welcome.resume_token))
+    assert answer.code == RefusalCode.RESUME_TOKEN
+    (audit,) = lab.audits(AuditKind.TOKEN_REFUSED)
+    assert (audit.subject, audit.name) == (eve.fingerprint, "ann")
+    ann.send(Marker(1, "still ann"))
+    lab.session.wait_entries(Marker)
+
+
+def test_only_a_gateway_speaks_for_others(lab: Lab) -> None:
+    eve, client = lab.allowed("eve")
+    client.send(EStop("forged"), on_behalf_of="ann")
+    assert client.wait_for(ProtocolFault).message == "only a gateway speaks on behalf of others"
+    client.send(Hello("operator", "ann", secret=b"s" * 16), on_behalf_of="ann")
+    assert client.wait_for(Refused).code == RefusalCode.GATEWAY_ONLY
+    audits = lab.audits(AuditKind.GATEWAY_REFUSED, 2)
+    assert {(a.subject, a.detail) for a in audits} == {(eve.fingerprint, "on behalf of ann")}
+    assert not [e for e in lab.session.entries if isinstance(e.message, EStop)]
+
+
+def test_people_behind_a_gateway_have_the_other_roles_of_its_key(lab: Lab) -> None:
+    pair = KeyPair.new()
+    lab.home.clients.allow("web", pair.public, ("gateway", "observer"))
+    gateway = lab.client(pair)
+    gateway.join(role="gateway", name="web")
+    gateway.send(Hello("observer", "tab", secret=b"s" * 16), on_behalf_of="tab1")
+    joins = [e.message for e in lab.session.wait_entries(Join, 2)]
+    assert isinstance(joins[1], Join)
+    assert joins[1].roles == ("observer",)
+    lab.home.clients.allow("web", pair.public, ("gateway",))
+    lab.session.pump(lambda: lab.home.clients.read()[pair.fingerprint].roles == ("gateway",))
+    gateway.send(Hello("director", "tab", secret=b"t" * 16), on_behalf_of="tab2")
+    joins = [e.message for e in lab.session.wait_entries(Join, 3)]
+    assert isinstance(joins[2], Join)
+    assert "director" not in (joins[2].roles or ("director",))
+
+
+def test_audits_of_a_flood_are_few_and_add_up(lab: Lab) -> None:
+    clients = [lab.client(KeyPair.new()) for _ in range(5)]
+    for _ in range(40):
+        for client in clients:
+            client.send(Hello("operator", "Eve"))
+    audits = lab.audits(AuditKind.KEY_REFUSED, 200)
+    assert sum(a.count for a in audits) == 200
+    assert len(audits) <= 5
+    assert len([m for client in clients for m in client.got(Refused)]) <= 60, "answers to strangers are bounded"
+
+
+def test_the_list_that_was_damaged_while_running_stays_as_it_was(lab: Lab) -> None:
+    _, client = lab.allowed("ann")
+    path = lab.home.path / "clients.json"
+    good = path.read_bytes()
+    path.write_bytes(b"[{")
+    assert lab.session.wait_drops("allow_list_unreadable") >= 1
+    client.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+    path.write_bytes(good)
+    lab.home.clients.revoke("ann")
+    client.wait_for(ProtocolFault)
+
+
+def test_the_list_may_be_edited_by_hand_while_the_session_runs(lab: Lab) -> None:
+    _, ann = lab.allowed("ann")
+    _, bob = lab.allowed("bob")
+    path = lab.home.path / "clients.json"
+    lab.session.pump(lambda: any(key.last_seen for key in lab.home.clients.read().values()), "the session's own note")
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(rows[1:]))  # in place
+    assert ann.wait_for(ProtocolFault).code == FaultCode.REVOKED
+    new = path.with_name("new")  # as editors do
+    new.write_text("[]")
+    new.chmod(0o644)
+    new.replace(path)
+    assert lab.session.wait_drops("allow_list_unreadable") >= 1
+    bob.send(Marker(1, "still here"))
+    lab.session.wait_entries(Marker)
+    path.chmod(0o600)  # as the session said
+    assert bob.wait_for(ProtocolFault).code == FaultCode.REVOKED
+
+
+def test_strangers_that_never_finish_a_handshake_hold_nothing(lab: Lab) -> None:
+    sockets = [socket.create_connection(("127.0.0.1", lab.session.ports.control)) for _ in range(50)]
+    try:
+        lab.allowed("ann")
+    finally:
+        for one in sockets:
+            one.close()

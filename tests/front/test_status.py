@@ -1,0 +1,240 @@
+"""The status as the front answers it: with a real front, and an authority that says what it is told to say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+
+from iris_session.front.status import ENOUGH, REUSE_NS
+from iris_session.protocol.client_messages import Hello, Observation, Sample, Samples
+from iris_session.protocol.common import IDENTITY
+from iris_session.protocol.entries import Join
+from iris_session.protocol.limits import LIMITS
+from iris_session.protocol.names import FaultCode
+from iris_session.protocol.server_messages import ProtocolFault
+from iris_session.protocol.status import (
+    AlignmentReport,
+    ClientReport,
+    GetStatus,
+    ParticipantReport,
+    StatusReport,
+    quantiles,
+)
+from tests.front.harness import N_BODIES, FrontSession, RawClient
+
+MS = 1_000_000
+
+
+def half(*people: ParticipantReport, **fields: object) -> StatusReport:
+    """What the authority says."""
+    return StatusReport(0, "", "", 1, participants=people, **fields)  # type: ignore[arg-type]
+
+
+STILL = np.tile([0.0, 0, 0, 1, 0, 0, 0], (N_BODIES, 1))
+
+
+def row(participant: str, **fields: object) -> ParticipantReport:
+    return ParticipantReport(participant, "Ann", "operator", True, **fields)  # type: ignore[arg-type]
+
+
+def anything(_: StatusReport) -> bool:
+    return True
+
+
+def ask(
+    session: FrontSession, client: RawClient, until: Callable[[StatusReport], bool] = anything, *, moving: bool = False
+) -> StatusReport:
+    """Asks, a few times a second, until the answer is as wanted: what was sent to the front takes its way. `moving`: a
+    state with every step meanwhile."""
+    steps = 0
+
+    def wanted() -> bool:
+        nonlocal steps
+        if moving:
+            session.send_state(STILL)
+        if steps % 300 == 0:
+            client.send(GetStatus(1 + steps))
+        steps += 1
+        got = client.got(StatusReport)
+        del client.inbox[:]
+        return bool(got) and until(got[-1]) and not answers.append(got[-1])
+
+    answers: list[StatusReport] = []
+    session.pump(wanted, "a status as wanted")
+    return answers[-1]
+
+
+def sample(seq: int, capture_ns: int, device: str = "head") -> Sample:
+    return Sample(device, "pose", seq, capture_ns, 1, 0, 0)
+
+
+def test_both_halves_make_one_report(session: FrontSession) -> None:
+    client = session.client()
+    welcome = client.join(software="quest 1.0")
+    session.process.link.send_report(
+        half(row(welcome.participant_id, holds=("left",)), late_share=0.25, drops={"journal_rows": 3})
+    )
+    client.send(ClientReport(1.5, 7.0, 30, 10, 2.5, 1000.0))
+    report = ask(
+        session,
+        client,
+        lambda r: bool(r.participants) and r.participants[0].reported and r.step_to_publish is not None,
+        moving=True,
+    )
+    assert (report.session_name, report.late_share, report.connections) == ("test", 0.25, 1)
+    assert report.drops["journal_rows"] == 3
+    assert 0 <= report.authority_silent_ns < 60_000 * MS
+    (ann,) = report.participants
+    assert ann.holds == ("left",)
+    assert ann.software == "quest 1.0"
+    assert ann.address.startswith("127.0.0.1:")
+    assert ann.state_age is not None
+    assert (ann.state_age.p50, ann.state_age.p99, ann.missed_share, ann.rtt_ms) == (1.5, 7.0, 0.25, 2.5)
+    assert ann.heard_ns >= 0
+    assert ann.lost == ""
+
+
+def test_what_is_only_sent_again_has_no_age(session: FrontSession) -> None:
+    client = session.client()
+    session.process.link.send_report(half(row(client.join().participant_id)))
+    client.send(ClientReport(0.0, 0.0, 4))
+    report = ask(session, client, lambda r: bool(r.participants) and r.participants[0].reported)
+    assert report.participants[0].state_age is None
+
+
+def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
+    """A scene that stands still is sent four times a second: one that was late is not the usual way."""
+    client = session.client()
+    client.join()
+    for _ in range(ENOUGH // 2):
+        session.send_state(STILL)
+        session.once()
+    assert ask(session, client).step_to_publish is None
+
+
+def test_an_alignment_report_has_both_halves(open_session: Callable[..., FrontSession]) -> None:
+    session = open_session(anchors={"table": IDENTITY})
+    ann, bob = session.client(), session.client()
+    ids = [ann.join(devices=("head",)).participant_id, bob.join(name="Bob").participant_id]
+    theirs = AlignmentReport(version=7, alarm="changed", alarm_ns=5)
+    session.process.link.send_report(half(row(ids[0], alignment_report=theirs), row(ids[1], alignment_report=theirs)))
+    for i in range(8):
+        ann.send(Observation("table", "qr", IDENTITY, session.process.link.now_ns, 1, i))
+    report = ask(
+        session,
+        bob,
+        lambda r: bool(r.participants) and getattr(r.participants[0].alignment_report, "observations", 0) == 8,
+    )
+    ours, other = (person.alignment_report for person in report.participants)
+    assert ours is not None
+    assert (ours.version, ours.alarm, ours.alarm_ns) == (7, "changed", 5)
+    assert [(s.anchor_id, s.observations) for s in ours.seen] == [("table", 8)]
+    assert other == theirs
+
+
+def test_way_of_samples_is_measured(session: FrontSession) -> None:
+    client = session.client()
+    welcome = client.join(devices=("head",))
+    session.process.link.send_report(half(row(welcome.participant_id)))
+    seq = 0
+
+    def measured(report: StatusReport) -> bool:
+        nonlocal seq
+        for _ in range(40):
+            seq += 1
+            client.send(sample(seq, session.process.link.now_ns - 30 * MS))
+        client.send(Samples((sample(seq + 1, session.process.link.now_ns - 30 * MS),)))
+        seq += 1
+        (ann,) = report.participants or (None,)
+        return ann is not None and ann.samples_per_s > 0.0 and ann.capture_to_receive is not None
+
+    ann = ask(session, client, measured).participants[0]
+    assert ann.capture_to_receive is not None
+    assert 30.0 <= ann.capture_to_receive.p50 < 10_000.0  # ms, on a busy machine
+
+
+def test_many_questions_get_one_and_the_same_report(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    client.send(GetStatus(1))
+    client.send(GetStatus(2))
+    client.wait_for(StatusReport, 2)
+    one, two = client.got(StatusReport)
+    assert (one.request_id, two.request_id) == (1, 2)
+    if two.session_time - one.session_time < REUSE_NS:
+        assert msgspec.structs.replace(two, request_id=1, session_time=one.session_time) == one
+
+
+def test_questions_are_limited_like_everything(session: FrontSession) -> None:
+    client = session.client()
+    client.join()
+    for n in range(LIMITS[GetStatus].burst + 10):
+        client.send(GetStatus(n + 1))
+    assert client.wait_for(ProtocolFault).code == FaultCode.RATE
+    assert len(client.got(StatusReport)) <= LIMITS[GetStatus].burst + 4
+
+
+def test_who_is_not_let_in_yet_can_ask(session: FrontSession) -> None:
+    """An authority that stands still lets nobody in: then people ask most."""
+    session.admits = False
+    client = session.client()
+    client.send(Hello("observer", "doctor", secret=client.secret))
+    session.wait_entries(Join)
+    client.send(GetStatus(7))
+    report = client.wait_for(StatusReport)
+    assert report.request_id == 7
+
+
+def test_strangers_cannot_ask(session: FrontSession) -> None:
+    client = session.client()
+    client.send(GetStatus(1))
+    assert client.wait_for(ProtocolFault).code == FaultCode.HELLO
+    assert client.got(StatusReport) == []
+
+
+def test_stalled_authority_is_told_by_the_front(open_session: Callable[..., FrontSession]) -> None:
+    session = open_session(stall_ns=50 * MS)
+    client = session.client()
+    welcome = client.join()
+    session.process.link.send_report(half(row(welcome.participant_id)))
+    session.once()
+    while not client.got(ProtocolFault):  # the authority says nothing: no steps meanwhile
+        assert client.socket.poll(30_000)
+        client.receive()
+    client.send(GetStatus(1))
+    while not client.got(StatusReport):
+        assert client.socket.poll(30_000)
+        client.receive()
+    (report,) = client.got(StatusReport)
+    assert report.stalled
+    assert report.authority_silent_ns > 50 * MS
+
+
+def test_why_a_connection_was_lost_is_remembered(session: FrontSession) -> None:
+    ann, bob = session.client(), session.client()
+    welcome = ann.join()
+    bob.join(name="Bob")
+    session.process.link.send_report(half(row(welcome.participant_id)))
+    ann.close()
+    report = ask(session, bob, lambda r: bool(r.participants) and not r.participants[0].connected)
+    assert report.participants[0].lost == "closed"
+
+
+def test_report_of_before_is_no_report_of_now(session: FrontSession) -> None:
+    client = session.client()
+    welcome = client.join()
+    session.process.link.send_report(half(row(welcome.participant_id)))
+    report = ask(session, client, lambda r: bool(r.participants))
+    assert not report.participants[0].reported
+    assert report.participants[0].state_age is None
+
+
+@pytest.mark.parametrize(
+    ("durations", "expected"), [((), None), ((2 * MS,), (2.0, 2.0)), (tuple(n * MS for n in range(101)), (50.0, 99.0))]
+)
+def test_quantiles(durations: tuple[int, ...], expected: tuple[float, float] | None) -> None:
+    found = quantiles(durations)
+    assert expected == (None if found is None else pytest.approx((found.p50, found.p99)))

@@ -1,0 +1,48 @@
+"""Sockets of the front with real connections: what the kernel does about peers that take nothing."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+
+import pytest
+import zmq
+
+from iris_session.link import sockets
+from iris_session.link.config import FrontConfig
+
+
+def test_a_subscriber_that_takes_nothing_is_cut_off_and_the_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a headset that has gone to another network, or sleeps while its kernel answers."""
+    monkeypatch.setattr(sockets, "STUCK_MS", 1000)
+    with ExitStack() as stack:
+        context = stack.enter_context(zmq.Context())
+        config = FrontConfig(control_port=0, state_port=0, origin_ns=0)
+        state = stack.enter_context(sockets.open_state(context, config, None))
+        monitor = stack.enter_context(sockets.watch_tcp(state, "test", zmq.EVENT_DISCONNECTED))
+        reader = stack.enter_context(context.socket(zmq.SUB))
+        stuck = stack.enter_context(context.socket(zmq.SUB))  # nobody reads it: libzmq stops reading, too
+        stuck.rcvhwm, stuck.rcvbuf = 1, 4096
+        for one in (reader, stuck):
+            one.subscribe(b"")
+            one.connect(f"tcp://127.0.0.1:{sockets.bound_port(state)}")
+        state.linger = reader.linger = stuck.linger = 0
+        deadline = time.monotonic() + 60.0
+        got = 0
+        while not sockets.readable(monitor):
+            assert time.monotonic() < deadline, f"nobody was cut off; the other got {got} frames"
+            state.send(b"r" + bytes(5000))
+            got += len(_drain(reader))
+            time.sleep(0.005)
+        assert got > 0
+        while b"last" not in _drain(reader):
+            assert time.monotonic() < deadline, "the other one was cut off, too"
+            state.send(b"last")
+            time.sleep(0.005)
+
+
+def _drain(reader: zmq.Socket[bytes]) -> list[bytes]:
+    got = []
+    while reader.poll(0):
+        got.append(reader.recv())
+    return got

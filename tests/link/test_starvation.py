@@ -1,0 +1,68 @@
+"""A process that hangs is told from one that gets no processor, with real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from iris_session.link.starvation import Starvation
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="the scheduler's idle class is Linux's")
+BUSY = "while True: pass"
+#: Runs when nobody else wants to.
+IDLE = f"import os; os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); print('up', flush=True)\n{BUSY}"
+
+
+@contextmanager
+def running(code: str, cpu: int) -> Iterator[int]:
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    try:
+        os.sched_setaffinity(process.pid, {cpu})
+        if code != BUSY:
+            assert process.stdout is not None
+            process.stdout.readline()
+        yield process.pid
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def looks(starvation: Starvation, pid: int, seconds: float = 1.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        starvation.look(pid, time.monotonic_ns())
+        time.sleep(0.05)
+    return starvation.look(pid, time.monotonic_ns())
+
+
+def test_a_process_that_others_keep_from_running_is_starved() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    with running(IDLE, cpu) as starved, running(BUSY, cpu):
+        assert looks(Starvation(), starved)
+
+
+def test_a_process_that_is_stopped_or_waits_is_not() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    with running("print('up', flush=True); import time; time.sleep(60)", cpu) as waiting:
+        assert not looks(Starvation(), waiting)
+    with running(BUSY, cpu) as stopped:
+        os.kill(stopped, signal.SIGSTOP)
+        while "T" not in Path(f"/proc/{stopped}/stat").read_text().rpartition(")")[2]:
+            time.sleep(0.001)
+        assert not looks(Starvation(), stopped)
+
+
+def test_one_that_is_gone_is_not() -> None:
+    with running("print('up', flush=True)", min(os.sched_getaffinity(0))) as pid:
+        pass
+    assert not Starvation().look(pid, 0)

@@ -1,0 +1,223 @@
+"""Mirror of the session: snapshot plus events in any delivery give what the session has."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iris_session.client import SessionMirror
+from iris_session.protocol.common import IDENTITY, Alignment, Lease
+from iris_session.protocol.server_messages import (
+    AlignmentChanged,
+    BodyInfo,
+    EpisodeChanged,
+    EStopChanged,
+    Event,
+    EventKind,
+    LeaseChanged,
+    Notice,
+    ParticipantChanged,
+    ParticipantInfo,
+    ParticipantJoined,
+    ParticipantLeft,
+    PauseChanged,
+    ScaleChanged,
+    SceneChanged,
+    Snapshot,
+)
+from iris_session.protocol.session_mirror import Missed
+
+BODIES = (BodyInfo(0, "world", False), BodyInfo(3, "hammer", True, True))
+
+names = st.sampled_from(["p1", "p2", "p3", "p4"])
+flags = st.booleans()
+counts = st.integers(1, 9)
+bodies = st.one_of(
+    st.builds(lambda p, w: ParticipantJoined(ParticipantInfo(p, "ann", "operator", True, worn=w)), names, flags),
+    st.builds(lambda p: ParticipantChanged(ParticipantInfo(p, "bob", "observer", True)), names),
+    st.builds(ParticipantLeft, names, st.just("silent"), flags),
+    st.builds(lambda p, v: LeaseChanged(Lease("left", "robot", "exclusive", p, v), "acquired"), names, counts),
+    st.builds(lambda p, v: AlignmentChanged(p, Alignment(v, "measured", IDENTITY)), names, counts),
+    st.builds(ScaleChanged, st.sampled_from(["left", "gone"]), st.sampled_from([0.1, 1.0]), names),
+    st.builds(SceneChanged, counts, counts, st.just("reset"), tick_period_ns=st.sampled_from([0, 1_000_000])),
+    st.builds(EStopChanged, flags, names),
+    st.builds(PauseChanged, flags),
+    st.builds(EpisodeChanged, counts, st.sampled_from(["running", "success"])),
+    st.just(Notice("info", "hello")),
+)
+
+
+def event(seq: int, body: EventKind) -> Event:
+    return Event(seq, seq, 0, body)
+
+
+def snapshot(mirror: SessionMirror | None = None) -> Snapshot:
+    """What the session would send now, if `mirror` is what the session has."""
+    if mirror is None:
+        return Snapshot(0, 0, 1, 0, "hash", 0, 0.0, 0, (), (), bodies=BODIES)
+    return Snapshot(
+        0, mirror.event_seq, mirror.scene_epoch, mirror.scene_revision, mirror.scene_hash, 0, 0.0, 0,
+        tuple(mirror.participants.values()), tuple(mirror.leases.values()), tuple(mirror.robots.values()),
+        mirror.bodies, mirror.paused, mirror.estop, mirror.episode, tick_period_ns=mirror.tick_period_ns,
+    )  # fmt: skip
+
+
+def synced() -> SessionMirror:
+    mirror = SessionMirror()
+    mirror.apply_snapshot(snapshot())
+    return mirror
+
+
+def test_the_scale_of_a_robot_is_followed_until_its_lease_changes() -> None:
+    mirror = synced()
+    lease = Lease("left", "robot", "exclusive", "p1", 3)
+    for seq, body, scale in (
+        (1, LeaseChanged(lease, "acquired"), 1.0),
+        (2, ScaleChanged("left", 0.25, "p2"), 0.25),
+        (3, ScaleChanged("right", 0.5, "p2"), 0.25),
+        (4, LeaseChanged(lease, "assigned", "p1"), 1.0),
+    ):
+        mirror.apply_event(event(seq, body))
+        assert mirror.leases["left"].scale == scale
+        assert list(mirror.leases) == ["left"]
+
+
+@given(st.lists(bodies, max_size=30), st.data())
+@settings(max_examples=150, deadline=None)
+def test_any_joining_moment_and_any_loss_end_in_the_same_state(kinds: list[EventKind], data: st.DataObject) -> None:
+    events = [event(i + 1, kind) for i, kind in enumerate(kinds)]
+    truth = synced()
+    joined_at = data.draw(st.integers(0, len(events)))
+    lost = data.draw(st.sets(st.integers(0, max(0, len(events) - 1))))
+    late, lossy = SessionMirror(), synced()
+    for i, one in enumerate(events):
+        if i == joined_at:
+            late.apply_snapshot(snapshot(truth))
+        truth.apply_event(one)
+        late.apply_event(one)
+        late.apply_event(one)  # repeated
+        if i not in lost:
+            lossy.apply_event(one)
+    if not late.synced:
+        late.apply_snapshot(snapshot(truth))
+    if not lossy.synced or lossy.event_seq != truth.event_seq:
+        lossy.apply_snapshot(snapshot(truth))
+    assert late.mirror_hash() == truth.mirror_hash()
+    assert lossy.mirror_hash() == truth.mirror_hash()
+
+
+def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None:
+    mirror, truth = synced(), synced()
+    events = [event(i, EStopChanged(i % 2 == 1, f"p{i}")) for i in range(1, 6)]
+    mirror.apply_event(events[0])
+    assert not mirror.apply_event(events[2])
+    assert not mirror.synced
+    assert mirror.gaps == 1
+    mirror.apply_event(events[3])
+    for one in events[:3]:
+        truth.apply_event(one)
+    told = mirror.apply_snapshot(snapshot(truth))
+    assert told == [Missed(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
+    assert mirror.synced
+    assert mirror.event_seq == 4
+    assert mirror.discarded == 0
+
+
+@given(st.lists(st.sampled_from(["come", "lost", "twice", "snapshot"]), max_size=60), st.integers(0, 5))
+@settings(max_examples=300, deadline=None)
+def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fates: list[str], before: int) -> None:
+    """Exactly once, in order, whatever is lost or comes again, and whenever a snapshot comes."""
+    mirror, truth = SessionMirror(), synced()
+    told: list[Event | Missed] = []
+
+    def come(one: Event) -> None:
+        if mirror.apply_event(one):
+            told.append(one)
+
+    for i, fate in enumerate([*["come"] * before, "snapshot", *fates, "snapshot"]):
+        if fate == "snapshot":
+            told += mirror.apply_snapshot(snapshot(truth))
+            continue
+        one = event(truth.event_seq + 1, Notice("info", str(i)))
+        truth.apply_event(one)
+        for _ in range({"come": 1, "twice": 2, "lost": 0}[fate]):
+            come(one)
+    seqs = [
+        seq for one in told for seq in (range(one.first, one.last + 1) if isinstance(one, Missed) else (one.event_seq,))
+    ]
+    assert seqs == list(range(before + 1, truth.event_seq + 1))
+    lost = {seq for one in told if isinstance(one, Missed) for seq in range(one.first, one.last + 1)}
+    numbers = [i for i, fate in enumerate([f for f in fates if f != "snapshot"], before + 1) if fate == "lost"]
+    assert lost == set(numbers), "what came is handed out"
+
+
+def test_an_older_snapshot_is_discarded() -> None:
+    mirror = synced()
+    old = snapshot(mirror)
+    mirror.apply_event(event(1, EStopChanged(True, "p1")))
+    assert mirror.apply_snapshot(old) == []
+    assert mirror.estop
+    assert mirror.discarded == 1
+
+
+def test_a_new_scene_needs_a_snapshot_but_a_reset_does_not() -> None:
+    mirror = synced()
+    mirror.apply_event(event(1, SceneChanged(2, 0, "reset")))
+    assert mirror.synced
+    mirror.apply_event(event(2, SceneChanged(3, 0, "new_scene", tick_period_ns=1_000_000)))
+    assert not mirror.synced
+    assert (mirror.scene_epoch, mirror.tick_period_ns) == (3, 1_000_000)
+    mirror.apply_snapshot(Snapshot(0, 2, 3, 0, "other", 0, 0.0, 0, (), (), tick_period_ns=1_000_000))
+    mirror.apply_event(event(3, SceneChanged(4, 0, "reset")))
+    assert mirror.tick_period_ns == 1_000_000, "0: as it was"
+
+
+def test_bodies_are_of_the_epochs_that_have_them() -> None:
+    """Poses of an epoch go with the bodies of that one only; a reset changes none."""
+    ball, box = (BodyInfo(1, name, True) for name in ("ball", "box"))
+    mirror = synced()
+    told: list[tuple[int, int]] = []
+
+    def snap(epoch: int, *bodies: BodyInfo) -> None:
+        mirror.apply_snapshot(Snapshot(0, mirror.event_seq, epoch, 0, "", 0, 0.0, 0, (), (), bodies=bodies))
+        told.append((mirror.bodies_since, mirror.bodies_until))
+
+    def change(epoch: int, cause: str) -> None:
+        mirror.apply_event(event(mirror.event_seq + 1, SceneChanged(epoch, 0, cause)))
+        told.append((mirror.bodies_since, mirror.bodies_until))
+
+    snap(3, ball)
+    change(4, "reset")
+    change(5, "new_scene")
+    snap(5, box, ball)
+    change(6, "external")
+    snap(6, box, ball)
+    change(7, "new_scene")
+    snap(7, box, ball)
+    assert told == [(3, 3), (3, 4), (3, 4), (5, 5), (5, 6), (5, 6), (5, 6), (5, 7)]
+
+
+def test_hash_tells_different_states_apart_and_ignores_order() -> None:
+    a, b = synced(), synced()
+    for mirror, order in ((a, ("p1", "p2")), (b, ("p2", "p1"))):
+        for i, name in enumerate(order):
+            mirror.apply_event(event(i + 1, ParticipantJoined(ParticipantInfo(name, name, "operator", True))))
+    assert a.mirror_hash() == b.mirror_hash()
+    b.apply_event(event(3, EStopChanged(True, "p1")))
+    a.apply_event(event(3, EStopChanged(False, "p1")))
+    assert a.mirror_hash() != b.mirror_hash()
+
+
+def test_lease_version_is_only_for_its_holders() -> None:
+    mirror = synced()
+    shared = Lease("left", "robot", "shared", "p1", 7, sub_holders=("p1", "p2"), weights=(0.5, 0.5))
+    mirror.apply_event(event(1, LeaseChanged(shared, "acquired")))
+    assert [mirror.lease_version("left", p) for p in ("p1", "p2", "p3")] == [7, 7, None]
+    assert mirror.lease_version("right", "p1") is None
+
+
+def test_held_events_are_bounded() -> None:
+    mirror = SessionMirror()
+    for i in range(1000):
+        mirror.apply_event(event(i + 1, Notice("info", "x")))
+    assert mirror.held_overflow == 1000 - 256

@@ -1,0 +1,551 @@
+"""Going on from a recording: the exact state of its last good row, whatever happened to the file; what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from anchors.pose import IDENTITY_QUAT, PoseTuple
+from iris_session.authority import AuthorityConfig
+from iris_session.demo.scenes import scene_path
+from iris_session.physics import load_model, model_bytes
+from iris_session.protocol.client_messages import Marker, MoveAnchor
+from iris_session.protocol.common import Applied, Pose
+from iris_session.protocol.entries import Entry, SessionResumed, decode_entries
+from iris_session.protocol.names import CommandKind
+from iris_session.protocol.server_messages import Gap, StateHeader
+from iris_session.protocol.steps import Decision
+from iris_session.recording import (
+    CLOSED,
+    OPEN,
+    JournalRow,
+    Keyframe,
+    RecorderError,
+    RecordingInUseError,
+    RecordingLock,
+    SessionHeader,
+    Settings,
+    header_root,
+    make_row,
+    pack_model,
+)
+from iris_session.recording.journal import CRASHED, seal
+from iris_session.recording.messages import Batch
+from iris_session.recording.versions import boot_id
+from iris_session.security.resume_tokens import ResumeTokens, handback_above
+from iris_session.session import continuation
+from iris_session.session.config import SessionConfig
+from iris_session.session.continuation import MARGIN_NS, Continuation, begin
+from iris_session.session.core import CoreState, SessionCore
+from iris_session.session.errors import ConfigError, ResumeError
+from iris_session.session.processes import settings_of
+from iris_session.session.resume_note import Listening, NoteKeeper, ResumeNote, note_path, read_note
+from iris_session.session.stepper import ResumedFrom, Stepper
+from iris_session.session.verification import verify_recording
+from tests.recording.support import write
+from tests.session.play import ANN, TICK_NS, entries, host, make_core, play
+
+STEPS = 100
+KEYFRAMES = (39, 79)
+LAST_NS = STEPS * TICK_NS
+
+
+def keyframe_of(core: SessionCore, step: int) -> Keyframe:
+    state = core.snapshot()
+    return Keyframe(step, state.plant, state.authority, state.controller, state.status)
+
+
+def recorded(
+    path: Path,
+    change: Callable[[JournalRow], JournalRow] = lambda row: row,
+    keyframes: Callable[[Keyframe], Keyframe] = lambda keyframe: keyframe,
+    core: SessionCore | None = None,
+    said: Mapping[int, list[Entry]] = MappingProxyType({}),
+    **header: object,
+) -> Path:
+    """The scripted session of `play`, as our loop would have recorded it."""
+    core = core or make_core()
+    head = SessionHeader(
+        "s1",
+        "lab",
+        CLOSED,
+        TICK_NS,
+        msgspec.msgpack.encode(core.config),
+        pack_model(core.world.model_bytes()),
+        core.world.scene_hash,
+        core.config.robots,
+        core.config.objects,
+        core.world.bodies,
+        origin_ns=time.monotonic_ns() - LAST_NS,
+        boot_id=boot_id(),
+    )
+    head = msgspec.structs.replace(head, **header)
+    chain = header_root(head)
+    batch = Batch(keyframes=[seal(keyframe_of(core, -1), chain)])
+    for step in range(STEPS):
+        now_ns = (step + 1) * TICK_NS
+        came = [*entries(step), *said.get(step, ())]
+        row = make_row(chain, step, now_ns, 1, came, core.step(now_ns, came, 1).digest)
+        batch.rows.append(change(row))
+        chain = batch.rows[-1].chain
+        if step in KEYFRAMES:
+            batch.keyframes.append(keyframes(seal(keyframe_of(core, step), chain)))
+    return write(path, head, batch)
+
+
+def state_after(step: int) -> CoreState:
+    core = make_core()
+    play(core, 0, step + 1)
+    return core.snapshot()
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("original") / "session.rrd")
+
+
+@pytest.fixture
+def session(original: Path, tmp_path: Path) -> Path:
+    """A copy of the recording, in a folder of its own."""
+    return Path(shutil.copy(original, tmp_path / "session.rrd"))
+
+
+def test_the_state_is_that_after_the_last_row(session: Path) -> None:
+    past = Continuation(session.parent)
+    assert (past.step, past.now_ns) == (STEPS - 1, LAST_NS)
+    assert past.core.snapshot() == state_after(STEPS - 1)
+    assert past.recording == session.with_name("session.resume2.rrd")
+    assert past.header.session_id == "s1"
+    assert len(past.notes) == 1
+    assert "resume.tokens" in past.notes[0]
+    past.close()
+
+
+@pytest.mark.parametrize("share", [0.999, 0.9, 0.8])
+def test_a_file_that_was_cut_short_goes_on_where_it_can_be_read(session: Path, share: float) -> None:
+    """As after a power cut: anywhere in the middle of a write."""
+    size = session.stat().st_size
+    os.truncate(session, int(size * share))
+    past = Continuation(session)
+    assert -1 <= past.step < STEPS
+    assert past.core.snapshot() == (state_after(past.step) if past.step >= 0 else make_core().snapshot())
+    past.close()
+
+
+def test_what_comes_after_a_changed_row_is_left_out_and_said(tmp_path: Path) -> None:
+    def change(row: JournalRow) -> JournalRow:
+        return msgspec.structs.replace(row, n_ticks=2) if row.step == 90 else row
+
+    past = Continuation(recorded(tmp_path / "session.rrd", change))
+    assert past.step == 89
+    assert past.core.snapshot() == state_after(89)
+    assert any("step 90" in note and "n_ticks" in note for note in past.notes)
+
+
+def test_rows_that_come_out_otherwise_here_are_left_out(tmp_path: Path) -> None:
+    """Another version of a library computes another state: the session goes on before it, exactly."""
+
+    def change(row: JournalRow) -> JournalRow:
+        if row.step != 90:
+            return row
+        digest = bytes(16)
+        return make_row(before[-1], row.step, row.now_ns, 1, decode_entries(row.entries), digest)
+
+    before: list[bytes] = []
+
+    def noting(row: JournalRow) -> JournalRow:
+        changed = change(row)
+        before.append(changed.chain)
+        return changed
+
+    past = Continuation(recorded(tmp_path / "session.rrd", noting))
+    assert past.step == 89
+    assert past.core.snapshot() == state_after(89)
+    assert any("step 90 gives another result" in note for note in past.notes)
+
+
+def test_a_damaged_keyframe_gives_way_to_the_one_before(tmp_path: Path) -> None:
+    def damage(keyframe: Keyframe) -> Keyframe:
+        return msgspec.structs.replace(keyframe, plant=b"\0" * 8) if keyframe.step == KEYFRAMES[-1] else keyframe
+
+    past = Continuation(recorded(tmp_path / "session.rrd", keyframes=damage))
+    assert past.step == STEPS - 1
+    assert past.core.snapshot() == state_after(STEPS - 1)
+
+
+def test_the_step_that_ended_the_session_with_an_error_is_not_taken_again(tmp_path: Path) -> None:
+    def change(row: JournalRow) -> JournalRow:
+        return make_row(chains[-1], row.step, row.now_ns, 1, [], CRASHED) if row.step == STEPS - 1 else row
+
+    chains: list[bytes] = []
+
+    def noting(row: JournalRow) -> JournalRow:
+        changed = change(row)
+        chains.append(changed.chain)
+        return changed
+
+    past = Continuation(recorded(tmp_path / "session.rrd", noting))
+    assert past.step == STEPS - 2
+    assert any("ended the session" in note for note in past.notes)
+
+
+def test_the_newest_recording_that_can_be_read_is_continued(session: Path) -> None:
+    session.with_name("session.resume2.rrd").write_bytes(b"")
+    session.with_name("session.resume3.rrd").write_bytes(b"no recording at all")
+    past = Continuation(session)
+    assert past.file == "session.rrd"
+    assert past.recording.name == "session.resume4.rrd"
+    assert sum("left out session.resume" in note for note in past.notes) == 2
+
+
+def test_a_recording_in_use_is_refused(session: Path) -> None:
+    writing = RecordingLock(session, shared=True)
+    with pytest.raises(ResumeError, match=f"still runs: process {os.getpid()}$"):
+        Continuation(session, patience_s=0.1)
+    writing.release()
+    first = Continuation(session)
+    with pytest.raises(ResumeError, match=f"being resumed by process {os.getpid()}$"):
+        Continuation(session, patience_s=0.1)
+    first.close()
+    Continuation(session).close()
+
+
+def test_who_waited_while_another_went_on_goes_on_from_there(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between looking for the newest recording and having its lock, another process began and ended a newer one."""
+    newer = session.with_name("session.resume2.rrd")
+
+    class Late(RecordingLock):
+        def __init__(self, path: str, **options: Any) -> None:
+            super().__init__(path, **options)
+            newer.touch()
+
+    monkeypatch.setattr(continuation, "RecordingLock", Late)
+    past = Continuation(session)
+    assert past.recording.name == "session.resume3.rrd"
+    assert past.file == "session.rrd"
+    RecordingLock(session, shared=False, patience_s=0.0).release()
+    with pytest.raises(RecordingInUseError):
+        RecordingLock(newer, shared=True, patience_s=0.0)
+    past.close()
+
+
+def test_a_recording_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match=r"nothing\.rrd cannot be opened: No such file or directory$"):
+        RecordingLock(tmp_path / "nothing.rrd", shared=True)
+
+
+def test_recordings_of_a_users_loop_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ResumeError, match=r"class 'open'.*only recordings of our own loop"):
+        Continuation(recorded(tmp_path / "session.rrd", recording_class=OPEN))
+
+
+@pytest.mark.parametrize("name", ["", "nothing.rrd", "folder"])
+def test_no_recording_is_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(ResumeError, match="there is no recording") as refused:
+        Continuation(tmp_path / name)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_scene_may_be_given_and_must_be_the_same(session: Path) -> None:
+    config = SessionConfig(resume=session)
+    past, _, scene = begin(config, scene_path("handover"), None, None, None)
+    assert past is not None
+    past.close()
+    assert model_bytes(scene[0]) == model_bytes(load_model(scene_path("handover")))
+    other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(ResumeError, match=r"the scene is not that of session\.rrd"):
+        begin(config, other, None, None, None)
+    Continuation(session, patience_s=0.1).close()  # a refusal keeps nothing
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"name": "other"}, {"record": False}, {"record": "x.rrd"}, {"authority": AuthorityConfig(grace_ns=1)}],
+)
+def test_what_cannot_be_another_than_it_was_is_refused(session: Path, change: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match="resumed session"):
+        begin(SessionConfig(resume=session, **change), None, None, None, None)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="state, robots and objects"):
+        begin(SessionConfig(resume=session), None, None, (), None)
+
+
+def test_it_listens_where_it_listened_unless_told_otherwise(session: Path) -> None:
+    listening = Listening("0.0.0.0", control_port=4001, state_port=4002, curve=True, beacon_port=0)
+    keeper = NoteKeeper(note_path(session))
+    keeper.offer(ResumeNote("s1", listening, handback_above(0)))
+    keeper.close(5.0)
+    past, config, _ = begin(SessionConfig(resume=session, control_port=5001), None, None, None, None)
+    assert past is not None
+    assert past.notes == []
+    assert dataclasses.replace(config, resume=None) == SessionConfig(
+        "lab", "0.0.0.0", control_port=5001, state_port=4002, curve=True, beacon_port=0
+    )
+
+
+def test_rates_are_as_they_were_unless_told_otherwise(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "session.rrd", settings=Settings(30.0, 2.0, False))
+    past, config, _ = begin(SessionConfig(resume=path, keyframe_s=1.0), None, None, None, None)
+    assert past is not None
+    past.close()
+    assert (config.state_hz, config.keyframe_s, config.realtime) == (30.0, 1.0, False)
+
+
+@pytest.mark.parametrize(("given", "sizes"), [({}, {"wall": 0.2}), ({"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}, {})])
+def test_sheets_are_checked_for_misprints_as_they_were(
+    tmp_path: Path, given: dict[str, PoseTuple], sizes: dict[str, float]
+) -> None:
+    """Of sheets that are given anew, no size is known."""
+    settings = Settings(60.0, 5.0, True, adapt_media=False, anchor_sizes={"wall": 0.2})
+    anchors = {"wall": Pose((1.0, 0.0, 1.0), IDENTITY_QUAT)}
+    path = recorded(tmp_path / "session.rrd", settings=settings, anchors=anchors)
+    anew = {"anchors": given} if given else {}
+    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    assert past is not None
+    past.close()
+    assert config.sheet_sizes() == sizes
+    assert not config.adapt_media
+
+
+@pytest.mark.parametrize("given", [{}, {"door": ((0.0, 0.0, 1.0), IDENTITY_QUAT)}])
+def test_anchors_are_where_they_were_last_unless_given_anew(tmp_path: Path, given: dict[str, PoseTuple]) -> None:
+    """Also when a director moved one since."""
+    table, moved = Pose((0.0, -0.45, 0.0), IDENTITY_QUAT), Pose((0.5, 0.0, 0.0), IDENTITY_QUAT)
+    path = recorded(
+        tmp_path / "session.rrd",
+        core=make_core(anchors={"table": table}),
+        said={40: [host(41 * TICK_NS, MoveAnchor(0, "table", moved))]},
+        anchors={"table": table},
+    )
+    anew = {"anchors": given} if given else {}
+    past, config, _ = begin(SessionConfig(resume=path, **anew), None, None, None, None)  # type: ignore[arg-type]
+    assert past is not None
+    past.close()
+    now = {name: Pose(*T) for name, T in given.items()}
+    assert (config.anchor_poses(), past.anchors) == (now or {"table": moved}, now)
+    stepper = Stepper(
+        past.core, Front(), None, lambda: LAST_NS + 10**9, 10**9, 10**10, b"",
+        ResumedFrom(past.step, past.now_ns, past.anchors),
+    )  # fmt: skip
+    stepper.step(1)
+    assert past.core.authority.anchors == (now or {"table": moved})
+
+
+def test_what_is_noted_for_a_resumed_session_is_what_it_was_given() -> None:
+    config = SessionConfig(
+        state_hz=30.0,
+        keyframe_s=2.0,
+        realtime=False,
+        adapt_media=False,
+        anchors={"wall": ((1.0, 0.0, 1.0), IDENTITY_QUAT)},
+        anchor_sizes={"wall": 0.2},
+    )
+    noted = settings_of(config)
+    assert {name: getattr(config, name) for name in noted.__struct_fields__} == msgspec.structs.asdict(noted)
+
+
+# --- tokens -----------------------------------------------------------------------------------------------------------
+
+
+def test_tokens_stay_good_and_connection_numbers_go_on(session: Path) -> None:
+    tokens = ResumeTokens(8)
+    tokens.new_connection()
+    token = tokens.issue("key", "p1")
+    keeper = NoteKeeper(note_path(session))
+    keeper.offer(ResumeNote("s1", Listening(), tokens.blob()))
+    keeper.close(5.0)
+    assert token not in note_path(session).read_bytes(), "hashes only"
+    assert note_path(session).stat().st_mode & 0o777 == 0o600
+    past = Continuation(session)
+    after = ResumeTokens(8, past.handback)
+    assert after.find(token, "key") == "p1"
+    assert after.find(token, "another key") is None
+    assert after.new_connection() > ANN
+
+
+def test_without_a_note_numbers_begin_above_those_of_the_journal(session: Path) -> None:
+    assert ResumeTokens(8, Continuation(session).handback).new_connection() == ANN + 1
+
+
+@pytest.mark.parametrize("fault", ["another session", "open to others", "damaged", "nothing"])
+def test_a_note_that_cannot_be_trusted_is_not_used(session: Path, fault: str) -> None:
+    path = note_path(session)
+    if fault != "nothing":
+        note = ResumeNote("s2" if fault == "another session" else "s1", Listening("9.9.9.9"))
+        path.write_bytes(b"\xc1" if fault == "damaged" else msgspec.msgpack.encode(note))
+        path.chmod(0o644 if fault == "open to others" else 0o600)
+    note_read, why = read_note(session, "s1")
+    assert note_read is None
+    assert path.name in why
+
+
+def test_a_recording_of_another_name_has_a_note_of_its_own() -> None:
+    names = [note_path(Path(name)).name for name in ("session.rrd", "session.resume3.part2.rrd", "b.resume2.rrd")]
+    assert names == ["resume.tokens", "resume.tokens", "b.resume.tokens"]
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+def test_session_time_goes_on_with_the_clock_of_this_boot(session: Path) -> None:
+    past = Continuation(session)
+    assert past.origin_ns == past.header.origin_ns
+
+
+@pytest.mark.parametrize("header", [{"boot_id": "another"}, {"boot_id": ""}, {"origin_ns": 2**62}])
+def test_after_a_reboot_session_time_goes_on_above_what_anybody_saw(tmp_path: Path, header: dict[str, object]) -> None:
+    past = Continuation(recorded(tmp_path / "session.rrd", **header))  # type: ignore[arg-type]
+    now_ns = time.monotonic_ns() - past.origin_ns
+    assert LAST_NS + MARGIN_NS <= now_ns < LAST_NS + 2 * MARGIN_NS
+
+
+# --- the first steps --------------------------------------------------------------------------------------------------
+
+
+class Front:
+    """Keeps decisions."""
+
+    def __init__(self) -> None:
+        self.decisions: list[tuple[int, Decision]] = []
+
+    def poll(self) -> list[Entry]:
+        return []
+
+    def send_decision(self, step: int, decision: Decision) -> None:
+        self.decisions.append((step, decision))
+
+    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
+        pass
+
+
+class Journal:
+    """Keeps what a recorder would write."""
+
+    wants_keyframe = False
+
+    def __init__(self) -> None:
+        self.batch = Batch()
+
+    def row(self, row: JournalRow) -> None:
+        self.batch.rows.append(row)
+
+    def flush(self) -> None:
+        pass
+
+    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        self.batch.keyframes.append(seal(keyframe, chain))
+
+    def state(
+        self,
+        step: int,
+        tick: int,
+        sim_time: float,
+        session_time: int,
+        poses: NDArray[np.float64],
+        applied: Sequence[Applied] = (),
+    ) -> None:
+        pass
+
+    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+        pass
+
+    def metric(self, name: str, value: float) -> None:
+        pass
+
+    def take_gap(self) -> int:
+        return 0
+
+
+@pytest.fixture
+def gone_on(session: Path) -> tuple[Stepper, Front, Path]:
+    """Forty steps after five seconds, recorded beside the first recording."""
+    past = Continuation(session)
+    now_ns = [LAST_NS + 5_000_000_000]
+
+    def clock() -> int:
+        now_ns[0] += TICK_NS // 2
+        return now_ns[0]
+
+    header = msgspec.structs.replace(past.header, continues=past.continues)
+    front, journal = Front(), Journal()
+    stepper = Stepper(
+        past.core, front, journal, clock, 10**9, 10**10, header_root(header), ResumedFrom(past.step, past.now_ns)
+    )  # fmt: skip
+    stepper.post(Marker(0, "on we go"))
+    for _ in range(40):
+        stepper.step(1)
+    past.close()
+    return stepper, front, write(past.recording, header, journal.batch)
+
+
+def test_the_first_entry_says_that_the_session_goes_on(gone_on: tuple[Stepper, Front, Path]) -> None:
+    stepper, front, _ = gone_on
+    step, decision = front.decisions[0]
+    assert step == STEPS
+    (gap,) = [event.body for event in decision.events if isinstance(event.body, Gap)]
+    assert gap.kind == "resumed"
+    assert gap.duration_ns == pytest.approx(5e9, abs=1e8)
+    before = make_core()
+    play(before, 0, STEPS)
+    assert decision.events[0].event_seq == before.authority.step(LAST_NS + 1, [], 0, before.world.view()).event_seq + 1
+    assert stepper.step_count == STEPS + 40
+
+
+def test_people_keep_what_they_had_and_robots_hold(gone_on: tuple[Stepper, Front, Path]) -> None:
+    stepper, front, _ = gone_on
+    lease = stepper.ledger.mirror.leases["left"]
+    assert lease.holder == "p1"
+    assert lease.expires_ns > LAST_NS + 5_000_000_000, "the grace period begins anew"
+    (ann,) = stepper.ledger.participants()
+    assert (ann.name, ann.connected, ann.robots) == ("ann", False, ("left",))
+    assert all(command.kind == CommandKind.HOLD for _, decision in front.decisions for command in decision.commands)
+    assert stepper.core.world.view().tick == STEPS + 39, "the first step has no tick: it may be paused"
+
+
+def test_both_recordings_verify_and_the_second_says_what_it_continues(gone_on: tuple[Stepper, Front, Path]) -> None:
+    _, _, path = gone_on
+    report = verify_recording(path)
+    assert report.ok, report.line()
+    assert report.continues == f"session.rrd after step {STEPS - 1}"
+    assert report.steps == 40
+    assert report.last_step == STEPS + 39
+    assert verify_recording(path.with_name("session.rrd")).ok
+    past = Continuation(path)  # and on again
+    assert (past.file, past.step) == ("session.resume2.rrd", STEPS + 39)
+    past.close()
+
+
+def test_a_recording_beside_another_beginning_fails(gone_on: tuple[Stepper, Front, Path]) -> None:
+    _, _, path = gone_on
+    first = path.with_name("session.rrd")
+    first.unlink()
+    alone = verify_recording(path)
+    assert alone.ok, "it verifies by itself"
+    assert any("not there" in note for note in alone.notes)
+    recorded(first, session_name="other")
+    report = verify_recording(path)
+    assert not report.ok
+    assert "does not continue" in report.problems[0].text
+
+
+def test_the_first_row_is_journaled_as_such(gone_on: tuple[Stepper, Front, Path]) -> None:
+    from iris_session.recording import Recording
+
+    with Recording.open(gone_on[2]) as recording:
+        row = next(recording.rows())
+    first, *_ = decode_entries(row.entries)
+    assert first == host(row.now_ns, first.message)
+    assert isinstance(first.message, SessionResumed)
+    assert row.n_ticks == 0

@@ -1,0 +1,232 @@
+"""What a publisher sets: checked at once, nothing changes when it is wrong, taken together as one frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.scene.articulation import Articulation, Joint, Part
+from iris_session.session.draft import MAX_SAID, SceneDraft
+from iris_session.session.errors import PublishError
+from tests.session.published import CLOTH, MOVING, UNIT, composed
+
+TURNED = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # a quarter turn around z
+
+
+@pytest.fixture
+def draft() -> SceneDraft:
+    return SceneDraft(composed())
+
+
+def pose(draft: SceneDraft, name: str) -> list[float]:
+    return draft.frame(0, 0.0, anew=False).poses[MOVING.index(name)].tolist()
+
+
+def everything(draft: SceneDraft) -> bytes:
+    frame = draft.frame(0, 0.0, anew=False)
+    return frame.poses.tobytes() + b"".join(v.tobytes() for v in frame.vertices.values())
+
+
+def test_a_frame_holds_what_was_set_and_the_rest_as_it_was(draft: SceneDraft) -> None:
+    draft.set_pose("blue", (1.0, 2.0, 3.0), TURNED)
+    frame = draft.frame(7, 0.5, anew=True)
+    assert (frame.capture_ns, frame.time_s, frame.anew) == (7, 0.5, True)
+    assert frame.poses[1].tolist() == pytest.approx([1.0, 2.0, 3.0, *TURNED])
+    assert frame.poses[0].tolist() == [0.0, 0.0, 0.5, *UNIT]
+    draft.set_pose("blue", (0.0, 0.0, 0.0), UNIT)
+    draft.set_vertices("cloth", CLOTH + 1.0)
+    assert frame.poses[1, 0] == 1.0, "a frame that was taken does not change any more"
+    assert (frame.vertices["cloth"] == CLOTH).all()
+    assert (draft.frame(8, 1.0, anew=False).vertices["cloth"] == CLOTH + 1.0).all()
+
+
+def test_joints_and_the_root_place_the_bodies_of_an_articulation(draft: SceneDraft) -> None:
+    draft.set_joints("arm", {"turn": math.pi / 2})
+    assert pose(draft, "arm/fore") == pytest.approx([0.0, 1.0, 0.8, *TURNED])
+    draft.set_joints("arm", {"slide": 0.25})
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 0.8]), "the other joint stays"
+    draft.set_pose("arm", (10.0, 0.0, 0.0), TURNED)
+    assert pose(draft, "arm/base") == pytest.approx([10.0, 0.0, 0.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([8.75, 0.0, 0.0])
+
+
+def test_joints_beyond_their_limits_are_shown_and_said_when_they_are_far_beyond(draft: SceneDraft) -> None:
+    """Encoders of real robots report a little more than their description allows; degrees are much more."""
+    draft.set_joints("arm", {"turn": math.pi + 0.05, "slide": -0.01})
+    assert draft.warnings() == ()
+    assert pose(draft, "arm/upper")[3:] == pytest.approx([math.cos((math.pi + 0.05) / 2), 0, 0, 0.9997], abs=1e-4)
+    draft.set_joints("arm", {"turn": 90.0, "slide": 0.6})
+    assert draft.warnings() == (
+        "joint 'turn' of 'arm' is set to 90 rad, far beyond its limits, -3.142 to 3.142 rad",
+        "joint 'slide' of 'arm' is set to 0.6 m, far beyond its limits, 0 to 0.5 m",
+    )
+    draft.set_joints("arm", {"slide": 0.5})
+    assert len(draft.warnings()) == 1, "of those that are there now"
+
+
+def test_of_many_joints_beyond_their_limits_a_few_are_named() -> None:
+    joints = tuple(Joint(f"j{i}", "revolute", -1.0, 1.0, 0.0) for i in range(MAX_SAID + 3))
+    parts = (Part("arm/base"), *(Part(f"arm/{i}", i, joint=i) for i in range(len(joints))))
+    names = tuple(part.body for part in parts)
+    robot = Articulation("arm", IDENTITY, parts, joints, {})
+    scene = replace(composed(), moving=names, poses=(IDENTITY,) * len(names), articulations={"arm": robot})
+    draft = SceneDraft(scene)
+    draft.set_joints("arm", {joint.name: 57.3 for joint in joints})
+    assert len(draft.warnings()) == MAX_SAID + 1
+    assert draft.warnings()[-1] == "3 more joints are set far beyond their limits"
+
+
+def test_one_body_of_an_articulation_can_be_placed_by_itself(draft: SceneDraft) -> None:
+    """Robots often tell where their links are, not their joints."""
+    draft.set_pose("arm/upper", (0.0, 0.0, 5.0), UNIT)
+    assert pose(draft, "arm/upper")[2] == 5.0
+    assert pose(draft, "arm/fore")[2] == 0.5
+
+
+def on_a_floating_base() -> SceneDraft:
+    """The arm, its upper arm on a floating joint."""
+    scene = composed()
+    robot = scene.articulations["arm"]
+    base, _, fore = robot.parts
+    parts = (base, Part("arm/upper", 0, Pose((0.0, 0.0, 0.2), UNIT)), fore)
+    floating = replace(robot, parts=parts, loose={"fly": "arm/upper"})
+    return SceneDraft(replace(scene, articulations={"arm": floating}))
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_what_is_on_a_floating_joint_stays_where_it_was_put(many: bool) -> None:
+    draft = on_a_floating_base()
+    draft.set_joints("arm", {"slide": 0.25})
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([1.25, 0.0, 1.0]), "at first it goes with the rest"
+    if many:
+        draft.set_poses(["red", "arm/upper"], [(1.0, 2.0, 3.0), (0.0, 0.0, 5.0)], [UNIT, TURNED])
+    else:
+        draft.set_pose("arm/upper", (0.0, 0.0, 5.0), TURNED)
+    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.25, 5.0]), "what is on it goes with it"
+    draft.set_joints("arm", {"slide": 0.5})
+    draft.set_pose("arm", (7.0, 0.0, 0.0), UNIT)
+    assert pose(draft, "arm/base")[:3] == [7.0, 0.0, 0.0]
+    assert pose(draft, "arm/upper") == pytest.approx([0.0, 0.0, 5.0, *TURNED])
+    assert pose(draft, "arm/fore")[:3] == pytest.approx([0.0, 1.5, 5.0])
+
+
+def test_a_floating_joint_has_no_position() -> None:
+    with pytest.raises(PublishError, match=r"joint 'fly' of 'arm' has no position: set_pose\('arm/upper', ...\)"):
+        on_a_floating_base().set_joints("arm", {"fly": 1.0})
+
+
+def test_links_that_are_named_with_the_floating_one_are_where_they_are_said_to_be() -> None:
+    draft = on_a_floating_base()
+    draft.set_poses(["arm/fore", "arm/upper"], [(9.0, 9.0, 9.0), (0.0, 0.0, 5.0)], [UNIT, UNIT])
+    assert pose(draft, "arm/fore")[:3] == [9.0, 9.0, 9.0]
+
+
+def test_a_floating_link_that_takes_others_too_far_away_changes_nothing() -> None:
+    draft = on_a_floating_base()
+    before = everything(draft)
+    for put in (
+        lambda: draft.set_pose("arm/upper", (1e6, 0.0, 0.0), UNIT),
+        lambda: draft.set_poses(["red", "arm/upper"], [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)], [UNIT, UNIT]),
+    ):
+        with pytest.raises(PublishError, match="more than 1,000 km away"):
+            put()
+        assert everything(draft) == before
+    draft.set_joints("arm", {})
+    assert pose(draft, "arm/upper")[0] == 0.0
+
+
+def test_a_root_that_takes_its_bodies_too_far_away_stays_where_it_was(draft: SceneDraft) -> None:
+    draft.set_joints("arm", {"turn": 0.5})
+    before = everything(draft)
+    with pytest.raises(PublishError, match="more than 1,000 km away"):
+        draft.set_pose("arm", (1e6, 0.0, 0.0), UNIT)
+    assert everything(draft) == before
+    draft.set_joints("arm", {})
+    assert everything(draft) == before, "nor does it go there with the next joint that is set"
+
+
+def test_many_bodies_at_once_are_as_one_after_the_other(draft: SceneDraft) -> None:
+    other = SceneDraft(composed())
+    names = ["blue", "red"]
+    positions = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
+    draft.set_poses(names, positions, [TURNED, np.array(UNIT) * 1.0005])
+    for name, position, q in zip(names, positions, (TURNED, UNIT), strict=True):
+        other.set_pose(name, position, q)
+    assert np.allclose(draft.frame(0, 0.0, anew=False).poses, other.frame(0, 0.0, anew=False).poses, atol=1e-15)
+
+
+def test_a_quaternion_that_was_rounded_is_normalised(draft: SceneDraft) -> None:
+    draft.set_pose("red", (0.0, 0.0, 0.0), (0.7071, 0.0, 0.0, 0.7071))
+    assert np.linalg.norm(pose(draft, "red")[3:]) == pytest.approx(1.0, abs=1e-15)
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda d: d.set_pose("redd", (0, 0, 0), UNIT), "nearest: 'red'"),
+        (lambda d: d.set_pose("cloth", (0, 0, 0), UNIT), "use set_vertices"),
+        (lambda d: d.set_pose("red", (0, NAN, 0), UNIT), "3 finite numbers"),
+        (lambda d: d.set_pose("red", (0, 0), UNIT), "3 finite numbers"),
+        (lambda d: d.set_pose("red", None, UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", ("0", "1", "2"), UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", "012", UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", (0, 0, 0), ("1", "0", "0", "0")), "4 numbers"),
+        (lambda d: d.set_poses(["red"], [("1", "1", "1")], [UNIT]), "of numbers, not texts"),
+        (lambda d: d.set_vertices("cloth", CLOTH.astype(str)), "of numbers, not texts"),
+        (lambda d: d.set_pose("red", (0, 0, 2e6), UNIT), "in metres"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (0, 0, 0, 0)), r"length 0: .*\(1, 0, 0, 0\) turns nothing"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (1.002, 0, 0, 0)), "of length 1 is expected"),
+        (lambda d: d.set_pose("red", (0, 0, 10**400), UNIT), "3 numbers"),
+        (lambda d: d.set_pose("red", np.zeros((90, 3)), UNIT), "^[^\n]{1,120}$"),
+        (lambda d: d.set_pose(["red"], (0, 0, 0), UNIT), r"\['red'\] is no name"),
+        (lambda d: d.set_pose("red", (0, 0, 0), (1, 0, 0)), "4 finite numbers"),
+        (lambda d: d.set_poses(["red", "blu"], [(1, 1, 1)] * 2, [UNIT] * 2), "nearest: 'blue'"),
+        (lambda d: d.set_poses(["red", "arm"], [(1, 1, 1)] * 2, [UNIT] * 2), "set_pose"),
+        (lambda d: d.set_poses(["red", "blue"], [(1, 1, 1)] * 2, [UNIT, (1.1, 0, 0, 0)]), "of 'blue' has length 1.1"),
+        (lambda d: d.set_poses(["red", "blue", "red"], [(1, 1, 1)] * 3, [UNIT] * 3), "'red' is named more than once"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(0, 0, 0, 0)]), "of 'red' has length 0"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 1)], [(1e200, 0, 0, 0)]), "has length inf"),
+        (lambda d: d.set_poses("red", [(1, 1, 1)] * 3, [UNIT] * 3), "names is 'red': a list of the names"),
+        (lambda d: d.set_poses(None, [(1, 1, 1)], [UNIT]), "a list of the names"),
+        (lambda d: d.set_poses([0], [(1, 1, 1)], [UNIT]), "0 is no name"),
+        (lambda d: d.set_poses(["red"], [(1, 1, 10**400)], [UNIT]), "an array of shape"),
+        (lambda d: d.set_poses(["red"], [(1, NAN, 1)], [UNIT]), "not finite"),
+        (lambda d: d.set_poses(["red"], [(1, 1)], [UNIT]), r"\(1, 2\): \(1, 3\) is expected"),
+        (lambda d: d.set_poses(["red"], "red", [UNIT]), "an array of shape"),
+        (lambda d: d.set_joints("armm", {}), "nearest: 'arm'"),
+        (lambda d: d.set_joints("arm", {"turn": 1.0, "twist": 1.0}), "Joints: turn, slide"),
+        (lambda d: d.set_joints("arm", {"follower": 1.0}), "follows 'turn'"),
+        (lambda d: d.set_joints("arm", {"turn": NAN}), "finite"),
+        (lambda d: d.set_joints("arm", [1.0]), "by name of the joint are expected, as {'turn': 0.0, 'slide': 0.0}"),
+        (lambda d: d.set_joints("arm", {"turn": "1.0"}), "a finite number is needed"),
+        (lambda d: d.set_joints("arm", {"turn": 10**400}), "set_joints"),
+        (lambda d: d.set_joints(["arm"], {}), "is no name"),
+        (lambda d: d.set_joints("arm", {"turn": 1e300}), "radians"),
+        (lambda d: d.set_joints("arm", {"slide": 1e7}), "1,000 km"),
+        (lambda d: d.set_joints("arm", {"turn": 1.0, "slide": 1e308}), "1,000 km"),
+        (lambda d: d.set_vertices("clot", CLOTH), "nearest: 'cloth'"),
+        (lambda d: d.set_vertices("cloth", CLOTH[:3]), r"\(3, 3\): \(4, 3\) is expected"),
+        (lambda d: d.set_vertices("cloth", CLOTH * NAN), "not finite"),
+        (lambda d: d.set_vertices("cloth", CLOTH * 1e9), "metres"),
+        (lambda d: d.set_vertices("cloth", CLOTH.astype(np.float64) * 1e300), "metres"),
+        (lambda d: d.set_vertices(["cloth"], CLOTH), "is no name"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_and_changes_nothing(
+    draft: SceneDraft, wrong: Callable[[SceneDraft], None], says: str
+) -> None:
+    before = everything(draft)
+    with pytest.raises(PublishError, match=says):
+        wrong(draft)
+    assert everything(draft) == before
+    draft.set_pose("arm", (0.0, 0.0, 0.8), UNIT)  # nor does it come back later
+    assert pose(draft, "arm/fore") == pytest.approx([1.0, 0.0, 0.8, *UNIT])

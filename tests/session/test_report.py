@@ -1,0 +1,170 @@
+"""The authority's half of the status: what the ledger makes of events, when a report is due, what the recorder is."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from iris_session.physics import Pacer
+from iris_session.protocol.client_messages import MoveAnchor, PlaceAlignment, TrackingEpoch
+from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose
+from iris_session.protocol.entries import Bye, Entry, Join
+from iris_session.protocol.names import Role
+from iris_session.protocol.status import AnchorReport, ParticipantReport, RecorderReport
+from iris_session.recording.feed import FeedStats
+from iris_session.recording.messages import RecorderStatus
+from iris_session.session.config import SessionConfig
+from iris_session.session.processes import SessionProcesses
+from iris_session.session.report import PATIENCE_NS, PERIOD_NS, Reporter, anchors, recorder_report, robots, warnings
+from iris_session.session.stepper import Stepper
+from tests.session.play import TICK_NS, entries, host, make_core
+from tests.session.test_stepper import Front
+
+BOB = 2
+
+
+class Session:
+    """A stepper whose clock moves by a tick per step, in front of ports that keep what they are given."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.front = Front()
+        self.stepper = Stepper(make_core(), self.front, None, lambda: self.now_ns, 16_000_000, 5_000_000_000)
+
+    def step(self, *arrived: Entry) -> None:
+        self.now_ns += TICK_NS
+        self.front.waiting = list(arrived)
+        self.stepper.step(1)
+
+    def people(self) -> dict[str, ParticipantReport]:
+        return {row.name: row for row in self.stepper.ledger.participant_reports(self.now_ns)}
+
+
+@pytest.fixture
+def session() -> Session:
+    return Session()
+
+
+def bob(now_ns: int) -> Entry:
+    return Entry(BOB, BOB, now_ns, Join("key2", Role.OPERATOR, "bob", devices=("head",), alignment="measured"))
+
+
+def test_alignment_has_an_age_and_a_void(session: Session) -> None:
+    session.step(bob(TICK_NS))
+    row = session.people()["bob"]
+    assert (row.alignment, row.alignment_age_ns, row.alignment_void_ns) == ("none", -1, -1)
+    session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
+    for _ in range(10):
+        session.step()
+    row = session.people()["bob"]
+    assert (row.alignment, row.alignment_age_ns, row.alignment_void_ns) == ("placed", 10 * TICK_NS, -1)
+    session.step(Entry(BOB, BOB, session.now_ns, TrackingEpoch(1)))
+    for _ in range(5):
+        session.step()
+    row = session.people()["bob"]
+    assert (row.alignment, row.alignment_age_ns, row.alignment_void_ns) == ("none", -1, 5 * TICK_NS)
+    assert row.tracking_epoch == 1
+    session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
+    assert session.people()["bob"].alignment_void_ns == -1
+
+
+def test_nothing_stays_of_who_left(session: Session) -> None:
+    session.step(bob(TICK_NS))
+    session.stepper.ledger.rejected[session.people()["bob"].id, "head", "stale"] = 3
+    assert session.people()["bob"].rejected == {"stale": 3}
+    session.step(Entry(BOB, BOB, session.now_ns, Bye()))
+    assert session.people() == {}
+    assert session.stepper.ledger.rejected == {}
+
+
+def test_robots_and_who_drives_them(session: Session) -> None:
+    session.step()
+    before = {row.name: row for row in robots(session.stepper)}
+    assert {row.mode for row in before.values()} == {"exclusive"}
+    assert {(row.state, row.hold_reason) for row in before.values()} == {("hold", "no_lease")}
+    for step in range(150):
+        session.step(*entries(step))
+    after = {row.name: row for row in robots(session.stepper)}
+    left = after["left"]
+    assert (left.holder_name, left.state) == ("ann", "pose")
+    assert left.receive_to_step is not None
+    assert left.receive_to_step.p99 < 20.0
+    assert after["right"].receive_to_step is None
+    assert session.people()["ann"].holds == ("left",)
+
+
+def test_a_report_waits_for_time_to_spare_but_not_for_ever() -> None:
+    reporter = Reporter()
+    assert reporter.due(0)
+    assert not reporter.due(PERIOD_NS - 1)
+    reporter.pacer = Pacer(TICK_NS, 0)  # its first tick was due long ago
+    assert not reporter.due(PERIOD_NS)
+    assert reporter.due(PERIOD_NS + PATIENCE_NS)
+    reporter.pacer = Pacer(TICK_NS, 3 * PERIOD_NS)
+    assert reporter.due(3 * PERIOD_NS)
+
+
+def test_what_is_noticed_beside_ticks_is_among_the_warnings(session: Session) -> None:
+    assert warnings(session.stepper, RecorderReport(), "") == []
+    assert warnings(session.stepper, RecorderReport(), "", ["x" * 5000]) == ["x" * MAX_TEXT]
+
+
+def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) -> None:
+    session.step(bob(TICK_NS))
+    row = session.people()["bob"]
+    session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
+    reports = session.stepper.core.authority.alignment_reports()
+    (told,) = [r for r in session.stepper.ledger.participant_reports(session.now_ns, reports) if r.id == row.id]
+    assert told.alignment_report is not None
+    assert (told.alignment_report.version, told.alignment_report.running) == (1, True)
+    assert anchors({"table": IDENTITY, "door": IDENTITY}, {"table": 0.16}) == (
+        AnchorReport("table", IDENTITY, 0.16),
+        AnchorReport("door", IDENTITY, 0.0),
+    )
+
+
+def test_a_new_front_is_told_where_the_anchors_are_now() -> None:
+    core = make_core(anchors={"table": IDENTITY})
+    moved = Pose((1.0, 0.0, 0.0), IDENTITY.q)
+    core.step(TICK_NS, [host(TICK_NS, MoveAnchor(0, "table", moved))], 0)
+    told: list[object] = []
+    session_processes = SessionProcesses(SessionConfig(record=False), core, 0)
+    session_processes.front = SimpleNamespace(  # type: ignore[assignment]
+        alive=False, fault="ended", set_anchors=told.append, restart=lambda: told.append("restarted"), link=Front()
+    )
+    session_processes.reporter = SimpleNamespace(due=lambda now_ns: False)  # type: ignore[assignment]
+    session_processes.watch(Stepper(core, Front(), None, lambda: 10**12, 10**9, 10**9))
+    assert told == [{"table": moved}, "restarted"]
+
+
+def processes(alive: bool = True, hangs: bool = False, failure: str = "", fault: str = "") -> Any:
+    """What the report looks at."""
+    said = RecorderStatus(1, 0, 0, bytes=1000, fault=fault, disk_free=5000)
+    return SimpleNamespace(
+        feed=SimpleNamespace(stats=FeedStats(dropped_rows=2, spilled_bytes=30, recorder=said)),
+        recorder=SimpleNamespace(path="/data/session.rrd", part_path="/data/session.rrd"),
+        supervisor=SimpleNamespace(alive=alive, hangs=hangs, failure=failure),
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "state", "text"),
+    [
+        ({}, "running", ""),
+        ({"hangs": True}, "hangs", ""),
+        ({"alive": False}, "dead", ""),
+        ({"alive": False, "failure": "no space left"}, "failed", "no space left"),
+        ({"fault": "cannot be written"}, "failed", "cannot be written"),
+        ({"hangs": True, "failure": "no space left"}, "failed", "no space left"),  # dies again and again
+    ],
+)
+def test_recorder(fields: dict[str, Any], state: str, text: str) -> None:
+    report = recorder_report(processes(**fields))
+    assert (report.state, report.text) == (state, text)
+    assert (report.bytes_written, report.disk_free_bytes, report.lost_rows, report.spilled_bytes) == (1000, 5000, 2, 30)
+
+
+def test_without_recorder() -> None:
+    assert recorder_report(SimpleNamespace(feed=None, recorder=None, supervisor=None)).state == "off"  # type: ignore[arg-type]

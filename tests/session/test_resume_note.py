@@ -1,0 +1,53 @@
+"""The note beside a recording: written whole, to its end, and never over that of the next session."""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+
+from iris_session.session.resume_note import FILE, Listening, NoteKeeper, ResumeNote, read_note
+
+
+def test_the_last_note_is_written_also_when_the_end_comes_during_a_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper, disk = NoteKeeper(tmp_path / FILE), HangingDisk(monkeypatch)
+    keeper.offer(ResumeNote("s1", Listening("first")))
+    assert disk.reached.wait(30.0)
+    keeper.offer(ResumeNote("s1", Listening("last")))
+    threading.Timer(0.05, disk.works.set).start()
+    keeper.close(30.0)
+    note, _ = read_note(tmp_path / "session.rrd", "s1")
+    assert note is not None
+    assert note.listening.host == "last"
+    assert disk.synced_folders, "the new name is on the disk too"
+
+
+def test_a_note_that_comes_too_late_is_not_put_over_that_of_the_next_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper, disk = NoteKeeper(tmp_path / FILE), HangingDisk(monkeypatch)
+    keeper.offer(ResumeNote("s1", Listening("too late")))
+    assert disk.reached.wait(30.0)
+    keeper.close(0.0)
+    disk.works.set()
+    keeper._thread.join(30.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+class HangingDisk:
+    """`fsync` waits until it `works`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.reached, self.works = threading.Event(), threading.Event()
+        self.synced_folders = 0
+        monkeypatch.setattr(os, "fsync", self)
+
+    def __call__(self, descriptor: int) -> None:
+        self.synced_folders += stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        self.reached.set()
+        assert self.works.wait(30.0)

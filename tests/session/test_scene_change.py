@@ -1,0 +1,228 @@
+"""Another scene in a running core and in a live stepper: the same bits again, restored across the change."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import pytest
+
+from iris_session import Session, SessionConfig
+from iris_session.demo.scenes import n_arms_scene, scene_path
+from iris_session.physics import Pacer, PhysicsError, find_objects, find_robots
+from iris_session.physics.load import model_bytes, model_from_bytes, scene_hash
+from iris_session.protocol.client_messages import Control, GetSnapshot
+from iris_session.protocol.entries import SceneLoaded, decode_entries
+from iris_session.protocol.server_messages import SceneChanged, Snapshot
+from iris_session.session.core import SessionCore, make_plant, plant_state
+from iris_session.session.errors import ConfigError, OwnershipError
+from iris_session.session.scene_change import follow_timestep, prepare
+from iris_session.session.shared_scene import SharedScenes
+from iris_session.session.stepper import MAX_SCENES
+from iris_session.session.tick_times import TickTimes
+from tests.session.play import TICK_NS, entries, host, make_core
+from tests.session.test_stepper import Rig
+
+AT = 90  # step of the change: Ann's clutch is closed since step 50
+
+
+def bench_scene(timestep: float = 0.002) -> mujoco.MjModel:
+    spec = n_arms_scene(2, objects=3)
+    spec.option.timestep = timestep
+    return spec.compile()
+
+
+def loaded(model: mujoco.MjModel, state: bytes = b"") -> SceneLoaded:
+    return SceneLoaded(scene_hash(model_bytes(model)), find_robots(model), find_objects(model), state)
+
+
+def with_models(*models: mujoco.MjModel) -> SessionCore:
+    """A core that can build the scenes that are loaded later, as a replay does."""
+    first = make_core()
+    known = {scene_hash(model_bytes(m)): bytes(model_bytes(m)) for m in models}
+    return SessionCore(first.world.model, first.config, lambda model_hash: model_from_bytes(known[model_hash]))
+
+
+def play(core: SessionCore, first: int, last: int, change: SceneLoaded) -> list[bytes]:
+    digests = []
+    for i in range(first, last):
+        now_ns = (i + 1) * TICK_NS
+        begin = [host(now_ns, change)] if i == AT else []
+        digests.append(core.step(now_ns, begin + entries(i, 1 if i < AT else 2), 1).digest)
+    return digests
+
+
+def test_the_same_journal_gives_the_same_digests_across_a_change() -> None:
+    model = bench_scene()
+    scene = loaded(model)
+    live, replayed = make_core(), with_models(model)
+    live.prepared[scene.model_hash] = make_plant(model, scene, live.config.control)
+    assert play(live, 0, 150, scene) == play(replayed, 0, 150, scene)
+    assert live.world.model is model, "made off the loop"
+    assert not live.prepared
+    assert [o.name for o in live.scene.objects] == ["object1", "object2", "object3"]
+    assert live.world.view().tick == 150 - AT, "a new world begins at tick 0"
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.001])
+@pytest.mark.parametrize("at", [40, AT + 1, 130])
+def test_restoring_a_snapshot_is_invisible_from_either_side_of_the_change(at: int, timestep: float) -> None:
+    model = bench_scene(timestep)
+    scene = loaded(model)
+    straight = with_models(model)
+    play(straight, 0, at, scene)
+    state = straight.snapshot()
+    expected = play(straight, at, 150, scene)
+    fresh, later = with_models(model), with_models(model)
+    fresh.restore(state)
+    play(later, 0, 140, scene)
+    later.restore(state)  # back over the change, or within the new scene
+    assert play(fresh, at, 150, scene) == expected
+    assert play(later, at, 150, scene) == expected
+    straight.restore(straight.snapshot())
+    assert straight.snapshot() == fresh.snapshot()
+
+
+def test_a_reset_goes_back_to_the_state_that_the_scene_came_with() -> None:
+    model = bench_scene()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data.qpos[0] += 0.2
+    scene = loaded(model, plant_state(model, data))
+    core = with_models(model)
+    core.step(TICK_NS, [host(TICK_NS, scene)], 0)
+    begun = core.world.data.qpos[0]
+    assert begun == data.qpos[0]
+    for i in range(2, 20):
+        core.step(i * TICK_NS, [], 1)
+    core.step(21 * TICK_NS, [host(21 * TICK_NS, Control(0, "reset"))], 0)
+    assert core.world.data.qpos[0] == begun
+    assert core.as_it_is().initial_state == scene.initial_state
+
+
+def test_a_session_that_goes_on_from_the_new_scene_needs_no_other_model() -> None:
+    """As `serve --resume` does: its recording begins with the scene as it is."""
+    model = bench_scene()
+    scene = loaded(model)
+    before = with_models(model)
+    play(before, 0, 120, scene)
+    resumed = SessionCore(before.world.model, before.as_it_is())
+    resumed.restore(before.snapshot())
+    assert play(resumed, 120, 150, scene) == play(before, 120, 150, scene)
+
+
+def test_a_scene_with_another_timestep_is_as_fast_and_everybody_is_told() -> None:
+    """Twice as many ticks a second, each half as long: sim_time, speeds of control and what clients know follow."""
+    model = bench_scene(0.001)
+    scene = loaded(model)
+    core = with_models(model)
+    play(core, 0, AT, scene)
+    joined = core.step(AT * TICK_NS + 1, [host(AT * TICK_NS + 1, scene), host(AT * TICK_NS + 1, GetSnapshot())], 1)
+    assert [e.body.tick_period_ns for e in joined.decision.events if isinstance(e.body, SceneChanged)] == [1_000_000]
+    told = [o.message for o in joined.decision.outgoing if isinstance(o.message, Snapshot)]
+    assert [m.tick_period_ns for m in told] == [1_000_000]
+    for i in range(AT + 1, AT + 100):
+        core.step(i * TICK_NS + 1, entries(i, 2), 2)
+    view = core.world.view()
+    assert (view.tick, view.tick_period_ns) == (199, 1_000_000)
+    assert view.sim_time == pytest.approx(0.199)
+    core.step(500 * TICK_NS, [host(500 * TICK_NS, Control(0, "reset"))], 0)
+    assert core.world.tick_period_ns == 1_000_000
+
+
+def test_control_moves_as_fast_whatever_the_timestep() -> None:
+    """The same hand, the same time: the tips end at the same place."""
+    ends = []
+    for timestep, n_ticks in ((0.002, 1), (0.001, 2), (0.0005, 4)):
+        spec = mujoco.MjSpec.from_file(str(scene_path("handover")))
+        spec.option.timestep = timestep
+        model = spec.compile()
+        first = make_core()
+        core = SessionCore(model, first.config)
+        for i in range(200):
+            core.step((i + 1) * TICK_NS, entries(i), n_ticks)
+        ends.append(core.world.view().tip_pose("left").p)
+        assert core.world.view().sim_time == pytest.approx(0.4)
+    begun = make_core().world.view().tip_pose("left").p
+    assert math.dist(ends[0], begun) > 0.02
+    for end in ends[1:]:
+        assert math.dist(end, ends[0]) < 0.1 * math.dist(ends[0], begun)
+
+
+def test_the_loop_keeps_the_timestep_of_the_scene_from_its_first_tick_on() -> None:
+    rig = Rig()
+    rig.steps(30)
+    pacer = Pacer(TICK_NS, rig.stepper.clock())
+    times = TickTimes(TICK_NS, rig.stepper.clock)
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(0.001), b"", None, None)
+    rig.stepper.change_scene(scene)
+    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    rig.steps(1)
+    assert follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+    assert (pacer.period_ns, times.lateness()) == (1_000_000, None)
+    assert pacer.next_deadline_ns == rig.stepper.clock() + 1_000_000
+    stats = pacer.stats(rig.stepper.clock())
+    assert (stats.finished, stats.late, stats.missing) == (1, 0, 0)
+    assert not follow_timestep(rig.stepper, pacer, times, pacer.next_deadline_ns)
+
+
+def test_the_stepper_hands_the_scene_to_everybody_before_the_step() -> None:
+    rig = Rig()
+    rig.steps(60)
+    seen: list[int] = []
+    rig.stepper.on_scene.append(lambda _: seen.append(len(rig.front.decisions)))
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
+    rows = len(rig.recorder.rows)
+    rig.stepper.change_scene(scene)
+    rig.steps(30)
+    assert rig.recorder.scenes == [(rows, scene.model_hash)]
+    assert seen == [rows]
+    first = decode_entries(rig.recorder.rows[rows].entries)[0].message
+    assert first == scene.plant.scene
+    events = [e.body for e in rig.stepper.ledger.recent if isinstance(e.body, SceneChanged)]
+    assert events == [SceneChanged(2, 0, "new_scene", tick_period_ns=TICK_NS)]
+    assert rig.stepper.ledger.mirror.synced
+    assert set(rig.stepper.ledger.mirror.leases) == {"left", "right", "object1", "object2", "object3"}
+    assert rig.front.n_bodies == len(scene.plant.world.bodies)
+
+
+def test_changes_that_nobody_takes_are_refused() -> None:
+    rig = Rig()
+    scene = prepare(rig.stepper.core, SharedScenes(False, "test"), bench_scene(), b"", None, None)
+    for _ in range(MAX_SCENES):
+        rig.stepper.change_scene(scene)
+    with pytest.raises(RuntimeError, match="is the loop running"):
+        rig.stepper.change_scene(scene)
+
+
+def test_scenes_that_cannot_take_the_place_are_refused_with_a_reason() -> None:
+    core = make_core()
+    for timestep in (1e-6, 0.25):
+        with pytest.raises(ConfigError, match=rf"timestep of {timestep:g} s, run\(\) takes 1e-05 to 0.1 s"):
+            prepare(core, SharedScenes(False, "test"), bench_scene(timestep), b"", None, None)
+    with pytest.raises(PhysicsError):
+        prepare(core, SharedScenes(False, "test"), bench_scene(), b"too short", None, None)
+
+
+def test_only_a_session_that_runs_takes_another_scene() -> None:
+    session = Session(str(scene_path("handover")))
+    with pytest.raises(OwnershipError, match=r"call it after the first run\(\), or during it"):
+        session.load_scene(bench_scene())
+    ports = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+    with Session(str(scene_path("handover")), config=ports) as run:
+        run.run(seconds=0.01)
+        with pytest.raises(ConfigError, match=r"objects\[0\] is 'hammer': a list of ObjectSpec is expected"):
+            run.load_scene(bench_scene(), objects=["hammer"])  # type: ignore[list-item]
+        with pytest.raises(ConfigError, match=r"robots is 'robots\.toml': a list of RobotSpec is expected"):
+            run.load_scene(bench_scene(), robots="robots.toml")  # type: ignore[arg-type]
+        change = run.load_scene(bench_scene())  # between two runs
+        change.result(timeout=60)
+        run.run(seconds=0.05)
+        assert run.objects == find_objects(bench_scene())
+    model: Any = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
+    with Session(model, mujoco.MjData(model)) as mine:
+        mine.begin_tick()
+        with pytest.raises(OwnershipError, match="your own loop owns the model"):
+            mine.load_scene(bench_scene())
+        mine.end_tick()

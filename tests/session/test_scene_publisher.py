@@ -1,0 +1,344 @@
+"""The publisher as its owner has it: what it refuses, times, threads; its recordings replay. Real processes."""
+
+from __future__ import annotations
+
+import errno
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from iris_session import (
+    Client,
+    ConfigError,
+    OwnershipError,
+    PublishError,
+    ResumeError,
+    SceneBuilder,
+    ScenePublisher,
+    Session,
+    SessionConfig,
+)
+from iris_session.protocol.scene import Environment
+from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
+from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
+from iris_session.recording import Recording
+from iris_session.scene import AssetStore
+from iris_session.session.cadence import SILENT_NS
+from iris_session.session.resume_note import note_path
+from iris_session.session.scene_publisher import AHEAD_NS, _capture
+from iris_session.session.verification import verify_recording
+
+CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
+NAN = float("nan")
+
+
+def scene() -> SceneBuilder:
+    builder = SceneBuilder("bench")
+    builder.add_plane("floor")
+    builder.add_box("box", half_size=(0.1, 0.1, 0.1), movable=True, position=(1.0, 0.0, 0.0))
+    builder.add_deformable("cloth", [(0, 0, 1), (0, 1, 1), (1, 0, 1)], [(0, 1, 2)])
+    return builder
+
+
+@pytest.fixture(scope="module")
+def session() -> Iterator[ScenePublisher]:
+    """One for all tests that leave it running; its time is given with every state, as a simulator does."""
+    with ScenePublisher(scene(), CONFIG) as session:
+        yield session
+
+
+def kinds(session: ScenePublisher) -> list[type]:
+    return [type(event.body) for event in session.recent_events()]
+
+
+def box(session: ScenePublisher) -> list[float]:
+    """Where the session has it now."""
+    with session._unchanging():
+        assert session._stepper is not None
+        return session._stepper.core.world.data.xpos[1].tolist()  # type: ignore[no-any-return]
+
+
+def test_what_is_published_is_the_state_and_what_is_only_set_is_not(session: ScenePublisher) -> None:
+    before = box(session)
+    session.set_pose("box", (0.0, 0.0, 2.0))
+    session.run(seconds=0.05)
+    assert box(session) == before
+    session.publish(12.5)
+    session.run(until=lambda: box(session) == [0.0, 0.0, 2.0], seconds=30.0)
+    assert (session.status().sim_time, session.status().tick) == (12.5, 12_500)
+
+
+def test_the_owner_speaks_and_patches_as_of_any_session(session: ScenePublisher) -> None:
+    session.marker("begin")
+    session.estop("from a script")
+    session.run(until=lambda: session.status().estop, seconds=30.0)
+    session.clear_estop()
+    assert session.scene is not None
+    floor = session.scene.visuals[0]
+    with pytest.raises(ConfigError, match=r"patch_scene: operation 1, SetVisual: numbers of rgba\[2\] must be finite"):
+        session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, NAN, 1.0)))
+    session.patch_scene(SetVisual(floor.id, rgba=(0.0, 0.0, 1.0, 1.0)))
+    session.run(until=lambda: SceneChanged in kinds(session) and not session.status().estop, seconds=30.0)
+    assert MarkerAdded in kinds(session)
+    assert session.scene.visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda s: s.begin_tick(), r"publish\(\) is the tick"),
+        (lambda s: s.end_tick(), r"Session\(model, data\)"),
+        (lambda s: s.load_scene("scene.xml"), "begin another"),
+        (lambda s: s.assign(["arm"], "ann"), "nothing that people drive"),
+        (lambda s: s.set_scale("arm", 0.5), "nothing that people drive"),
+        (lambda s: s.pause(), "publish nothing"),
+        (lambda s: s.resume(), "publish again"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_a_published_world_says_what_does(wrong: Callable[[ScenePublisher], None], says: str) -> None:
+    with pytest.raises(OwnershipError, match=says):
+        wrong(ScenePublisher(scene(), CONFIG))
+
+
+def test_times_that_cannot_be_are_refused_and_change_nothing(session: ScenePublisher) -> None:
+    session.publish(13.0)
+    session.run(until=lambda: session.status().sim_time == 13.0, seconds=30.0)
+    before = session.status().sim_time
+    session.set_pose("box", (9.0, 9.0, 9.0))
+    second = 1_000_000_000
+    for at, capture, says in (
+        (NAN, None, "time_s is nan"),
+        (-1.0, None, "seconds from 0"),
+        (1e10, None, "seconds from 0"),  # more nanoseconds than a recording counts
+        ("noon", None, "time_s is 'noon'"),
+        ("1", None, "time_s is '1'"),
+        (14.0, -1, "whole nanoseconds"),
+        (14.0, 0.5, "whole nanoseconds"),
+        (14.0, session.clock() + second, "ahead of session.clock"),
+        (14.0, 0, "before that of the state before"),
+        (None, None, "with every publish"),
+    ):
+        with pytest.raises(PublishError, match=says):
+            session.publish(at, capture_ns=capture)  # type: ignore[arg-type]
+    session.run(seconds=0.1)
+    assert session.status().sim_time == before
+    assert 9.0 not in box(session)
+    session.publish(np.float32(14.0), capture_ns=np.int64(session.clock()))  # type: ignore[arg-type]
+
+
+def test_a_time_that_goes_back_is_a_new_scene_epoch(session: ScenePublisher) -> None:
+    before = kinds(session).count(SceneChanged)
+    session.publish(15.0)
+    session.publish(15.0)  # a world that stands still
+    session.publish(4.0)
+    session.run(until=lambda: session.status().sim_time == 4.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 1
+    session.reset()
+    session.publish(4.5)
+    session.run(until=lambda: kinds(session).count(SceneChanged) == before + 2, seconds=30.0)
+    session.publish(5.0)
+    session.run(until=lambda: session.status().sim_time == 5.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 2, "a reset is one"
+
+
+def test_two_states_may_be_of_one_moment(session: ScenePublisher) -> None:
+    moment = session.clock()
+    for time_s in (6.0, 7.0):
+        session.publish(time_s, capture_ns=moment)
+    session.run(until=lambda: session.status().sim_time == 7.0, seconds=30.0)
+    assert session.status().sim_time == 7.0
+
+
+def test_what_is_captured_a_moment_ahead_of_the_clock_is_captured_now() -> None:
+    assert _capture(7_000 + AHEAD_NS, 7_000) == 7_000
+    with pytest.raises(PublishError, match="ahead of"):
+        _capture(7_001 + AHEAD_NS, 7_000)
+
+
+def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: ScenePublisher) -> None:
+    before = kinds(session).count(SceneChanged)
+
+    class Now(float):
+        """A time during whose comparison another thread says `reset`."""
+
+        def __gt__(self, other: object) -> bool:
+            thread = threading.Thread(target=session.reset)
+            thread.start()
+            thread.join(0.2)
+            return float.__gt__(self, other)  # type: ignore[arg-type, operator]
+
+    session.publish(16.0)
+    session._time_s = Now(16.0)
+    session.publish(16.5)
+    session.run(until=lambda: session._anew, seconds=30.0)
+    session.publish(17.0)
+    session.run(until=lambda: session.status().sim_time == 17.0, seconds=30.0)
+    assert kinds(session).count(SceneChanged) == before + 1
+
+
+def test_a_publisher_that_is_silent_is_as_old_as_its_silence_and_says_so(session: ScenePublisher) -> None:
+    """A simulator that hangs, or a robot's driver: what everybody looks at is not of now."""
+    with Client(session.address, role="observer", name="ann", alignment="not_needed") as ann:
+        for i in range(5):
+            session.publish(18.0 + 0.1 * i)
+        ann.wait_for(lambda c: c.state is not None and c.state.header.sim_time == 18.4, 30.0)
+        assert ann.state is not None
+        shown = ann.state.header
+        ann.wait_for(lambda c: (c.data_age_ns() or 0) > SILENT_NS, 30.0)
+        assert ann.state.header.session_time == shown.session_time
+        assert ann.state.header.state_seq > shown.state_seq, "it is sent again, for those who join"
+        ann.wait_for(lambda c: "nothing was published for" in " ".join(c.status(30.0).warnings), 30.0)
+        report = ann.status(30.0)
+        way = report.step_to_publish
+        assert way is None or way.p99 < 1000.0, "the front is not to blame"
+        row = next(row for row in report.participants if row.name == "ann")
+        assert row.state_age is None or row.state_age.p99 < 1000.0, "nor her link"
+        session.publish(19.0)
+        ann.wait_for(lambda c: not c.status(30.0).warnings, 30.0)
+        ann.wait_for(lambda c: c.state is not None and c.state.header.sim_time == 19.0, 30.0)
+
+
+def test_several_threads_may_publish(session: ScenePublisher) -> None:
+    faults: list[BaseException] = []
+
+    def work(x: float) -> None:
+        try:
+            for _ in range(200):
+                session.set_pose("box", (x, x, x))
+                session.publish(20.0)
+        except BaseException as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=work, args=(float(x),)) for x in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+    session.run(until=lambda: session.status().sim_time == 20.0, seconds=30.0)
+    assert len(set(box(session))) == 1, "never half of one and half of another"
+
+
+def test_nothing_is_set_before_the_start_or_published_after_the_end() -> None:
+    session = ScenePublisher(scene(), CONFIG)
+    for call in (session.publish, session.reset, session.run, lambda: session.marker("x"), lambda: session.address):
+        with pytest.raises(OwnershipError, match="not started"):
+            call()
+    assert (session.name, session.recording, session.superseded, session.stopping) == ("session", None, 0, False)
+    with session:
+        session.stop()
+        session.run()  # ends at once
+    assert session.stopping
+    for call in (session.publish, session.patch_scene, lambda: session.set_pose("box", (0, 0, 0)), session.start):
+        with pytest.raises(OwnershipError, match="closed"):
+            call()
+    assert session.close()
+    with pytest.raises(OwnershipError, match="make another"):
+        session.start()
+
+
+def test_what_it_is_made_of_is_checked(tmp_path: Path) -> None:
+    broken = SceneBuilder("broken")
+    broken.add_box("box", half_size=(1.0, 1.0, 1.0), movable=True)
+    broken.environment = Environment(extent=math.nan)
+    for builder, config, says in (
+        ("scene.xml", CONFIG, "a SceneBuilder is expected"),
+        (scene(), "config", "a SessionConfig is expected"),
+        (scene(), SessionConfig(resume=tmp_path), "cannot go on from its recording"),
+        (scene(), SessionConfig(assets=False), "nothing but what clients draw"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            ScenePublisher(builder, config)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="cannot be built"):
+        ScenePublisher(broken, CONFIG).start()
+
+
+def test_what_looks_like_a_mistake_or_comes_late_is_told(tmp_path: Path) -> None:
+    """A part in millimetres; a box that is added when the scene is shared already."""
+    builder = scene()
+    trimesh.creation.icosphere(radius=50).export(tmp_path / "ball_mm.stl")
+    builder.add_file(tmp_path / "ball_mm.stl", movable=True)
+    with ScenePublisher(builder, replace(CONFIG, assets=tmp_path)) as session:
+        assert [note for note in session.notes if "ball_mm.stl is 100 m large: in millimetres" in note]
+        session.set_pose("ball_mm", (0, 0, 0))
+        builder.add_box("late", half_size=(1, 1, 1), movable=True)
+        for say in (
+            lambda: session.set_pose("late", (0, 0, 0)),
+            lambda: session.set_poses(["box", "late"], np.zeros((2, 3)), [(1, 0, 0, 0)] * 2),
+            lambda: session.set_joints("late", {}),
+            lambda: session.set_vertices("late", [(0, 0, 0)]),
+        ):
+            with pytest.raises(PublishError, match="'late' was added after the session had begun"):
+                say()
+        with pytest.raises(PublishError, match="nearest: 'box'"):
+            session.set_pose("boxx", (0, 0, 0))
+
+
+def test_a_store_without_locks_is_no_reason_not_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As network drives are: what is shared may be taken away by others, which is said."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(AssetStore, "hold", no_locks)
+    with ScenePublisher(scene(), replace(CONFIG, assets=tmp_path)) as session:
+        session.publish()
+        assert any("cannot be held" in note for note in session.notes)
+
+
+def test_what_stopped_the_session_is_raised_to_whoever_asks_something_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ScenePublisher(scene(), CONFIG) as session:
+        assert session._stepper is not None
+        assert session.scene is not None
+        before, floor = session.scene, session.scene.visuals[0]
+
+        def broken(*_: object, **__: object) -> None:
+            raise KeyError("the core is broken")
+
+        monkeypatch.setattr(session._stepper.core, "step", broken)
+        with pytest.raises(KeyError, match="broken"):
+            session.run(seconds=30.0)
+        for call in (
+            session.publish,
+            lambda: session.estop("now"),
+            lambda: session.patch_scene(RemoveVisual(floor.id)),
+        ):
+            with pytest.raises(KeyError, match="broken"):
+                call()
+        assert session.scene is before
+
+
+def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=path, keyframe_s=0.5)
+    with ScenePublisher(scene(), config) as session:
+        moments = iter(range(60))
+
+        def move() -> bool:
+            i = next(moments, -1)
+            session.set_pose("box", (i * 0.01, 0.0, 0.5))
+            session.publish(i % 30 * 0.02)
+            return i < 0
+
+        session.run(until=move)
+        assert session._loop is not None
+        silent_ns = session._loop._sent_ns
+        session.run(until=lambda: session._loop is not None and session._loop._sent_ns > silent_ns, seconds=30.0)
+        session.publish(1.0)
+    assert session.close(), session.recording_fault
+    report = verify_recording(path)
+    assert (report.ok, report.unverified_steps) == (True, 0), report
+    with Recording.open(path) as recording:
+        assert recording.header.recording_class == "open"
+        assert [body.name for body in recording.header.bodies] == ["box"]
+        rows = list(recording.rows())
+        assert 10 < sum(bool(row.plant) for row in rows) <= 62, "only where something was published"
+    with pytest.raises(ResumeError, match=r"class 'open'.*serve the file again that was shown"):
+        Session(config=SessionConfig(resume=path))
+    assert not note_path(path).exists(), "what nobody can go on from needs none"

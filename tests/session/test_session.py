@@ -1,0 +1,326 @@
+"""The public object: what it refuses, and inputs of its owner. Real processes, no clients."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from iris_session import ConfigError, OwnershipError, Session, SessionConfig, StartError
+from iris_session.authority import AuthorityConfig
+from iris_session.control import ControlConfig, ControlError
+from iris_session.demo.scenes import scene_path
+from iris_session.physics import AmbiguousModelError, load_model
+from iris_session.protocol.client_messages import Control
+from iris_session.protocol.scene import encode_scene
+from iris_session.protocol.scene_patch import AddVisual, RemoveVisual, SetVisual
+from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
+from iris_session.scene import AssetStore
+from iris_session.session import scene_change
+from iris_session.session.core import plant_state
+from iris_session.session.stepper import MAX_HOST_ENTRIES
+from iris_session.session.verification import verify_recording
+
+QUIET = SessionConfig(control_port=0, state_port=0, record=False, realtime=False)
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    with Session(scene_path("handover"), config=QUIET) as session:
+        yield session
+
+
+def _bodies(session: Session) -> list[object]:
+    return [event.body for event in session.recent_events()]
+
+
+def test_what_the_owner_says_before_the_first_step_is_in_it(session: Session) -> None:
+    session.marker("first")
+    session.run(until=session.recent_events)
+    assert isinstance(_bodies(session)[0], MarkerAdded)
+    assert session.status().tick >= 1
+
+
+def test_what_the_owner_cannot_say_is_refused_at_once_and_an_e_stop_never(session: Session) -> None:
+    session.marker("before")
+    with pytest.raises(ValueError, match="Marker cannot be used"):
+        session.marker(3)  # type: ignore[arg-type]
+    session.estop(None)  # type: ignore[arg-type]
+    session.marker("after")
+    session.run(until=lambda: len(_bodies(session)) >= 3, seconds=30.0)
+    kinds = {type(body) for body in _bodies(session) if not isinstance(body, Gap)}
+    assert kinds == {MarkerAdded, EStopChanged}, "what was refused costs nothing of what comes after it"
+    assert session.status().estop
+    with pytest.raises(ValueError, match="Marker cannot be used"):
+        session.marker(3)  # type: ignore[arg-type]
+    session.estop("\ud800")
+
+
+def test_an_e_stop_before_the_first_step_is_taken_however_much_waits(session: Session) -> None:
+    for _ in range(MAX_HOST_ENTRIES):
+        session.clear_estop()
+    with pytest.raises(OwnershipError, match="inputs wait for the first step"):
+        session.clear_estop()
+    session.estop("at once")
+    session.run(until=lambda: session.status().estop, seconds=30.0)
+    assert session.status().estop
+
+
+def test_the_owner_has_the_rights_of_a_director(session: Session) -> None:
+    session.pause()
+    session.resume()
+    session.reset()
+    session.estop("from a script")
+    session.run(until=lambda: session.status().estop)
+    session.clear_estop()
+    session.run(until=lambda: not session.status().estop)
+    kinds = [type(body) for body in _bodies(session) if not isinstance(body, Gap)]  # of a busy machine
+    # The e-stop takes the urgent lane, before what was said with it.
+    assert kinds == [EStopChanged, PauseChanged, PauseChanged, SceneChanged, EStopChanged]
+
+
+def test_ticks_asked_for_while_paused_are_taken_a_few_at_a_time(session: Session) -> None:
+    """An e-stop among them waits for one step, not for all of them."""
+    session.pause()
+    session.run(until=lambda: session.status().paused)
+    start, steps = session.status().tick, session.stepper.step_count
+    session.post(Control(request_id=0, action="step", ticks=35))
+    session.run(until=lambda: session.status().tick - start >= 35)
+    assert session.status().tick - start == 35
+    assert session.stepper.step_count - steps >= 5
+    session.run(seconds=0.05)
+    assert session.status().tick - start == 35
+
+
+def test_ticks_asked_for_twice_are_all_taken(session: Session) -> None:
+    session.pause()
+    session.run(until=lambda: session.status().paused)
+    start = session.status().tick
+    for ticks in (25, 5):
+        session.post(Control(request_id=0, action="step", ticks=ticks))
+    session.run(until=lambda: session.status().tick - start >= 10)
+    session.post(Control(request_id=0, action="step", ticks=7))
+    session.run(until=lambda: session.status().tick - start >= 37)
+    session.run(seconds=0.05)
+    assert session.status().tick - start == 37
+
+
+def test_run_ends_after_its_seconds_and_from_another_thread(session: Session) -> None:
+    session.run(seconds=0.05)
+    ticks = session.status().tick
+    assert ticks >= 1
+    timer = threading.Timer(0.05, session.stop)
+    timer.start()
+    session.run()
+    timer.join()
+    assert session.stopping
+
+
+def test_posting_without_a_loop_is_bounded(session: Session) -> None:
+    for i in range(256):
+        session.marker(f"m{i}")
+    with pytest.raises(OwnershipError, match="call run"):
+        session.marker("one more")
+
+
+def test_one_session_is_driven_in_one_way() -> None:
+    model = load_model(scene_path("handover"))
+    with Session(model, mujoco.MjData(model), QUIET) as session:
+        session.begin_tick()
+        with pytest.raises(OwnershipError, match="one way"):
+            session.run(seconds=0.1)
+    with Session(model, mujoco.MjData(model), QUIET) as session:
+        session.run(seconds=0.01)
+        with pytest.raises(OwnershipError, match="one way"):
+            session.begin_tick()
+
+
+def test_targets_for_an_environment_with_its_own_controller() -> None:
+    model = load_model(scene_path("handover"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    ctrl = data.ctrl.copy()
+    config = SessionConfig(
+        control_port=0, state_port=0, record=False, realtime=False, control=ControlConfig(output="targets")
+    )
+    with Session(model, data, config) as session:
+        for _ in range(5):
+            session.begin_tick()
+            mujoco.mj_step(model, data)
+            session.end_tick()
+        targets = session.targets()
+        assert set(targets) == {"left", "right"}
+        site = data.site(session.robots[0].site)
+        assert targets["left"].p == pytest.approx(tuple(site.xpos), abs=5e-3)
+    assert (data.ctrl == ctrl).all(), "the environment's own controller writes ctrl"
+
+
+def test_closing_twice_and_using_it_afterwards(session: Session) -> None:
+    session.close()
+    session.close()
+    for call in (session.run, session.start, session.patch_scene, session.estop, lambda: session.address):
+        with pytest.raises(OwnershipError, match="the session is closed: make another Session"):
+            call()
+    assert session.recording is None
+
+
+def test_a_look_can_be_changed_before_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "session.rrd"
+    config = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=path)
+    with pytest.raises(OwnershipError, match="not started"):
+        Session(scene_path("handover"), config=config).patch_scene(RemoveVisual(0))
+    with Session(scene_path("handover"), config=config) as session:
+        monkeypatch.setattr(scene_change, "MAX_SCENES", 2)
+        assert session.scene is not None
+        seen = session.scene.visuals[0]
+        for green in (0.5, 1.0):
+            session.patch_scene(SetVisual(seen.id, rgba=(0.0, green, 0.0, 1.0)))
+        with pytest.raises(ConfigError, match="2 changes wait for the first step: call run"):
+            session.patch_scene(RemoveVisual(seen.id))
+        assert session.scene.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
+        told = session.scene
+
+        def changes() -> list[SceneChanged]:
+            return [body for body in _bodies(session) if isinstance(body, SceneChanged)]
+
+        session.run(until=lambda: len(changes()) == 2, seconds=30.0)
+        assert changes()[1].scene_hash == hashlib.sha256(encode_scene(told)).hexdigest()
+        session.patch_scene(RemoveVisual(seen.id))
+        session.run(until=lambda: len(changes()) == 3, seconds=30.0)
+        assert [change.scene_revision for change in changes()] == [1, 2, 3]
+        assert not [note for note in session.notes if "cannot be held" in note]
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(AssetStore, "hold", full)
+        session.patch_scene(AddVisual(seen))
+        assert "No space left" in session.notes[-1], "what comes up later is said as well"
+    assert verify_recording(path).ok
+
+
+def test_another_scene_begins_with_the_data_that_came_with_its_file(session: Session) -> None:
+    path = scene_path("handover")
+    model = load_model(path)
+    data = mujoco.MjData(model)
+    data.qpos[0] = 0.3
+    begun = plant_state(model, data)
+    session.run(seconds=0.05)
+    change = session.load_scene(path, data)
+    data.qpos[0] = 0.9  # whose it is goes on with it
+    session.run(until=change.done)
+    change.result()
+    before = session.stepper.core.as_it_is().initial_state
+    session.run(until=lambda: session.stepper.core.as_it_is().initial_state != before, seconds=30.0)
+    assert session.stepper.core.as_it_is().initial_state == begun
+    other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
+    with pytest.raises(ConfigError, match="data is of another model"):
+        other.result(60.0)
+
+
+def test_what_cannot_be_driven_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    torque = """<mujoco><worldbody><body name="arm"><joint name="j1"/><geom size=".1"/>
+    <body name="b"><joint name="j2"/><geom size=".1"/><body name="c"><joint name="j3"/><geom size=".1"/>
+    <site name="tip"/></body></body></body></worldbody><actuator><motor name="a1" joint="j1"/>
+    <motor name="a2" joint="j2"/><motor name="a3" joint="j3"/></actuator></mujoco>"""
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd")
+    session = Session(mujoco.MjModel.from_xml_string(torque), config=config)
+    with pytest.raises(ControlError, match="gravity_pd"):
+        session.start()
+    assert list(tmp_path.iterdir()) == []
+    ambiguous = torque.replace("motor", "position").replace('<site name="tip"/>', '<site name="x"/><site name="y"/>')
+    with pytest.raises(AmbiguousModelError):
+        Session(mujoco.MjModel.from_xml_string(ambiguous), config=config)
+    odd = SessionConfig(authority=AuthorityConfig(leader_apart="wait"), record=False)
+    with pytest.raises(ConfigError, match="'ramp' or 'refuse'"):
+        Session(scene_path("handover"), config=odd).start()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "taken" / "session.rrd")
+    with pytest.raises(StartError, match="taken"):
+        Session(scene_path("handover"), config=config).start()
+
+
+def test_a_start_that_failed_can_be_tried_again(tmp_path: Path) -> None:
+    blocked = tmp_path / "session.rrd"
+    blocked.write_bytes(b"somebody else's")
+    config = SessionConfig(control_port=0, state_port=0, record=blocked, realtime=False)
+    session = Session(scene_path("handover"), config=config)
+    with pytest.raises(StartError, match="never overwritten") as caught:
+        session.start()
+    assert "".join(traceback.format_exception(caught.value)).count("Traceback") == 1, "its text says it all"
+    blocked.unlink()
+    with session:
+        session.run(seconds=0.05)
+        assert session.status().tick > 1
+    assert session.close()
+    assert not session.recording_fault
+
+
+def test_a_recording_that_ends_early_is_said(tmp_path: Path) -> None:
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)
+    session = Session(scene_path("handover"), config=config)
+    session.start()
+    session.run(seconds=0.1)
+    os.kill(session.processes.recorder_pid, signal.SIGKILL)
+    before = time.monotonic()
+    assert not session.close()
+    assert time.monotonic() - before < 4.0, "nobody waits for a recorder that is gone"
+    assert "killed by signal 9" in session.recording_fault
+
+
+def test_a_recorder_that_was_just_replaced_gets_its_time(tmp_path: Path) -> None:
+    config = SessionConfig(control_port=0, state_port=0, record=tmp_path / "session.rrd", realtime=False)
+    with Session(scene_path("handover"), config=config) as session:
+        session.run(seconds=0.3)
+        os.kill(session.processes.recorder_pid, signal.SIGKILL)
+        session.run(until=lambda: session.status().restarts["recorder"] == 1)
+        session.run(seconds=0.05)
+    assert not session.recording_fault
+    assert session.recording == tmp_path / "session.rrd", "known after the end too"
+    report = verify_recording(tmp_path / "session.rrd")
+    assert report.ok, report.line()
+    assert (report.parts, report.finished) == (2, True)
+
+
+def test_dropped_contacts_are_said_once_and_counted() -> None:
+    """MuJoCo without room for contacts goes on silently: things fall through each other."""
+    boxes = "".join(
+        f'<body pos="0 0 {0.09 + 0.02 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(20)
+    )
+    xml = f'<mujoco><size memory="300K"/><worldbody><geom type="plane" size="1 1 1"/>{boxes}</worldbody></mujoco>'
+    with Session(mujoco.MjModel.from_xml_string(xml), config=QUIET) as session:
+        session.run(until=lambda: any("MuJoCo:" in str(body) for body in _bodies(session)))
+        before = sum(count for reason, count in session.status().drops.items() if "dropped" in reason)
+        assert before > 0
+        session.reset()
+        session.run(seconds=0.3)
+        assert sum(count for reason, count in session.status().drops.items() if "dropped" in reason) >= before
+        texts = [body.text for body in _bodies(session) if isinstance(body, MarkerAdded)]
+        assert len([text for text in texts if "MuJoCo:" in text]) == len({t for t in texts if "MuJoCo:" in t})
+
+
+def test_a_diverged_session_is_resumed_by_a_reset_only(session: Session) -> None:
+    session.run(seconds=0.05)
+    session.data.qpos[0] = float("nan")
+    session.run(until=lambda: session.status().paused)
+    told = len([body for body in _bodies(session) if isinstance(body, MarkerAdded)])
+    session.resume()
+    session.run(until=lambda: len([b for b in _bodies(session) if isinstance(b, MarkerAdded)]) > told)
+    session.run(until=lambda: session.status().paused)
+    session.reset()
+    session.resume()
+    tick = session.status().tick
+    session.run(until=lambda: not session.status().paused and session.status().tick > 5)
+    assert tick >= 0

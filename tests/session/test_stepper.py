@@ -1,0 +1,300 @@
+"""The stepper's bounds and rhythms, with recording ports in place of processes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from iris_session.link import messages as link_messages
+from iris_session.protocol.client_messages import Assign, Control, EStop, Marker
+from iris_session.protocol.common import Applied
+from iris_session.protocol.entries import HOST, Entry, ExternalReset, RecordingGap, decode_entries
+from iris_session.protocol.server_messages import BodyInfo, Gap, StateHeader
+from iris_session.protocol.steps import Decision
+from iris_session.recording.journal import CRASHED, JournalRow, Keyframe, check_row
+from iris_session.session.errors import OwnershipError
+from iris_session.session.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper
+from tests.session.play import TICK_NS, entries, make_core
+
+MS = 1_000_000
+
+
+class Front:
+    """Keeps what is sent; gives `waiting`."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Entry] = []
+        self.decisions: list[Decision] = []
+        self.states: list[StateHeader] = []
+        self.n_bodies = 0
+
+    def poll(self) -> list[Entry]:
+        entries, self.waiting = self.waiting, []
+        return entries
+
+    def send_decision(self, step: int, decision: Decision) -> None:
+        assert step == len(self.decisions)
+        self.decisions.append(decision)
+
+    def send_state(self, header: StateHeader, poses: NDArray[np.float64]) -> None:
+        assert poses.shape[1] == 7
+        self.n_bodies = len(poses)
+        self.states.append(header)
+
+
+class Recorder:
+    """Keeps what is recorded; loses `gap` rows once."""
+
+    def __init__(self) -> None:
+        self.wants_keyframe = False
+        self.gap = 0
+        self.rows: list[JournalRow] = []
+        self.keyframes: list[Keyframe] = []
+        self.states = 0
+        self.state_times: list[int] = []
+        self.metrics: list[tuple[str, float]] = []
+        self.scenes: list[tuple[int, str]] = []  # rows before it, hash
+        self.drawn: list[tuple[str, str]] = []
+
+    def scene(
+        self,
+        model_hash: str,
+        packed_model: bytes,
+        bodies: tuple[BodyInfo, ...],
+        root: str = "",
+        scene_hash: str = "",
+    ) -> None:
+        assert packed_model
+        assert bodies
+        self.scenes.append((len(self.rows), model_hash))
+        self.drawn.append((root, scene_hash))
+
+    def patch(self, root: str, scene_hash: str) -> None:
+        self.drawn.append((root, scene_hash))
+
+    def row(self, row: JournalRow) -> None:
+        self.rows.append(row)
+
+    def flush(self) -> None:
+        self.flushed = len(self.rows)
+
+    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+        assert chain == (self.rows[-1].chain if self.rows else b"root")
+        self.keyframes.append(keyframe)
+
+    def state(
+        self,
+        step: int,
+        tick: int,
+        sim_time: float,
+        session_time: int,
+        poses: NDArray[np.float64],
+        applied: Sequence[Applied] = (),
+    ) -> None:
+        self.states += 1
+        self.state_times.append(session_time)
+
+    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+        pass
+
+    def metric(self, name: str, value: float) -> None:
+        self.metrics.append((name, value))
+
+    def take_gap(self) -> int:
+        gap, self.gap = self.gap, 0
+        return gap
+
+
+class Rig:
+    """A stepper whose clock the test moves."""
+
+    def __init__(self, state_ms: float = 16.0, keyframe_ms: float = 100.0) -> None:
+        self.now_ns = 0
+        self.front, self.recorder = Front(), Recorder()
+        self.stepper = Stepper(
+            make_core(),
+            self.front,
+            self.recorder,
+            lambda: self.now_ns,
+            round(state_ms * MS),
+            round(keyframe_ms * MS),
+            b"root",
+        )
+
+    def steps(self, n: int, distance_ns: int = TICK_NS) -> None:
+        for _ in range(n):
+            self.now_ns += distance_ns
+            self.front.waiting = entries(self.stepper.step_count)
+            self.stepper.step(1)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_every_step_is_a_row_of_one_chain(rig: Rig) -> None:
+    rig.steps(120)
+    chain = b"root"
+    for i, row in enumerate(rig.recorder.rows):
+        assert row.step == i
+        assert check_row(chain, row) is None
+        chain = row.chain
+    assert len(rig.recorder.rows) == 120
+
+
+def test_the_input_that_crashes_a_step_is_recorded(rig: Rig) -> None:
+    rig.steps(3)
+    rig.stepper.post(Marker(0, "the last words"))
+    step = rig.stepper.core.controller.begin
+    rig.stepper.core.controller.begin = lambda *_: {}["key"]  # type: ignore[method-assign,assignment]
+    with pytest.raises(KeyError):
+        rig.steps(1)
+    row = rig.recorder.rows[-1]
+    assert (row.step, row.digest, rig.recorder.flushed) == (3, CRASHED, 4)
+    assert check_row(rig.recorder.rows[-2].chain, row) is None
+    assert [e.message for e in decode_entries(row.entries)] == [Marker(0, "the last words")]
+    rig.stepper.core.controller.begin = step  # type: ignore[method-assign]
+    with pytest.raises(KeyError):
+        rig.steps(1)
+    assert rig.recorder.rows[-1] is row, "no row follows, whatever thread would take the next step"
+
+
+def test_a_step_that_an_interrupt_broke_off_is_the_last(rig: Rig) -> None:
+    """Ctrl-C in a script's own loop: a helper thread would go on from half a step, which no journal has."""
+    rig.steps(3)
+
+    def interrupted(step: int, decision: Decision) -> None:
+        raise KeyboardInterrupt
+
+    rig.front.send_decision = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        rig.steps(1)
+    del rig.front.send_decision
+    depths = set()
+    for _ in range(3):
+        with pytest.raises(OwnershipError, match="broken off by an interrupt") as caught:
+            rig.steps(1)
+        depths.add(len(caught.traceback))
+    assert len(depths) == 1, "who tries again and again does not fill the memory"
+    assert len(rig.recorder.rows) == 3
+
+
+def test_keyframes_at_the_start_and_at_their_distance(rig: Rig) -> None:
+    rig.steps(120)  # 240 ms
+    assert [k.step for k in rig.recorder.keyframes] == [-1, 50, 100]
+    core = make_core()
+    assert rig.recorder.keyframes[0].plant == core.snapshot().plant
+
+
+def test_a_keyframe_when_the_recorder_asks(rig: Rig) -> None:
+    rig.steps(3)
+    rig.recorder.wants_keyframe = True
+    rig.steps(1)
+    assert [k.step for k in rig.recorder.keyframes] == [-1, 3]
+
+
+def test_session_time_grows_even_when_the_clock_stands(rig: Rig) -> None:
+    rig.steps(5, distance_ns=0)
+    times = [row.now_ns for row in rig.recorder.rows]
+    assert all(b > a for a, b in pairwise(times))
+
+
+def test_state_keeps_its_rate_and_a_gap_makes_no_burst(rig: Rig) -> None:
+    rig.steps(400)  # 0.8 s
+    assert len(rig.front.states) == pytest.approx(0.8 / 0.016, abs=1)
+    assert rig.recorder.states == len(rig.front.states)
+    before = len(rig.front.states)
+    rig.now_ns += 3_000 * MS
+    rig.steps(8)  # 16 ms
+    assert len(rig.front.states) - before <= 2
+
+
+def test_a_long_time_between_steps_is_one_gap_and_no_entry_of_ours(rig: Rig) -> None:
+    rig.steps(60)
+    rig.now_ns += 400 * MS
+    rig.steps(1)
+    gaps = [e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]
+    assert len(gaps) == 1
+    assert gaps[0].session_time == rig.now_ns
+    assert not decode_entries(rig.recorder.rows[-1].entries)
+    rig.steps(10)
+    assert len([e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]) == 1
+
+
+def test_plain_overload_is_no_gap(rig: Rig) -> None:
+    """Steps that take 20 times as long as they should: slow, but robots go on."""
+    rig.steps(100, distance_ns=40 * MS)
+    assert not [e for d in rig.front.decisions for e in d.events if isinstance(e.body, Gap)]
+
+
+def test_rows_that_the_recorder_lost_are_told_in_the_next_step(rig: Rig) -> None:
+    rig.steps(2)
+    rig.recorder.gap = 17
+    rig.steps(2)
+    (entry,) = decode_entries(rig.recorder.rows[-1].entries)
+    assert entry.message == RecordingGap(17)
+
+
+def test_host_entries_are_bounded(rig: Rig) -> None:
+    for i in range(MAX_HOST_ENTRIES):
+        rig.stepper.post(Marker(0, f"m{i}"))
+    with pytest.raises(OwnershipError, match="is the loop running"):
+        rig.stepper.post(Marker(0, "one more"))
+    rig.stepper.say(ExternalReset())  # a reset that a script's loop has seen, whatever else that script says
+    for _ in range(ROOM_FOR_OURS - 1):
+        rig.stepper.post(EStop("somebody shouts"))
+    with pytest.raises(RuntimeError, match="is the loop running"):
+        rig.stepper.post(EStop("one more"))
+    rig.steps(1)
+    assert rig.stepper.last is not None
+    assert rig.stepper.last.decision.estop
+    rig.stepper.post(Marker(0, "there is room again"))
+
+
+def test_long_texts_of_the_owner_are_cut_and_other_excess_is_refused(rig: Rig) -> None:
+    """Front and recorder check every limit of the protocol: what breaks one must not reach them."""
+    rig.stepper.post(Marker(0, "m" * 3000))
+    rig.stepper.post(EStop("r" * 3000))
+    with pytest.raises(ValueError, match="Assign cannot be used"):
+        rig.stepper.post(Assign(0, ("r" * 65,)))
+    rig.steps(1)
+    assert [e.message for e in decode_entries(rig.recorder.rows[-1].entries) if e.connection == HOST] == [
+        Marker(0, "m" * 509 + "..."),
+        EStop("r" * 509 + "..."),
+    ]
+    for decision in rig.front.decisions:
+        encoded = link_messages.encoder.encode(link_messages.Decided(1, events=decision.events))
+        link_messages.decode_decided(encoded)
+
+
+def test_physics_that_diverges_pauses_the_session_and_is_told_once(rig: Rig) -> None:
+    rig.steps(5)
+    rig.stepper.core.world.data.qvel[0] = math.nan
+    rig.steps(5)
+    messages = [e.message for row in rig.recorder.rows for e in decode_entries(row.entries) if e.connection == 0]
+    assert messages[0] == Control(0, "pause")
+    assert isinstance(messages[1], Marker)
+    assert "NaN" in messages[1].text
+    assert len(messages) == 2
+    assert rig.stepper.paused
+    rig.stepper.post(Control(0, "reset"))
+    rig.stepper.post(Control(0, "resume"))
+    rig.steps(2)
+    assert not rig.stepper.paused
+    assert rig.stepper.last is not None
+    assert rig.stepper.last.diverged == ""
+
+
+def test_the_worst_lateness_between_two_states_is_recorded_once() -> None:
+    rig = Rig()
+    rig.stepper.lateness_ns = 3 * MS
+    rig.stepper.step(1)
+    rig.now_ns += 17 * MS
+    rig.stepper.step(1)
+    assert rig.recorder.metrics == [("lateness_ms", 3.0), ("lateness_ms", 0.0)]

@@ -1,0 +1,147 @@
+"""When a process that died is started again, and that the tick loop waits for nothing of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from itertools import pairwise
+
+from iris_session.recording import RecordingError
+from iris_session.session.supervision import (
+    HANGING_NS,
+    HEALTHY_NS,
+    RESTART_BACKOFF_NS,
+    Backoff,
+    RecorderSupervisor,
+)
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+
+
+def _restarts(backoff: Backoff, start_ns: int, until_ns: int) -> list[int]:
+    """Times at which a process that dies at once is started again."""
+    return [now for now in range(start_ns, until_ns, 50 * MS) if backoff.dead(now)]
+
+
+def test_the_first_restart_is_at_once_and_later_ones_wait_longer() -> None:
+    backoff = Backoff()
+    times = _restarts(backoff, 60_000 * MS, 90_000 * MS)
+    waits = [b - a for a, b in pairwise(times)]
+    assert times[0] == 60_000 * MS
+    for wait, least in zip(waits, (*RESTART_BACKOFF_NS[1:], *[RESTART_BACKOFF_NS[-1]] * 10), strict=False):
+        assert least <= wait <= least + 100 * MS
+    assert backoff.restarts == len(times)
+
+
+def test_a_process_that_lived_long_is_started_at_once_again() -> None:
+    backoff = Backoff()
+    now_ns = 60_000 * MS
+    for _ in range(3):
+        while not backoff.dead(now_ns):
+            now_ns += 50 * MS
+    assert backoff.failures == 3
+    assert backoff.dead(now_ns + HEALTHY_NS + 50 * MS)
+    assert backoff.failures == 1
+
+
+class Recorder:
+    """A recorder whose disk answers only when `disk` is set."""
+
+    def __init__(self) -> None:
+        self.alive = True
+        self.disk = threading.Event()
+        self.refused = False
+        self.readers: list[threading.Thread] = []
+        self.closed = threading.Event()
+
+    @property
+    def failure(self) -> str:
+        self.readers.append(threading.current_thread())
+        assert self.disk.wait(30.0)
+        return "the recorder ended (exit status 1): no space left"
+
+    def restart(self) -> None:
+        if self.refused:
+            raise RecordingError("no room for its log")
+        self.alive = True
+
+    def close(self, timeout_s: float) -> bool:
+        self.alive = False
+        self.closed.set()
+        return True
+
+
+def _until(look: Callable[[], list[str]]) -> list[str]:
+    """What is told first."""
+    until = time.monotonic() + 30.0
+    while time.monotonic() < until:
+        if told := look():
+            return told
+        time.sleep(0.001)
+    raise AssertionError("nothing was told")
+
+
+def test_a_dead_recorder_is_replaced_while_the_loop_goes_on() -> None:
+    recorder = Recorder()
+    supervisor = RecorderSupervisor(recorder)
+    assert supervisor.look(SECOND, 0) == []
+    recorder.alive = False
+    for i in range(100):  # its log cannot be read now: no look waits
+        assert supervisor.look(2 * SECOND + i * 50 * MS, 0) == []
+    assert not supervisor.alive
+    assert supervisor.restarts == 1
+    recorder.disk.set()
+    (told,) = _until(lambda: supervisor.look(8 * SECOND, 0))
+    assert told == "the recorder ended (exit status 1): no space left; it was replaced"
+    assert threading.main_thread() not in recorder.readers
+    assert supervisor.alive
+    assert "no space left" in supervisor.failure
+    assert supervisor.look(8 * SECOND + HANGING_NS + MS, 0) == []
+    assert supervisor.failure == ""  # its successor writes
+
+
+def test_a_recorder_that_cannot_be_started_is_tried_again_and_its_end_stays_told() -> None:
+    recorder = Recorder()
+    recorder.disk.set()
+    recorder.alive, recorder.refused = False, True
+    supervisor = RecorderSupervisor(recorder)
+    (told,) = _until(lambda: supervisor.look(SECOND, 0))
+    assert told.endswith("it is not replaced: no room for its log")
+    assert supervisor.look(SECOND + 100 * MS, 0) == []
+    (told,) = _until(lambda: supervisor.look(SECOND + 3 * HANGING_NS, 0))
+    assert "not replaced" in told
+    assert supervisor.failure
+    assert not supervisor.alive
+    recorder.refused = False
+    (told,) = _until(lambda: supervisor.look(SECOND + 9 * HANGING_NS, 0))
+    assert told.endswith("it was replaced")
+
+
+def test_a_recorder_that_hangs_is_told_once_and_the_end_waits_for_the_thread() -> None:
+    recorder = Recorder()
+    supervisor = RecorderSupervisor(recorder)
+    (told,) = supervisor.look(SECOND, HANGING_NS + 1)
+    assert "hangs" in told
+    assert supervisor.hangs
+    assert supervisor.look(2 * SECOND, HANGING_NS + 1) == []
+    recorder.alive = False
+    supervisor.look(3 * SECOND, 0)
+    assert not supervisor.hangs
+    recorder.disk.set()
+    supervisor.close()
+    assert recorder.alive
+    assert not recorder.closed.is_set(), "it writes what is left"
+
+
+def test_the_end_does_not_wait_for_a_disk_that_hangs() -> None:
+    recorder = Recorder()
+    supervisor = RecorderSupervisor(recorder)
+    recorder.alive = False
+    supervisor.look(SECOND, 0)
+    supervisor.close(0.05)
+    assert not recorder.alive, "and its disk has not answered yet"
+    recorder.disk.set()
+    assert recorder.closed.wait(30.0), "nobody would look after the successor that is started now"
+    assert not recorder.alive

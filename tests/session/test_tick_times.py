@@ -1,0 +1,181 @@
+"""Blame for late ticks: a pacing loop with a clock of its own, in which one part after the other takes too long."""
+
+from __future__ import annotations
+
+import pytest
+
+from iris_session.physics import PacerStats
+from iris_session.protocol.names import LateCause
+from iris_session.session.tick_times import CAUSES, SKIPPED, TickTimes, run_delay
+
+MS = 1_000_000
+PERIOD = 2 * MS
+#: How long the parts take when all is well [ns].
+USUAL = {LateCause.AUTHORITY: 100_000, LateCause.CONTROL: 150_000, LateCause.PHYSICS: 600_000, LateCause.OUTPUT: 80_000}
+
+
+class Loop:
+    """The pacing of `Session.run`, with a clock that moves only when something is done, and with time in which the
+    thread was kept from running."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.delayed_ns = 0
+        self.due_ns = PERIOD
+        self.late = 0
+        self.ticks = 0
+        self.times = TickTimes(PERIOD, lambda: self.now_ns, lambda: self.delayed_ns)
+
+    def work(self, ns: int, *, delayed: bool = False) -> None:
+        self.now_ns += ns
+        self.delayed_ns += ns * delayed
+
+    def tick(self, extra: dict[str, int] | None = None, *, delayed: bool = False, overslept_ns: int = 0) -> None:
+        """One turn; `extra` time per part, in which the thread worked or waited, or was kept from running."""
+        extra = extra or {}
+        if self.now_ns < self.due_ns:
+            self.now_ns = self.due_ns + overslept_ns
+            self.times.woke(self.due_ns)
+        for cause in (LateCause.AUTHORITY, LateCause.CONTROL, LateCause.PHYSICS, LateCause.OUTPUT):
+            self.work(USUAL[cause])
+            self.work(extra.get(cause, 0), delayed=delayed)
+            self.times.lap(cause)
+        lateness = self.now_ns - self.due_ns
+        self.times.finished(lateness)
+        self.ticks += 1
+        self.late += lateness > PERIOD
+        self.due_ns += PERIOD
+        for cause in (LateCause.SUPERVISION, LateCause.OWNER):
+            self.work(extra.get(cause, 0), delayed=delayed)
+            self.times.lap(cause)
+
+    def mark(self, missing: int = 0) -> None:
+        none = PacerStats._make([0] * len(PacerStats._fields))
+        ticks = self.ticks + missing
+        self.times.mark(none._replace(ticks=ticks, finished=self.ticks, late=self.late, missing=missing))
+
+
+@pytest.fixture
+def loop() -> Loop:
+    loop = Loop()
+    for _ in range(2000):
+        loop.tick()
+    loop.mark()
+    return loop
+
+
+@pytest.mark.parametrize("cause", [c for c in CAUSES if c not in (LateCause.SCHEDULER, LateCause.OWNER)])
+def test_the_part_that_took_too_long_is_blamed(loop: Loop, cause: str) -> None:
+    loop.tick({cause: 7 * MS})
+    for _ in range(50):
+        loop.tick()
+    loop.mark()
+    assert loop.late > 2, "a pause of 7 ms makes several ticks late: those are caught up one after the other"
+    assert loop.times.late_causes() == {cause: loop.late}
+
+
+def test_what_the_owner_does_between_ticks_is_theirs(loop: Loop) -> None:
+    loop.tick({LateCause.OWNER: 9 * MS})
+    for _ in range(50):
+        loop.tick()
+    loop.mark()
+    assert set(loop.times.late_causes()) == {LateCause.OWNER}
+
+
+def test_oversleeping_is_the_schedulers(loop: Loop) -> None:
+    loop.tick(overslept_ns=6 * MS)
+    for _ in range(50):
+        loop.tick()
+    loop.mark()
+    assert set(loop.times.late_causes()) == {LateCause.SCHEDULER}
+
+
+@pytest.mark.parametrize("cause", [c for c in CAUSES if c != LateCause.SCHEDULER])
+def test_a_part_that_was_interrupted_is_not_to_blame(loop: Loop, cause: str) -> None:
+    loop.tick({cause: 7 * MS}, delayed=True)
+    for _ in range(50):
+        loop.tick()
+    loop.mark()
+    assert set(loop.times.late_causes()) == {LateCause.SCHEDULER}
+
+
+def test_the_larger_share_decides(loop: Loop) -> None:
+    loop.tick({LateCause.PHYSICS: 4 * MS}, delayed=True)
+    loop.tick({LateCause.OUTPUT: 9 * MS})
+    for _ in range(50):
+        loop.tick()
+    loop.mark()
+    causes = loop.times.late_causes()
+    assert causes[LateCause.OUTPUT] > causes[LateCause.SCHEDULER] > 0
+
+
+def test_physics_that_never_fits_is_blamed_throughout() -> None:
+    loop = Loop()
+    loop.mark()
+    for _ in range(200):
+        loop.tick({LateCause.PHYSICS: 2 * MS})
+    loop.mark()
+    assert loop.times.late_causes() == {LateCause.PHYSICS: loop.late}
+    assert loop.times.late_share() == pytest.approx(loop.late / 200)
+
+
+def test_ticks_that_were_given_up_have_the_cause_of_their_chain(loop: Loop) -> None:
+    for _ in range(300):
+        loop.tick({LateCause.CONTROL: 5 * MS})
+    loop.times.gave_up(500)
+    loop.mark(missing=500)
+    assert loop.times.late_causes() == {LateCause.CONTROL: loop.late + 500}
+
+
+def test_a_process_that_stood_still_is_told_apart(loop: Loop) -> None:
+    loop.tick(overslept_ns=3_000 * MS)
+    loop.times.gave_up(1400)
+    loop.mark(missing=1400)
+    assert loop.times.late_causes() == {LateCause.SCHEDULER: 1, SKIPPED: 1400}
+
+
+def test_the_system_counts_how_long_we_did_not_run() -> None:
+    delayed = run_delay()
+    before = delayed()
+    assert delayed() >= before >= 0
+
+
+def test_shares_are_of_the_last_ten_marks() -> None:
+    loop = Loop()
+    loop.mark()
+    loop.tick({LateCause.PHYSICS: 7 * MS})
+    for _ in range(10):
+        loop.tick()
+    loop.mark()
+    assert loop.times.late_share() > 0.0
+    for _ in range(10):
+        loop.tick()
+        loop.mark()
+    assert loop.times.late_share() == 0.0
+    assert loop.times.late_causes() == {}
+
+
+def test_lateness_is_of_the_newest_ticks(loop: Loop) -> None:
+    usual_ms = sum(USUAL.values()) * 1e-6
+    lateness = loop.times.lateness()
+    assert lateness is not None
+    assert lateness.p50 == pytest.approx(usual_ms)
+    for _ in range(5000):
+        loop.tick({LateCause.CONTROL: 500_000})
+    lateness = loop.times.lateness()
+    assert lateness is not None
+    assert lateness.p50 == pytest.approx(usual_ms + 0.5)
+
+
+def test_nothing_is_known_at_first() -> None:
+    times = Loop().times
+    assert (times.lateness(), times.late_share(), times.late_causes()) == (None, 0.0, {})
+
+
+def test_a_pause_blames_nobody(loop: Loop) -> None:
+    loop.now_ns += 5_000 * MS
+    loop.times.idle()
+    loop.due_ns = loop.now_ns + PERIOD
+    loop.tick()
+    loop.mark()
+    assert loop.times.late_causes() == {}
