@@ -17,8 +17,8 @@ from iris_session.protocol.assets import (
     MAX_ASSET_WINDOW_BYTES,
     AssetRequest,
 )
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.names import AssetRefusal
-from iris_session.protocol.token_bucket import TokenBucket
 
 #: Requests of one reader: 1000 chunks of half a MiB are more than a gigabit link carries in a second.
 REQUESTS_PER_S: Final = 1000.0

@@ -25,9 +25,9 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind
 from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
 
 #: A gripper closed further than this counts as pressed: crossing it is an edge.
 GRIPPER_EDGE = 0.5

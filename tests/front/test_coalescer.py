@@ -31,8 +31,8 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
 
 SAMPLE = Sample("controller/right", "pose", 1, 0, 1, 0, 1, pose=IDENTITY, targets=(Target("left", 1),))
 
