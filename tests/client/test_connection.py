@@ -340,7 +340,11 @@ def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> N
     assert 4 <= asked <= 7
     wire.snapshot(now, event_seq=2)
     assert wire.connection.mirror.event_seq == 3
-    told = [e if isinstance(e, MissedEvents) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | MissedEvents)]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
     assert told == [1, MissedEvents(2, 2), 3]
 
 
@@ -353,7 +357,11 @@ def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> 
     wire.snapshot(3 * MS, event_seq=7)
     wire.get(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
     assert wire.connection.mirror.gaps == 0
-    told = [e if isinstance(e, MissedEvents) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | MissedEvents)]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
     assert told == [1, MissedEvents(2, 7), 8]
 
 
@@ -374,7 +382,11 @@ def test_events_held_while_a_snapshot_came_are_handed_out_and_not_told_as_missed
     for seq in (1, 3, 5, 6):
         wire.get(Event(seq, 0, 0, Notice("info", "x")), MS)
     wire.snapshot(2 * MS, event_seq=5)
-    told = [e if isinstance(e, MissedEvents) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | MissedEvents)]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
     assert told == [1, MissedEvents(2, 2), 3, MissedEvents(4, 4), 5, 6]
 
 

@@ -142,9 +142,9 @@ def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fa
         truth.apply_event(one)
         for _ in range({"come": 1, "twice": 2, "lost": 0}[fate]):
             come(one)
-    seqs = [
-        seq for one in told for seq in (range(one.first, one.last + 1) if isinstance(one, MissedEvents) else (one.event_seq,))
-    ]
+    seqs: list[int] = []
+    for one in told:
+        seqs += range(one.first, one.last + 1) if isinstance(one, MissedEvents) else (one.event_seq,)
     assert seqs == list(range(before + 1, truth.event_seq + 1))
     lost = {seq for one in told if isinstance(one, MissedEvents) for seq in range(one.first, one.last + 1)}
     numbers = [i for i, fate in enumerate([f for f in fates if f != "snapshot"], before + 1) if fate == "lost"]
