@@ -48,8 +48,8 @@ from iris_session.protocol.client_messages import (
     envelope,
 )
 from iris_session.protocol.codec import encode_client
-from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
+    Paired,
     ProtocolFault,
     Refused,
     Welcome,

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.protocol.names import ArrayName
 from iris_session.protocol.scene import Deformable
-from iris_session.protocol.scene_names import ArrayName
 from iris_session.scene.arrays import require
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES
 

@@ -22,9 +22,8 @@ from iris_session.client.deformable_mesh import DeformableMesh, read_mesh
 from iris_session.client.errors import ClientError
 from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.protocol.scene_names import ArrayKind, ArrayName
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.errors import AssetError
 from iris_session.streams.deformable import DeformableDecoder

@@ -21,12 +21,12 @@ from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
     ClockPong,
     EStopChanged,
     Event,
     Feedback,
+    Paired,
     ParticipantLeft,
     ProtocolFault,
     Refused,

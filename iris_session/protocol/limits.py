@@ -31,8 +31,10 @@ from iris_session.protocol.client_messages import (
     Marker,
     MoveAnchor,
     Observation,
+    Pair,
     PlaceAlignment,
     Release,
+    RemoveParticipant,
     Sample,
     Samples,
     SetMode,
@@ -40,11 +42,11 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import Message
-from iris_session.protocol.security import Pair, Paired, RemoveParticipant
 from iris_session.protocol.server_messages import (
     ClockPong,
     Event,
     Feedback,
+    Paired,
     ProtocolFault,
     Refused,
     Reply,

@@ -1,4 +1,4 @@
-"""Arrays to bytes and back: the container of `protocol.arrays`, filters and Zstandard. Layout in docs/scene.md.
+"""Arrays to bytes and back: the container of `protocol.assets`, filters and Zstandard. Layout in docs/scene.md.
 
 Decoding is safe for bytes of anybody: it raises `AssetError` and nothing else, and allocates no more than the header
 says, which is checked against a limit first.
@@ -18,9 +18,9 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAGIC, MAX_ARRAY_BYTES, MAX_HEADER_BYTES, ArrayHeader, ArrayInfo
-from iris_session.protocol.decoding import decoder
-from iris_session.protocol.scene_names import ArrayCodec, ArrayFilter
+from iris_session.protocol.assets import ARRAYS_MAGIC, MAX_ARRAY_BYTES, MAX_ARRAY_HEADER_BYTES, ArrayHeader, ArrayInfo
+from iris_session.protocol.codec import decoder
+from iris_session.protocol.names import ArrayCodec, ArrayFilter
 from iris_session.scene.errors import AssetError
 
 Array = NDArray[Any]
@@ -63,7 +63,7 @@ def encode_arrays(kind: str, arrays: Sequence[Stored], max_error: float = 0.0) -
         )
         bodies.append(packed)
     header = _encoder.encode(ArrayHeader(kind, tuple(infos), max_error))
-    return b"".join((_PREFIX.pack(MAGIC, len(header)), header, *bodies))
+    return b"".join((_PREFIX.pack(ARRAYS_MAGIC, len(header)), header, *bodies))
 
 
 def decode_arrays(
@@ -88,11 +88,11 @@ def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]
     if len(data) < _PREFIX.size:
         raise AssetError(f"{len(data)} bytes are no asset of arrays")
     magic, length = _PREFIX.unpack_from(data)
-    if magic != MAGIC:
-        raise AssetError(f"no asset of arrays: it begins with {bytes(magic)!r}, not {MAGIC!r}")
+    if magic != ARRAYS_MAGIC:
+        raise AssetError(f"no asset of arrays: it begins with {bytes(magic)!r}, not {ARRAYS_MAGIC!r}")
     start = _PREFIX.size + length
-    if length > MAX_HEADER_BYTES or start > len(data):
-        raise AssetError(f"a header of {length} bytes in an asset of {len(data)}, at most {MAX_HEADER_BYTES}")
+    if length > MAX_ARRAY_HEADER_BYTES or start > len(data):
+        raise AssetError(f"a header of {length} bytes in an asset of {len(data)}, at most {MAX_ARRAY_HEADER_BYTES}")
     try:
         header = _decode_header(memoryview(data)[_PREFIX.size : start])
     except msgspec.DecodeError as error:

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.scene import Geometry, SceneSpec
-from iris_session.protocol.scene_looks import Texture
-from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.names import AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.scene import Geometry, SceneSpec, Texture
 from iris_session.scene.errors import AssetError
 from iris_session.scene.images import Pixels, decode_image, halved
 from iris_session.scene.meshes import MeshArrays, index_corners

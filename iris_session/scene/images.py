@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
+from iris_session.protocol.assets import MAX_ARRAY_BYTES
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, filtered, require
 from iris_session.scene.errors import AssetError
 

@@ -12,9 +12,8 @@ import pytest
 
 from iris_session.client import AssetCache, Client
 from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, keys
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
-from iris_session.protocol.scene_names import ArrayKind
 from iris_session.scene import AssetError, AssetStore
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco

@@ -16,6 +16,7 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Marker,
     Release,
+    RemoveParticipant,
     Sample,
     TrackingEpoch,
 )
@@ -32,7 +33,6 @@ from iris_session.protocol.entries import (
     Lost,
 )
 from iris_session.protocol.limits import Drops
-from iris_session.protocol.security import RemoveParticipant
 
 SAMPLE = Sample("controller/right", "pose", 1, 0, 1, 0, 1, pose=IDENTITY, targets=(Target("left", 1),))
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAGIC, ArrayHeader, ArrayInfo
+from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
 from iris_session.scene import AssetError, decode_arrays, encode_arrays
 from iris_session.scene.arrays import Stored
 
@@ -21,7 +21,7 @@ FILTERS = ("none", "shuffle", "delta", "up")
 
 def asset(*infos: ArrayInfo, body: bytes = b"", kind: str = "mesh") -> bytes:
     header = msgspec.msgpack.encode(ArrayHeader(kind, infos))
-    return MAGIC + len(header).to_bytes(4, "little") + header + body
+    return ARRAYS_MAGIC + len(header).to_bytes(4, "little") + header + body
 
 
 @given(
@@ -50,7 +50,7 @@ def test_smooth_content_shrinks_and_noise_costs_no_more_than_itself() -> None:
 
 @given(st.binary(max_size=200))
 def test_bytes_of_anybody(data: bytes) -> None:
-    for candidate in (data, MAGIC + data, MAGIC + len(data).to_bytes(4, "little") + data):
+    for candidate in (data, ARRAYS_MAGIC + data, ARRAYS_MAGIC + len(data).to_bytes(4, "little") + data):
         with pytest.raises(AssetError):
             decode_arrays(candidate, "mesh")
 
