@@ -43,7 +43,7 @@ class DeformableMesh:
 
 
 def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: int) -> DeformableMesh:
-    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetError` or `ValueError`."""
+    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetDecodeError` or `ValueError`."""
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:
