@@ -1,7 +1,7 @@
-"""Arrays to bytes and back: the container of `protocol.assets`, filters and Zstandard. Layout in docs/scene.md.
+"""Encode arrays to bytes and back: the container of `protocol.arrays`, filters and Zstandard. Layout in docs/scene.md.
 
-Decoding is safe for bytes of anybody: it raises `AssetDecodeError` and nothing else, and allocates no more than the header
-says, which is checked against a limit first.
+Decoding is safe for untrusted bytes: it raises `AssetDecodeError` and nothing else, and allocates no more than the
+header states, which is checked against a limit first.
 """
 
 from __future__ import annotations

@@ -52,7 +52,11 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
 
 
 def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes: int = MAX_ARRAY_BYTES) -> Pixels:
-    """Pixels (height, width, channels). Raises `AssetDecodeError` for other bytes, or when they would exceed `max_bytes`."""
+    """Return pixels (height, width, channels).
+
+    Raises:
+        AssetDecodeError: The bytes are no such image, or its pixels would exceed `max_bytes`.
+    """
     if encoding == AssetEncoding.ARRAYS:
         arrays = decode_arrays(data, ArrayKind.IMAGE, max_bytes)
         return require(arrays, ArrayName.PIXELS, "u1", (None, None, None))
