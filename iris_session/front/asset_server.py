@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, AssetHub, Reader
-from iris_session.assets.mapped_files import AssetFiles
+from iris_session.assets.store import ServedAssets
 from iris_session.front.media.connection_guard import MediaDoors
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
@@ -101,7 +101,7 @@ class AssetServer:
         self._doors = doors
         self._now_ns = now_ns
         self._encrypted = sockets.zap is not None
-        self._files = AssetFiles()
+        self._files = ServedAssets()
         self._hub = AssetHub(self._files.size)
         self._table = self._taken = Table()
         self._counts = {"bytes": 0, "chunks": 0, "requests": 0}
