@@ -24,8 +24,8 @@ from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, TrafficCounter
 from iris_session.link.config import MEBIBYTE, MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp, next_tcp_event, peer_of, readable, tcp_counts
+from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind
-from iris_session.protocol.token_bucket import Drops, TokenBucket
 
 CHECK_PERIOD_NS: Final = 250 * MILLISECOND
 #: A peer that was disconnected for a flood may say hello again after this.

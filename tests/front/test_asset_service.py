@@ -17,7 +17,7 @@ from iris_session.front.connections import ConnectionTable, FrontConnection, Pee
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.client_messages import Hello
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import AllowedKey, KeyPair
 from iris_session.security.keyring import Keyring
 
@@ -33,10 +33,10 @@ class Told:
 
     def start(self) -> None: ...
 
-    def publish(self, table: AssetAccess) -> None:
-        self.table = table
+    def set_access(self, access: AssetAccess) -> None:
+        self.table = access
 
-    def tallied(self) -> AssetCounters:
+    def read_counters(self) -> AssetCounters:
         return AssetCounters(0, 0, 0, 0, {})
 
     @property

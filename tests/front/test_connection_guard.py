@@ -35,7 +35,7 @@ from iris_session.link.config import SECOND, FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port, close_tcp, open_state, peer_of, tcp_counts, watch_tcp
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Audit, Entry
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 LIMITS = FrontLimits(strangers=3, hello_timeout_ns=10 * SECOND)
 
