@@ -28,8 +28,15 @@ if TYPE_CHECKING:
     from iris_session.physics import load_model, load_robots_toml
     from iris_session.protocol.common import Pose
     from iris_session.protocol.names import HoldReason
-    from iris_session.protocol.scene import Geometry, Visual
-    from iris_session.protocol.scene_patch import AddMaterial, AddMesh, AddVisual, RemoveVisual, SetVisual
+    from iris_session.protocol.scene import (
+        AddMaterial,
+        AddMesh,
+        AddVisual,
+        Geometry,
+        RemoveVisual,
+        SetVisual,
+        Visual,
+    )
     from iris_session.protocol.server_messages import ParticipantJoined
     from iris_session.protocol.specs import ObjectSpec, RobotSpec
     from iris_session.recording import Recording, RecordingError
@@ -77,8 +84,15 @@ _PUBLIC: Final = {
     "iris_session.assets.store": ("AssetStore",),
     "iris_session.assets.cache": ("AssetCache",),
     "iris_session.protocol.common": ("Pose",),
-    "iris_session.protocol.scene": ("Geometry", "Visual"),
-    "iris_session.protocol.scene_patch": ("SetVisual", "AddVisual", "RemoveVisual", "AddMesh", "AddMaterial"),
+    "iris_session.protocol.scene": (
+        "Geometry",
+        "Visual",
+        "SetVisual",
+        "AddVisual",
+        "RemoveVisual",
+        "AddMesh",
+        "AddMaterial",
+    ),
     "iris_session.protocol.names": ("HoldReason",),
     "iris_session.protocol.server_messages": ("ParticipantJoined",),
     "iris_session.client": ("Client", "ClientError", "DeniedError", "CurveKeys", "FoundSession", "find_sessions"),
