@@ -17,7 +17,7 @@ import subprocess
 import sys
 from typing import Any, Final
 
-from iris_session.bench import contract
+from iris_session.bench import report as contract
 
 PROFILES: Final = ("", "lan", "good-wifi", "busy-wifi", "wan", "blackout")
 #: Label, arguments of `iris-session bench`, and what of the results goes into the table: key, label.

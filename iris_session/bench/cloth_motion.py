@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 
 HZ: Final = 60
 SECONDS: Final = 6

@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 import zstandard
 
-from iris_session.bench.arena import Log, Measured, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.cloth_motion import HZ, ClothMotion, cloth_motion
-from iris_session.bench.contract import NO_BARS, BenchError, BenchReport, bar
 from iris_session.bench.deformable_clients import DeformableJob
+from iris_session.bench.harness import Log, Measured, grouped, linked, measure
+from iris_session.bench.report import NO_BARS, BenchError, BenchReport, bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session

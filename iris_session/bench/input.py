@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from iris_session.bench.arena import Measured, grouped, linked, measure
-from iris_session.bench.bare import bare
+from iris_session.bench.baseline import bare
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import NO_BARS, BenchReport, bar
+from iris_session.bench.harness import Measured, grouped, linked, measure
+from iris_session.bench.report import NO_BARS, BenchReport, bar
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device

@@ -19,11 +19,11 @@ import numpy as np
 import zmq
 
 from iris_session.assets.store import AssetStore
-from iris_session.bench.arena import Log, grouped, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import BenchError, BenchReport, bar
+from iris_session.bench.harness import Log, grouped, measure
 from iris_session.bench.join_clients import Copied, Joined, JoinJob
 from iris_session.bench.join_scene import Ready, join_model
+from iris_session.bench.report import BenchError, BenchReport, bar
 from iris_session.session.session import Session
 from iris_session.system import children
 

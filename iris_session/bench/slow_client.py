@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.arena import CLIENTS_PER_PROCESS, Action, Arena, Log, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import NO_BARS, BenchReport, bar
+from iris_session.bench.harness import CLIENTS_PER_PROCESS, Action, Arena, Log, grouped, linked, measure
+from iris_session.bench.report import NO_BARS, BenchReport, bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.session_link import link_address
 

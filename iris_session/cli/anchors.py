@@ -7,18 +7,35 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.anchors_live import register_live
-from iris_session.cli.anchors_solve import register_solve
-from iris_session.cli.common import CommandError, add_json, open_scene, print_json
-from iris_session.cli.poses import pose
+from iris_session.cli.anchors_offline import register_calibrate, register_solve
+from iris_session.cli.common import (
+    CommandError,
+    add_json,
+    add_pose,
+    add_way_to_session,
+    expect_session,
+    length,
+    open_scene,
+    print_json,
+    printable,
+)
+from iris_session.cli.status import add_watch, asking, watch
+from iris_session.doctor.headset_checks import agrees
+from iris_session.protocol.names import AlignAction, AlignmentKind
 
 if TYPE_CHECKING:
-    from anchors.pose import PoseTuple
+    from iris_session.client import Client
+    from iris_session.protocol.server_messages import ParticipantInfo
+    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
 
-_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+# --- anchors ---
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -40,9 +57,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
-    register_live(actions)
+    _register_status(actions)
+    _register_align(actions)
+    _register_place(actions)
+    _register_move(actions)
     register_solve(actions)
-    _register_calibrate(actions)
+    register_calibrate(actions)
 
 
 def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -76,81 +96,6 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
     )
     add_json(one)
     one.set_defaults(run=run_example)
-
-
-def _register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "calibrate-camera",
-        help="find out where a camera stands",
-        description="T_base_camera from pictures: of a sheet on the robot's hand while the hand moves (--poses), or of "
-        "sheets of known place (--at). Says how well it fits, and refuses what does not determine the result.",
-        epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
-        "  image,x,y,z,qw,qx,qy,qz\n"
-        "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
-        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
-    one.add_argument(
-        "--sheet",
-        type=_named_length,
-        action="append",
-        required=True,
-        metavar="ID=LENGTH",
-        help="a sheet that may be seen and the edge of its code, as printed: table=160mm; repeatable",
-    )
-    one.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
-        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
-    )
-    one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
-    one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the hand carries the camera, the sheet lies still"
-    )
-    one.add_argument(
-        "--in-hand",
-        type=pose,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
-    )
-    one.add_argument(
-        "--at",
-        type=_named_pose,
-        action="append",
-        default=[],
-        metavar="ID=X,Y,Z,QW,QX,QY,QZ",
-        help="the place of a sheet is known, T_base_sheet; repeatable",
-    )
-    one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json(one)
-    one.set_defaults(run=run_calibrate)
-
-
-def length(text: str) -> float:
-    """Type of lengths, with their unit so that nobody prints a sheet of 160 m: metres."""
-    found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
-    if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length: a number with its unit, for example 160mm")
-    return float(found[1]) * _UNITS[found[2]]
-
-
-def _named_length(text: str) -> tuple[str, float]:
-    name, _, rest = text.rpartition("=")
-    return _named(name, text), length(rest)
-
-
-def _named_pose(text: str) -> tuple[str, PoseTuple]:
-    name, _, rest = text.rpartition("=")
-    return _named(name, text), pose(rest)
-
-
-def _named(name: str, text: str) -> str:
-    if not name:
-        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
-    return name
 
 
 def run_print(arguments: argparse.Namespace) -> int:
@@ -204,21 +149,324 @@ def run_example(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def run_calibrate(arguments: argparse.Namespace) -> int:
-    from anchors.robot_world import CalibrationError
-    from iris_session.cli.anchors_calibrate import calibrate, lines_of, to_toml
+# --- anchors_live ---
 
-    try:
-        told = calibrate(arguments)
-    except CalibrationError as error:
-        raise CommandError(str(error), status=1) from error
-    if arguments.out is not None:
-        try:
-            arguments.out.write_text(to_toml(told), encoding="utf-8")
-        except OSError as error:
-            raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
+
+EVERYBODY: Final = "all"
+#: Sheets that are told of per headset, those seen last first.
+MAX_SEEN: Final = 8
+
+
+def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "status",
+        help="how well the headsets of a running session are aligned",
+        description="Joins as an observer, asks, and prints for every headset what its alignment rests on, then the "
+        "anchors, and how far apart pairs of headsets put the same thing.",
+        epilog="examples:\n"
+        "  iris-session anchors status\n"
+        "  iris-session anchors status 192.168.1.20 --watch\n"
+        "  iris-session anchors status --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_way_to_session(one)
+    add_watch(one, one)
+    add_json(one)
+    one.set_defaults(run=run_status)
+
+
+def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "align",
+        help="start or stop measuring the alignment of headsets",
+        description="`start` measures anew, from nothing; `stop` keeps what is in force, whatever is seen from then "
+        "on. Until there is a better one the present alignment stays. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors align start                   everybody with a headset\n"
+        "  iris-session anchors align start ann\n"
+        "  iris-session anchors align stop p3 --address 192.168.1.20",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("what", choices=sorted(AlignAction.ALL))
+    one.add_argument(
+        "participant", nargs="?", default=EVERYBODY, metavar="PARTICIPANT", help="name or id, or `all` (%(default)s)"
+    )
+    add_way_to_session(one, option=True)
+    add_json(one)
+    one.set_defaults(run=run_align)
+
+
+def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "place",
+        help="align a headset by hand",
+        description="Says where the tracking frame of a headset is, T_world_tracking, or with --offset by how much the "
+        "measured one is to be moved, which voids its stated error. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
+        "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
+    add_pose(one, "T_world_tracking, or the offset in the world")
+    one.add_argument("--offset", action="store_true", help="on top of the measured alignment")
+    add_way_to_session(one, option=True)
+    add_json(one)
+    one.set_defaults(run=run_place)
+
+
+def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "move",
+        help="say where an anchor of the session is",
+        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
+        "what is measured. Further than 5 m only with --force. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
+        "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
+    add_pose(one, "T_world_anchor")
+    one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
+    add_way_to_session(one, option=True)
+    add_json(one)
+    one.set_defaults(run=run_move)
+
+
+# --- what a director says ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def directing(arguments: argparse.Namespace) -> Iterator[Client]:
+    """A director in the session that is meant."""
+    from iris_session.client import Client
+
+    expect_session(arguments)
+    with Client(
+        arguments.address,
+        session=arguments.session,
+        join_code=arguments.code,
+        role="director",
+        name="anchors",
+        alignment=AlignmentKind.NOT_NEEDED,
+    ) as client:
+        yield client
+
+
+def run_align(arguments: argparse.Namespace) -> int:
+    """Exit status 1 when it was denied for one of several."""
+    from iris_session.client import DeniedError
+
+    done: list[dict[str, Any]] = []
+    with directing(arguments) as client:
+        people = chosen(client, arguments.participant)
+        for person in people:
+            denied = ""
+            try:
+                client.align(arguments.what, person.id)
+            except DeniedError as error:
+                if len(people) == 1:
+                    raise
+                denied = str(error)
+            done.append({"id": person.id, "name": person.name, "denied": denied})
+    ok = not any(one["denied"] for one in done)
     if arguments.json:
-        print_json(told)
+        print_json({"ok": ok, "action": arguments.what, "participants": done})
+        return 0 if ok else 1
+    word = "started: look at the sheets" if arguments.what == AlignAction.START else "stopped: the alignment stays"
+    for one in done:
+        print(printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
+    return 0 if ok else 1
+
+
+def run_place(arguments: argparse.Namespace) -> int:
+    with directing(arguments) as client:
+        (one,) = chosen(client, arguments.participant, several=False)
+        client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
+    if arguments.json:
+        print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
     else:
-        print("\n".join(lines_of(told)))
+        print(printable(f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"))
     return 0
+
+
+def run_move(arguments: argparse.Namespace) -> int:
+    """Whoever is not measured, or no more, is told of: their alignments stay."""
+    from anchors.pose import distance
+
+    with directing(arguments) as client:
+        report = client.status()
+        was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
+        away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
+        client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
+    aligned = [p for p in headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
+    stay = {p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := stays(p, arguments.anchor))}
+    follow = [p for p in aligned if p.id not in stay]
+    if arguments.json:
+        ids = {"follow": [p.id for p in follow], "stay": list(stay)}
+        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
+        return 0
+    by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
+    print(printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
+    for line in stay.values():
+        print(printable(f"    not that of {line}"))
+    return 0
+
+
+def stays(p: ParticipantReport, anchor: str) -> str:
+    """Why an alignment does not follow an anchor that is moved; empty: it does."""
+    r = p.alignment_report
+    if r is not None and not r.running:
+        return f"its run is stopped; `iris-session anchors align start {p.id}`"
+    if p.alignment == AlignmentKind.PLACED:
+        return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
+    if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
+        return f"it has not looked at '{anchor}' since it came; it follows when it does"
+    return ""
+
+
+def chosen(client: Client, word: str, *, several: bool = True) -> list[ParticipantInfo]:
+    """Who is meant by an id, a name, or `all`. Raises `CommandError` that lists who could be."""
+    people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
+    headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
+    there = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "nobody"
+    found = [one for one in people if one.id == word] or [one for one in people if one.name == word]
+    if not found and word == EVERYBODY and several:
+        found = [one for one in headsets if one.connected]
+        if not found:
+            raise CommandError("nobody in this session has a headset that is aligned", status=1)
+        return found
+    if not found:
+        raise CommandError(printable(f"no participant is called '{word}'; with a headset: {there}"))
+    if len(found) > 1:
+        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', lost'})" for one in found)
+        raise CommandError(printable(f"{len(found)} participants are called '{word}', give an id: {ids}"))
+    return found
+
+
+# --- how it stands ----------------------------------------------------------------------------------------------------
+
+
+def run_status(arguments: argparse.Namespace) -> int:
+    """Prints the alignment of everybody; with --watch until Ctrl-C."""
+    with asking(arguments) as (client, report):
+        if arguments.watch:
+            return watch(client, arguments.period, show, as_json=arguments.json)
+        show(report, as_json=arguments.json)
+    return 0
+
+
+def show(report: StatusReport, *, as_json: bool) -> None:
+    if as_json:
+        print_json(as_dict(report))
+    else:
+        print("\n".join(screen(report)), flush=True)
+
+
+def headsets(report: StatusReport) -> list[ParticipantReport]:
+    """Those who are, or are to be, aligned."""
+    return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
+
+
+def as_dict(report: StatusReport) -> dict[str, Any]:
+    """For `--json`: fields as in `StatusReport`."""
+    import msgspec
+
+    kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
+    people = [
+        {**{name: getattr(p, name) for name in kept}, "alignment_report": msgspec.to_builtins(p.alignment_report)}
+        for p in headsets(report)
+    ]
+    checks = [{**msgspec.to_builtins(one), "as_expected": agrees(one)} for one in report.cross_checks]
+    return {
+        "session": report.session_name,
+        "session_time": report.session_time,
+        "participants": people,
+        "anchors": msgspec.to_builtins(report.anchors),
+        "cross_checks": checks,
+    }
+
+
+def screen(report: StatusReport) -> list[str]:
+    """One screen of printable lines."""
+    return [printable(line) for line in _lines(report)]
+
+
+def _lines(report: StatusReport) -> Iterator[str]:
+    people = headsets(report)
+    still = f"  STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
+    yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
+    yield ""
+    yield (
+        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
+        f"{'looks':>6s} {'places':>6s} {'tilt':>8s}  correction"
+    )
+    for p in people:
+        yield from _headset(p)
+    yield ""
+    for anchor in report.anchors:
+        x, y, z = anchor.T_world_anchor.p
+        q = ",".join(f"{c:.5g}" for c in anchor.T_world_anchor.q)
+        size = f", {anchor.size_m * 1e3:.0f} mm" if anchor.size_m > 0.0 else ""
+        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {q}{size}"
+    if not report.anchors:
+        yield "this session has no anchors"
+    names = {p.id: p.name for p in report.participants}
+    for check in report.cross_checks:
+        yield _pair(check, names)
+
+
+def _headset(p: ParticipantReport) -> Iterator[str]:
+    r = p.alignment_report
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
+    if r is None:
+        yield f"{name:20.20s} {p.alignment:16.16s}"
+        return
+    kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
+    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)
+    stated = aligned and p.alignment == AlignmentKind.MEASURED and not r.offset
+    at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
+    yield (
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {ago(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
+        f"{pending(r)}"
+    )
+    if not aligned and p.alignment_void_ns >= 0:
+        yield f"    void for {ago(p.alignment_void_ns)}: the tracking frame jumped"
+    seen = sorted(r.seen, key=lambda one: one.age_ns)
+    if seen:
+        told = [f"{one.anchor_id} {one.observations} times, {ago(one.age_ns)} ago" for one in seen[:MAX_SEEN]]
+        more = f"; {len(seen) - MAX_SEEN} more" if len(seen) > MAX_SEEN else ""
+        unusable = f"; {r.unusable} of no use" if r.unusable else ""
+        yield f"    saw {'; '.join(told)}{more}{unusable}"
+    elif r.unusable:
+        yield f"    saw nothing of use, {r.unusable} times"
+    if r.alarm:
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {ago(r.alarm_ns)} ago"
+    if r.advice:
+        yield f"    advice: {r.advice}"
+
+
+def pending(r: AlignmentReport) -> str:
+    """A correction that waits or slides in."""
+    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
+        return "-"
+    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
+
+
+def _pair(check: CrossCheckReport, names: dict[str, str]) -> str:
+    a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
+    verdict = "" if agrees(check) else "  TOO FAR APART"
+    return (
+        f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, {ago(check.age_ns)} ago{verdict}"
+    )
+
+
+def ago(duration_ns: int) -> str:
+    """How long ago, as people say it."""
+    seconds = duration_ns * 1e-9
+    if seconds < 0.0:
+        return "never"
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

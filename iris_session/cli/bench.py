@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from iris_session.cli.common import CommandError, add_json, positive_seconds, print_json
 
 if TYPE_CHECKING:
-    from iris_session.bench.contract import BenchReport
+    from iris_session.bench.report import BenchReport
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
 
-    from iris_session.bench.contract import BenchError
+    from iris_session.bench.report import BenchError
 
     if arguments.clients is None:
         arguments.clients = 4 if arguments.bench in ("deformable", "join") else 16

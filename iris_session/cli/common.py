@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import socket
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,7 +17,11 @@ from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 if TYPE_CHECKING:
     import mujoco
 
+    from anchors.pose import PoseTuple
     from iris_session.demo.named_scenes import Scene
+
+
+# --- common ---
 
 
 #: Whatever is there has taken a connection by then.
@@ -212,6 +218,62 @@ def no_robots(model: mujoco.MjModel) -> str:
     )
 
 
+def printable(text: str) -> str:
+    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def print_json(value: dict[str, Any]) -> None:
     """Exactly one JSON object on standard output."""
     print(json.dumps(value, allow_nan=False), flush=True)
+
+
+# --- poses ---
+
+
+_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+FORM: Final = "X,Y,Z,QW,QX,QY,QZ"
+#: Numbers with a comma between them, the first negative: no option looks like that.
+_BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
+
+
+def pose(text: str) -> PoseTuple:
+    """Type of poses: position [m] and unit quaternion, w first."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or abs(math.hypot(*numbers[3:]) - 1.0) > 0.01:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a pose: x,y,z in metres and a unit quaternion qw,qx,qy,qz, for example 0,-0.45,0,1,0,0,0"
+        )
+    x, y, z, *q = numbers
+    norm = math.hypot(*q)
+    return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def joined(words: Sequence[str]) -> list[str]:
+    """Words of a command line, where a pose that begins with a minus is joined to its option: alone it would be read as
+    an option itself."""
+    out: list[str] = []
+    for word in words:
+        if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def add_pose(parser: argparse.ArgumentParser, what: str) -> None:
+    """`--pose`, which must be given."""
+    parser.add_argument(
+        "--pose", type=pose, required=True, metavar=FORM, help=f"{what}: metres, unit quaternion with w first"
+    )
+
+
+def length(text: str) -> float:
+    """Type of lengths, with their unit so that nobody prints a sheet of 160 m: metres."""
+    found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length: a number with its unit, for example 160mm")
+    return float(found[1]) * _UNITS[found[2]]

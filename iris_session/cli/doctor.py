@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_json, add_way_to_session, print_json
-from iris_session.cli.live import printable
+from iris_session.cli.common import add_json, add_way_to_session, print_json, printable
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Examines, prints one screen (or one JSON object); exit status 1 when a check failed."""
     import os
 
-    from iris_session.doctor.examination import Examination, examine, examine_server
+    from iris_session.doctor.runner import Examination, examine, examine_server
 
     if arguments.identity:
         os.environ["IRIS_HOME"] = arguments.identity

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import msgspec
 
+from iris_session.cli.common import printable
 from iris_session.system import children
 
 if TYPE_CHECKING:
@@ -35,11 +36,6 @@ END_S: Final = 3.0
 QUIET: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
-def printable(text: str) -> str:
-    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 def rounded(value: Any) -> Any:
     """Floats, also within lists, to four digits; below a tenth of a thousandth they are nothing."""
     if isinstance(value, float):
@@ -54,7 +50,7 @@ class Noteworthy:
         self._agreed: dict[tuple[str, str], bool] = {}  # by pair of headsets: whether they did
 
     def __call__(self, event: Event) -> bool:
-        from iris_session.doctor.headsets import BEYOND
+        from iris_session.doctor.headset_checks import BEYOND
         from iris_session.protocol.server_messages import HeadsetsCompared, ParticipantLeft
 
         body = event.body

@@ -23,8 +23,7 @@ from iris_session.cli import (
     status,
     verify,
 )
-from iris_session.cli.common import CommandError, expected_errors
-from iris_session.cli.poses import joined
+from iris_session.cli.common import CommandError, expected_errors, joined
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand a hammer over

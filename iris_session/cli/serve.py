@@ -20,7 +20,7 @@ from iris_session.cli.common import (
     print_json,
     scene_names,
 )
-from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of
+from iris_session.cli.scene import add_file_options, builder_of, check_file_options, file_of
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:

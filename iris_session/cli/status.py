@@ -18,8 +18,8 @@ from iris_session.cli.common import (
     expect_session,
     positive_seconds,
     print_json,
+    printable,
 )
-from iris_session.cli.live import printable
 
 if TYPE_CHECKING:
     from iris_session.client import Client
@@ -183,7 +183,7 @@ def screen(report: StatusReport) -> list[str]:
 
 
 def _lines(report: StatusReport) -> Iterator[str]:
-    from iris_session.doctor.condition import stages
+    from iris_session.doctor.session_checks import stages
     from iris_session.protocol.status import NOT_PUBLISHED
 
     silent = next((text for text in report.warnings if text.startswith(NOT_PUBLISHED)), "")

@@ -9,9 +9,8 @@ import pytest
 
 from anchors.lie import quat_log, quat_multiply
 from anchors.pose import PoseTuple, apply
-from iris_session.bench.alignment import CASES, MARKS, run_alignment
-from iris_session.bench.alignment_world import PER_VIEWPOINT, TIP_SIGMA_M, Headset
-from iris_session.bench.contract import BenchReport, flat
+from iris_session.bench.alignment import CASES, MARKS, PER_VIEWPOINT, TIP_SIGMA_M, Headset, run_alignment
+from iris_session.bench.report import BenchReport, flat
 
 KEYS = {"sheet_mm_p95", "sheet_deg_p95", "at_1m_mm_p95", "at_2m_mm_p95", "refused_share", "coverage_share"}
 

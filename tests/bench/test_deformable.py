@@ -16,8 +16,8 @@ import pytest
 
 from iris_session.bench import cloth_motion as motion_module
 from iris_session.bench.cloth_motion import ClothMotion, cloth_motion, simulate
-from iris_session.bench.contract import BenchError
 from iris_session.bench.deformable import _max_error_m, _Source
+from iris_session.bench.report import BenchError
 from iris_session.cli.main import main
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology

@@ -14,8 +14,8 @@ import msgspec
 import pytest
 
 from iris_session.authority import AuthorityConfig
-from iris_session.cli import anchors_live
-from iris_session.cli.anchors_live import as_dict, chosen, screen
+from iris_session.cli import anchors
+from iris_session.cli.anchors import as_dict, chosen, screen
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
 from iris_session.client import Client, DeniedError
@@ -169,7 +169,7 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     def directing(arguments: argparse.Namespace) -> Iterator[Session]:
         yield here
 
-    monkeypatch.setattr(anchors_live, "directing", directing)
+    monkeypatch.setattr(anchors, "directing", directing)
     return here
 
 

@@ -18,7 +18,7 @@ from zmq.auth import create_certificates
 from iris_session.cli.common import CommandError, expect_session, own_sessions
 from iris_session.cli.main import main
 from iris_session.client.address import Address
-from iris_session.doctor.examination import LOCAL, here
+from iris_session.doctor.runner import LOCAL, here
 from iris_session.protocol import pairing
 from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, SessionNote
 from iris_session.security.files import PrivateFolder

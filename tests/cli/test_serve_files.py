@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from iris_session.cli import scene_files
+from iris_session.cli import scene
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
-from iris_session.cli.scene_files import file_of
+from iris_session.cli.scene import file_of
 from iris_session.scene import report
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
@@ -179,8 +179,8 @@ def test_serve_and_inspect_tell_one_extent(tmp_path: Path, capfd: pytest.Capture
 def test_what_takes_long_is_told_before(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_files, "_LARGE_BYTES", 1000)
-    monkeypatch.setattr(scene_files, "_MANY_TRIANGLES", 1000)
+    monkeypatch.setattr(scene, "_LARGE_BYTES", 1000)
+    monkeypatch.setattr(scene, "_MANY_TRIANGLES", 1000)
     monkeypatch.setattr(report, "LARGE_MESH", 1000)
     path = tmp_path / "scan.stl"
     trimesh.creation.icosphere(subdivisions=3).export(path)

@@ -22,7 +22,7 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.netsim.session_link import link_address, links_before
 from iris_session.physics import PacerStats

@@ -11,7 +11,7 @@ import pytest
 from iris_session.client.address import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
 from iris_session.client.state_stream import SceneState
-from iris_session.doctor.door import knock, refusal, server_key, state_age, unpaired
+from iris_session.doctor.join_checks import knock, refusal, server_key, state_age, unpaired
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused, StateHeader

@@ -4,7 +4,7 @@ No physics, no people, no codec: a loop at real-time priority and bare libzmq fr
 run in which the session is measured. Where even this is late, so is every session. `bench state` and `bench input` give
 it as their reference.
 
-    python -m iris_session.bench.bare ADDRESS SOCKETS     one process of receivers
+    python -m iris_session.bench.baseline ADDRESS SOCKETS     one process of receivers
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 from iris_session.session.scheduling import quiet_collector, tick_priority
 from iris_session.system import children
 
@@ -65,7 +65,7 @@ def bare(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
 
 
 def _receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
-    command = children.command("iris_session.bench.bare", address, str(sockets))
+    command = children.command("iris_session.bench.baseline", address, str(sockets))
     return subprocess.Popen(command, stdout=subprocess.PIPE, env=children.environment())
 
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import psutil
 
-from iris_session.doctor.condition import FULL_DISK, LOW_DISK
 from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.doctor.session_checks import FULL_DISK, LOW_DISK
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.security import KeyHome, KeysError
 
@@ -155,7 +155,7 @@ def _who(pid: int | None) -> str:
 
 def interfaces() -> Finding:
     """The addresses that others can type."""
-    from iris_session.doctor.reach import own_networks
+    from iris_session.doctor.network_checks import own_networks
 
     up = psutil.net_if_stats()
     typed = [

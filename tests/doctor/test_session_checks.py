@@ -9,10 +9,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.doctor import condition
-from iris_session.doctor.condition import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
-from iris_session.doctor.dropped import _MEANINGS, told
+from iris_session.doctor import session_checks as condition
+from iris_session.doctor.drop_explanations import _MEANINGS, told
 from iris_session.doctor.findings import Finding
+from iris_session.doctor.session_checks import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
 from iris_session.protocol.status import (

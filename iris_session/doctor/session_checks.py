@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from iris_session.doctor import headsets
-from iris_session.doctor.dropped import told
+from iris_session.doctor import headset_checks as headsets
+from iris_session.doctor.drop_explanations import told
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role

@@ -14,9 +14,11 @@ from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
 from iris_session.client.errors import ClientError
 from iris_session.client.meeting import is_loopback
-from iris_session.doctor import condition, door, reach
+from iris_session.doctor import join_checks as door
+from iris_session.doctor import network_checks as reach
+from iris_session.doctor import session_checks as condition
 from iris_session.doctor.findings import OK, Findings, failed, ok
-from iris_session.doctor.machine import machine
+from iris_session.doctor.host_checks import machine
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport
 from iris_session.security import KeyHome, KeysError

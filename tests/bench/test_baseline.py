@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from iris_session.bench import bare as room
-from iris_session.bench.bare import bare
-from iris_session.bench.contract import BenchError
+from iris_session.bench import baseline as room
+from iris_session.bench.baseline import bare
+from iris_session.bench.report import BenchError
 
 
 def test_every_receiver_is_measured_and_none_is_left() -> None:

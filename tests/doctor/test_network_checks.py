@@ -12,9 +12,9 @@ import pytest
 
 from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
-from iris_session.doctor import reach
-from iris_session.doctor.examination import examine
+from iris_session.doctor import network_checks as reach
 from iris_session.doctor.findings import failed, ok
+from iris_session.doctor.runner import examine
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION

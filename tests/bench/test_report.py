@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.bench.contract import BenchReport, bar
+from iris_session.bench.report import BenchReport, bar
 from iris_session.cli.main import main
 
 STATE_KEYS = {

@@ -7,14 +7,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.doctor.condition import conditions
-from iris_session.doctor.examination import CONDITION
 from iris_session.doctor.findings import Finding
-from iris_session.doctor.headsets import ALARMS, MEDIA_DROPS, STALE_NS, agrees
+from iris_session.doctor.headset_checks import ALARMS, MEDIA_DROPS, STALE_NS, agrees
+from iris_session.doctor.runner import CONDITION
+from iris_session.doctor.session_checks import conditions
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.names import AlarmKind
 from iris_session.protocol.status import AlignmentReport, AnchorSeen, CrossCheckReport, StatusReport
-from tests.doctor.test_condition import ANN, DOCTOR, LEFT, WELL, S, change
+from tests.doctor.test_session_checks import ANN, DOCTOR, LEFT, WELL, S, change
 
 ALIGNED = AlignmentReport(3, observations=200, viewpoints=3, seen=(AnchorSeen("table", 120, 4 * S),))
 BOB = change(ANN, id="p2", name="bob", role="observer", holds=())

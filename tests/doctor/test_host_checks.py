@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from iris_session.doctor import machine
+from iris_session.doctor import host_checks as machine
 from iris_session.doctor.findings import Findings, failed, ok, warning
 from iris_session.security import KeyHome
 from iris_session.session.processes import INGEST_OFFSET, MEDIA_OFFSET
