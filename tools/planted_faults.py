@@ -27,7 +27,7 @@ from typing import Any, Final
 
 from planted_lab import COMMAND, Lab, LabError, Machine, require, system, wait
 
-from iris_session.cli.doctor import lines, verdict
+from iris_session.cli.doctor import format_findings, format_verdict
 from iris_session.doctor.findings import FAILED, WARNING, Finding
 
 IMPAIR: Final = str(Path(__file__).with_name("impair.py"))
@@ -367,7 +367,9 @@ def consult(visit: Visit) -> tuple[list[Finding], int, float]:
 def screen(findings: list[Finding]) -> int:
     """Lines that the findings take on a screen."""
     columns, _ = SCREEN
-    return sum(max(1, len(textwrap.wrap(line, columns))) for line in [*lines(findings), verdict(findings)])
+    return sum(
+        max(1, len(textwrap.wrap(line, columns))) for line in [*format_findings(findings), format_verdict(findings)]
+    )
 
 
 def judge(one: Fault, findings: list[Finding], status: int) -> str:
@@ -426,7 +428,7 @@ def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
             print(f"| {number} | {one.planted} | **not planted**: {error} | | | | |", flush=True)
             continue
         if verbose:
-            print("\n".join([*lines(findings), verdict(findings)]), file=sys.stderr)
+            print("\n".join([*format_findings(findings), format_verdict(findings)]), file=sys.stderr)
         if why := judge(one, findings, status):
             unnamed.append(f"{one.name}: {why}")
             print(f"| {number} | {one.planted} | **not named**: {why} | | | {status} | {took:.1f} |", flush=True)

@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli.anchors_offline import register_calibrate, register_solve
 from iris_session.cli.common import (
     CommandError,
-    add_json,
-    add_pose,
-    add_way_to_session,
-    expect_session,
-    length,
+    add_address_options,
+    add_json_option,
+    add_pose_option,
+    check_session_reachable,
     open_scene,
+    parse_length,
     print_json,
-    printable,
+    to_printable,
 )
-from iris_session.cli.status import add_watch, asking, watch
-from iris_session.doctor.headset_checks import agrees
+from iris_session.cli.status import add_watch_options, open_status, watch_status
+from iris_session.doctor.headset_checks import is_consistent
 from iris_session.protocol.names import AlignAction, AlignmentKind
 
 if TYPE_CHECKING:
@@ -72,11 +72,11 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         description="Writes a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
         "find from afar, and a ruler that shows whether the printer kept the size.",
     )
-    one.add_argument("--size", type=length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
+    one.add_argument("--size", type=parse_length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_print)
 
 
@@ -94,7 +94,7 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         default="",
         help="name of a scene (see `iris-session serve --help`); default: the usual sheet",
     )
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_example)
 
 
@@ -152,9 +152,9 @@ def run_example(arguments: argparse.Namespace) -> int:
 # --- anchors_live ---
 
 
-EVERYBODY: Final = "all"
+ALL_PARTICIPANTS: Final = "all"
 #: Sheets that are told of per headset, those seen last first.
-MAX_SEEN: Final = 8
+MAX_LISTED_SHEETS: Final = 8
 
 
 def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -169,9 +169,9 @@ def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser
         "  iris-session anchors status --json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_way_to_session(one)
-    add_watch(one, one)
-    add_json(one)
+    add_address_options(one)
+    add_watch_options(one, one)
+    add_json_option(one)
     one.set_defaults(run=run_status)
 
 
@@ -189,10 +189,14 @@ def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     one.add_argument("what", choices=sorted(AlignAction.ALL))
     one.add_argument(
-        "participant", nargs="?", default=EVERYBODY, metavar="PARTICIPANT", help="name or id, or `all` (%(default)s)"
+        "participant",
+        nargs="?",
+        default=ALL_PARTICIPANTS,
+        metavar="PARTICIPANT",
+        help="name or id, or `all` (%(default)s)",
     )
-    add_way_to_session(one, option=True)
-    add_json(one)
+    add_address_options(one, option=True)
+    add_json_option(one)
     one.set_defaults(run=run_align)
 
 
@@ -208,10 +212,10 @@ def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
-    add_pose(one, "T_world_tracking, or the offset in the world")
+    add_pose_option(one, "T_world_tracking, or the offset in the world")
     one.add_argument("--offset", action="store_true", help="on top of the measured alignment")
-    add_way_to_session(one, option=True)
-    add_json(one)
+    add_address_options(one, option=True)
+    add_json_option(one)
     one.set_defaults(run=run_place)
 
 
@@ -227,10 +231,10 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
-    add_pose(one, "T_world_anchor")
+    add_pose_option(one, "T_world_anchor")
     one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
-    add_way_to_session(one, option=True)
-    add_json(one)
+    add_address_options(one, option=True)
+    add_json_option(one)
     one.set_defaults(run=run_move)
 
 
@@ -238,11 +242,11 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
 
 
 @contextmanager
-def directing(arguments: argparse.Namespace) -> Iterator[Client]:
+def join_as_director(arguments: argparse.Namespace) -> Iterator[Client]:
     """A director in the session that is meant."""
     from iris_session.client import Client
 
-    expect_session(arguments)
+    check_session_reachable(arguments)
     with Client(
         arguments.address,
         session=arguments.session,
@@ -259,8 +263,8 @@ def run_align(arguments: argparse.Namespace) -> int:
     from iris_session.client import DeniedError
 
     done: list[dict[str, Any]] = []
-    with directing(arguments) as client:
-        people = chosen(client, arguments.participant)
+    with join_as_director(arguments) as client:
+        people = select_participants(client, arguments.participant)
         for person in people:
             denied = ""
             try:
@@ -276,18 +280,18 @@ def run_align(arguments: argparse.Namespace) -> int:
         return 0 if ok else 1
     word = "started: look at the sheets" if arguments.what == AlignAction.START else "stopped: the alignment stays"
     for one in done:
-        print(printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
+        print(to_printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
     return 0 if ok else 1
 
 
 def run_place(arguments: argparse.Namespace) -> int:
-    with directing(arguments) as client:
-        (one,) = chosen(client, arguments.participant, several=False)
+    with join_as_director(arguments) as client:
+        (one,) = select_participants(client, arguments.participant, allow_all=False)
         client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
     if arguments.json:
         print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
     else:
-        print(printable(f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"))
+        print(to_printable(f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"))
     return 0
 
 
@@ -295,26 +299,28 @@ def run_move(arguments: argparse.Namespace) -> int:
     """Whoever is not measured, or no more, is told of: their alignments stay."""
     from anchors.pose import distance
 
-    with directing(arguments) as client:
+    with join_as_director(arguments) as client:
         report = client.status()
         was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
         away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
         client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
-    aligned = [p for p in headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
-    stay = {p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := stays(p, arguments.anchor))}
+    aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
+    stay = {
+        p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))
+    }
     follow = [p for p in aligned if p.id not in stay]
     if arguments.json:
         ids = {"follow": [p.id for p in follow], "stay": list(stay)}
         print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
         return 0
     by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
-    print(printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
+    print(to_printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
     for line in stay.values():
-        print(printable(f"    not that of {line}"))
+        print(to_printable(f"    not that of {line}"))
     return 0
 
 
-def stays(p: ParticipantReport, anchor: str) -> str:
+def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
     """Why an alignment does not follow an anchor that is moved; empty: it does."""
     r = p.alignment_report
     if r is not None and not r.running:
@@ -326,22 +332,22 @@ def stays(p: ParticipantReport, anchor: str) -> str:
     return ""
 
 
-def chosen(client: Client, word: str, *, several: bool = True) -> list[ParticipantInfo]:
+def select_participants(client: Client, name: str, *, allow_all: bool = True) -> list[ParticipantInfo]:
     """Who is meant by an id, a name, or `all`. Raises `CommandError` that lists who could be."""
     people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
     headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
     there = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "nobody"
-    found = [one for one in people if one.id == word] or [one for one in people if one.name == word]
-    if not found and word == EVERYBODY and several:
+    found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
+    if not found and name == ALL_PARTICIPANTS and allow_all:
         found = [one for one in headsets if one.connected]
         if not found:
             raise CommandError("nobody in this session has a headset that is aligned", status=1)
         return found
     if not found:
-        raise CommandError(printable(f"no participant is called '{word}'; with a headset: {there}"))
+        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {there}"))
     if len(found) > 1:
         ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', lost'})" for one in found)
-        raise CommandError(printable(f"{len(found)} participants are called '{word}', give an id: {ids}"))
+        raise CommandError(to_printable(f"{len(found)} participants are called '{name}', give an id: {ids}"))
     return found
 
 
@@ -350,35 +356,35 @@ def chosen(client: Client, word: str, *, several: bool = True) -> list[Participa
 
 def run_status(arguments: argparse.Namespace) -> int:
     """Prints the alignment of everybody; with --watch until Ctrl-C."""
-    with asking(arguments) as (client, report):
+    with open_status(arguments) as (client, report):
         if arguments.watch:
-            return watch(client, arguments.period, show, as_json=arguments.json)
-        show(report, as_json=arguments.json)
+            return watch_status(client, arguments.period, print_alignment_status, as_json=arguments.json)
+        print_alignment_status(report, as_json=arguments.json)
     return 0
 
 
-def show(report: StatusReport, *, as_json: bool) -> None:
+def print_alignment_status(report: StatusReport, *, as_json: bool) -> None:
     if as_json:
-        print_json(as_dict(report))
+        print_json(to_dict(report))
     else:
-        print("\n".join(screen(report)), flush=True)
+        print("\n".join(format_alignment_status(report)), flush=True)
 
 
-def headsets(report: StatusReport) -> list[ParticipantReport]:
+def list_headsets(report: StatusReport) -> list[ParticipantReport]:
     """Those who are, or are to be, aligned."""
     return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
 
 
-def as_dict(report: StatusReport) -> dict[str, Any]:
+def to_dict(report: StatusReport) -> dict[str, Any]:
     """For `--json`: fields as in `StatusReport`."""
     import msgspec
 
     kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
     people = [
         {**{name: getattr(p, name) for name in kept}, "alignment_report": msgspec.to_builtins(p.alignment_report)}
-        for p in headsets(report)
+        for p in list_headsets(report)
     ]
-    checks = [{**msgspec.to_builtins(one), "as_expected": agrees(one)} for one in report.cross_checks]
+    checks = [{**msgspec.to_builtins(one), "as_expected": is_consistent(one)} for one in report.cross_checks]
     return {
         "session": report.session_name,
         "session_time": report.session_time,
@@ -388,13 +394,13 @@ def as_dict(report: StatusReport) -> dict[str, Any]:
     }
 
 
-def screen(report: StatusReport) -> list[str]:
+def format_alignment_status(report: StatusReport) -> list[str]:
     """One screen of printable lines."""
-    return [printable(line) for line in _lines(report)]
+    return [to_printable(line) for line in _format_lines(report)]
 
 
-def _lines(report: StatusReport) -> Iterator[str]:
-    people = headsets(report)
+def _format_lines(report: StatusReport) -> Iterator[str]:
+    people = list_headsets(report)
     still = f"  STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
     yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
     yield ""
@@ -403,7 +409,7 @@ def _lines(report: StatusReport) -> Iterator[str]:
         f"{'looks':>6s} {'places':>6s} {'tilt':>8s}  correction"
     )
     for p in people:
-        yield from _headset(p)
+        yield from _format_headset(p)
     yield ""
     for anchor in report.anchors:
         x, y, z = anchor.T_world_anchor.p
@@ -414,10 +420,10 @@ def _lines(report: StatusReport) -> Iterator[str]:
         yield "this session has no anchors"
     names = {p.id: p.name for p in report.participants}
     for check in report.cross_checks:
-        yield _pair(check, names)
+        yield _format_cross_check(check, names)
 
 
-def _headset(p: ParticipantReport) -> Iterator[str]:
+def _format_headset(p: ParticipantReport) -> Iterator[str]:
     r = p.alignment_report
     name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
     if r is None:
@@ -428,43 +434,47 @@ def _headset(p: ParticipantReport) -> Iterator[str]:
     stated = aligned and p.alignment == AlignmentKind.MEASURED and not r.offset
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
-        f"{name:20.20s} {kind:16.16s} {r.version:7d} {ago(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
-        f"{pending(r)}"
+        f"{format_pending_correction(r)}"
     )
     if not aligned and p.alignment_void_ns >= 0:
-        yield f"    void for {ago(p.alignment_void_ns)}: the tracking frame jumped"
+        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
     seen = sorted(r.seen, key=lambda one: one.age_ns)
     if seen:
-        told = [f"{one.anchor_id} {one.observations} times, {ago(one.age_ns)} ago" for one in seen[:MAX_SEEN]]
-        more = f"; {len(seen) - MAX_SEEN} more" if len(seen) > MAX_SEEN else ""
+        told = [
+            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
+            for one in seen[:MAX_LISTED_SHEETS]
+        ]
+        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
         unusable = f"; {r.unusable} of no use" if r.unusable else ""
         yield f"    saw {'; '.join(told)}{more}{unusable}"
     elif r.unusable:
         yield f"    saw nothing of use, {r.unusable} times"
     if r.alarm:
-        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {ago(r.alarm_ns)} ago"
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
     if r.advice:
         yield f"    advice: {r.advice}"
 
 
-def pending(r: AlignmentReport) -> str:
+def format_pending_correction(r: AlignmentReport) -> str:
     """A correction that waits or slides in."""
     if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
         return "-"
     return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
 
 
-def _pair(check: CrossCheckReport, names: dict[str, str]) -> str:
+def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
-    verdict = "" if agrees(check) else "  TOO FAR APART"
+    verdict = "" if is_consistent(check) else "  TOO FAR APART"
     return (
         f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, {ago(check.age_ns)} ago{verdict}"
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, "
+        f"{format_duration(check.age_ns)} ago{verdict}"
     )
 
 
-def ago(duration_ns: int) -> str:
+def format_duration(duration_ns: int) -> str:
     """How long ago, as people say it."""
     seconds = duration_ns * 1e-9
     if seconds < 0.0:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.common import CommandError, add_json, length, pose, print_json, printable
+from iris_session.cli.common import CommandError, add_json_option, parse_length, parse_pose, print_json, to_printable
 
 if TYPE_CHECKING:
     from anchors.camera import Camera
@@ -40,21 +40,21 @@ class Picture:
     sightings: tuple[Sighting, ...]
 
 
-def calibrate(arguments: argparse.Namespace) -> dict[str, Any]:
+def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
     """The result as it is printed with `--json`. Raises `CommandError`, and `CalibrationError` where the pictures do
     not determine a result."""
-    sheets = _sheets(arguments)
+    sheets = _parse_sheets(arguments)
     _check_options(arguments, sheets)
     if arguments.at:
-        return _by_sheets_of_known_place(_pictures(arguments.folder, arguments.intrinsics, sheets), arguments)
+        return _solve_from_known_sheets(_read_pictures(arguments.folder, arguments.intrinsics, sheets), arguments)
     poses = read_poses(arguments.poses)
-    pictures = _pictures(arguments.folder, arguments.intrinsics, sheets)
+    pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
     if len({picture.camera_name for picture in pictures}) > 1:
         raise CommandError("--poses calibrates one camera at a time: give the folder of that camera")
-    return _by_kinematics(pictures, poses, arguments)
+    return _solve_from_robot_poses(pictures, poses, arguments)
 
 
-def _sheets(arguments: argparse.Namespace) -> list[Sheet]:
+def _parse_sheets(arguments: argparse.Namespace) -> list[Sheet]:
     from anchors.sheet import Sheet, SheetError
 
     try:
@@ -113,35 +113,35 @@ def read_poses(path: Path) -> dict[str, PoseTuple]:
     return poses
 
 
-def _pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
     """Every picture of the folder, or of the folders in it, looked through for sheets."""
     if not folder.is_dir():
         raise CommandError(f"{folder} is not a folder")
-    folders = [folder] if _files(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
-    found = [picture for one in folders for picture in _pictures_of_one(one, intrinsics, sheets)]
+    folders = [folder] if _list_pictures(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
+    found = [picture for one in folders for picture in _read_camera_folder(one, intrinsics, sheets)]
     if not found:
         raise CommandError(f"no pictures in {folder}: files that end in {', '.join(PICTURES)}")
     return found
 
 
-def _files(folder: Path) -> list[Path]:
+def _list_pictures(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
 
 
-def _pictures_of_one(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
     import cv2
 
     from anchors.detection import DetectionError, SheetDetector
 
     pictures: list[Picture] = []
     detectors: dict[tuple[int, int], SheetDetector] = {}
-    for path in _files(folder):
+    for path in _list_pictures(folder):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None:
             raise CommandError(f"{path} is not a picture that can be read")
         height, width = image.shape
         if (width, height) not in detectors:
-            detectors[width, height] = SheetDetector(sheets, _camera(folder, intrinsics, width, height))
+            detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
         detector = detectors[width, height]
         try:
             pictures.append(Picture(path, folder.name, detector.camera, tuple(detector.detect(image))))
@@ -150,10 +150,10 @@ def _pictures_of_one(folder: Path, intrinsics: Path | None, sheets: list[Sheet])
     return pictures
 
 
-def _camera(folder: Path, given: Path | None, width: int, height: int) -> Camera:
+def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> Camera:
     from anchors.camera import CameraError, parse_camera
 
-    places = [given] if given is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
+    places = [intrinsics] if intrinsics is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
     path = next((place for place in places if place.is_file()), None)
     if path is None:
         raise CommandError(
@@ -169,7 +169,7 @@ def _camera(folder: Path, given: Path | None, width: int, height: int) -> Camera
 # --- solving ----------------------------------------------------------------------------------------------------------
 
 
-def _by_kinematics(
+def _solve_from_robot_poses(
     pictures: list[Picture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
 ) -> dict[str, Any]:
     from anchors.pose import compose, inverse
@@ -180,10 +180,10 @@ def _by_kinematics(
         raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures without a pose)")
     seen = [picture for picture in pictures if picture.sightings]
     if not seen:
-        raise CalibrationError(_nothing_seen(len(pictures)))
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
     robot = [poses[picture.path.name] for picture in seen]
     if arguments.in_hand is not None:
-        return _by_known_hand(pictures, seen, robot, arguments.in_hand)
+        return _solve_with_known_hand_pose(pictures, seen, robot, arguments.in_hand)
     found = [picture.sightings[0] for picture in seen]
     solver = camera_on_hand if arguments.camera_on_hand else solve
     solved = solver(robot, [one.T_camera_sheet for one in found], [one.covariance for one in found])
@@ -191,22 +191,26 @@ def _by_kinematics(
     result: dict[str, Any]
     if arguments.camera_on_hand:
         expected = [compose(inverse(compose(T, Y)), X) for T in robot]
-        result = {"T_ee_camera": _pose(Y), "T_base_sheet": _pose(X)}
+        result = {"T_ee_camera": _pose_to_dict(Y), "T_base_sheet": _pose_to_dict(X)}
     else:
         expected = [compose(inverse(X), compose(T, Y)) for T in robot]
-        result = {"T_base_camera": _pose(X), "T_ee_sheet": _pose(Y), **_stated(solved.covariance, X)}
+        result = {
+            "T_base_camera": _pose_to_dict(X),
+            "T_ee_sheet": _pose_to_dict(Y),
+            **_estimate_error(solved.covariance, X),
+        }
     left_out = {str(seen[k].path) for k in solved.left_out}
-    rows = _rows(pictures, {p.path: [T] for p, T in zip(seen, expected, strict=True)}, left_out)
+    rows = _compute_residuals(pictures, {p.path: [T] for p, T in zip(seen, expected, strict=True)}, left_out)
     return {
         "mode": "camera-on-hand" if arguments.camera_on_hand else "sheet-on-hand",
         **result,
-        **_fit(rows),
+        **_summarize_fit(rows),
         "turned_deg": math.degrees(solved.spread_rad),
         "pictures": rows,
     }
 
 
-def _by_known_hand(
+def _solve_with_known_hand_pose(
     pictures: list[Picture], seen: list[Picture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
 ) -> dict[str, Any]:
     """The place of the sheet on the hand is known, so in every picture it is a sheet of known place."""
@@ -217,17 +221,17 @@ def _by_known_hand(
     views = [View("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
     rig = solve_rig(views, known)
     at = rig.cameras["camera"]
-    rows = _rows(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
+    rows = _compute_residuals(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
     return {
         "mode": "sheet-in-hand",
-        "T_base_camera": _pose(at),
-        **_stated(rig.covariances["camera"], at),
-        **_fit(rows),
+        "T_base_camera": _pose_to_dict(at),
+        **_estimate_error(rig.covariances["camera"], at),
+        **_summarize_fit(rows),
         "pictures": rows,
     }
 
 
-def _by_sheets_of_known_place(pictures: list[Picture], arguments: argparse.Namespace) -> dict[str, Any]:
+def _solve_from_known_sheets(pictures: list[Picture], arguments: argparse.Namespace) -> dict[str, Any]:
     from anchors.camera_rig import View, solve_rig
     from anchors.pose import compose, inverse
     from anchors.robot_world import CalibrationError
@@ -239,39 +243,44 @@ def _by_sheets_of_known_place(pictures: list[Picture], arguments: argparse.Names
         if not one.ambiguous
     ]
     if not views:
-        raise CalibrationError(_nothing_seen(len(pictures)))
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
     blind = {picture.camera_name for picture in pictures} - {view.camera for view in views}
     if blind:
-        raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_LOOK}")
+        raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
     rig = solve_rig(views, dict(arguments.at))
     expected = {
         p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
         for p in pictures
     }
-    rows = _rows(pictures, expected, set())
+    rows = _compute_residuals(pictures, expected, set())
     cameras = {
-        name: {"T_base_camera": _pose(at), **_stated(rig.covariances[name], at)} for name, at in rig.cameras.items()
+        name: {"T_base_camera": _pose_to_dict(at), **_estimate_error(rig.covariances[name], at)}
+        for name, at in rig.cameras.items()
     }
     return {
         "mode": "sheets-of-known-place",
         **(next(iter(cameras.values())) if len(cameras) == 1 else {"cameras": cameras}),
-        "sheets": {name: {"T_base_sheet": _pose(at)} for name, at in rig.sheets.items()},
-        **_fit(rows),
+        "sheets": {name: {"T_base_sheet": _pose_to_dict(at)} for name, at in rig.sheets.items()},
+        **_summarize_fit(rows),
         "pictures": rows,
     }
 
 
-_LOOK: Final = "are --sheet and its size those of the print, are the pictures sharp, is the whole sheet in them?"
+_NO_SHEET_HINT: Final = (
+    "are --sheet and its size those of the print, are the pictures sharp, is the whole sheet in them?"
+)
 
 
-def _nothing_seen(n: int) -> str:
-    return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_LOOK}"
+def _format_no_sheet_found(n: int) -> str:
+    return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_NO_SHEET_HINT}"
 
 
 # --- what is said -----------------------------------------------------------------------------------------------------
 
 
-def _rows(pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]) -> list[dict[str, Any]]:
+def _compute_residuals(
+    pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
+) -> list[dict[str, Any]]:
     """Per picture and sheet: how far the sheet is seen from where the result puts it, in space and in the picture."""
     import numpy as np
 
@@ -301,7 +310,7 @@ def _rows(pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_o
     return rows
 
 
-def _fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _summarize_fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
     used = [row for row in rows if row.get("used")]
 
     def rms(key: str) -> float:
@@ -311,7 +320,7 @@ def _fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {"used": len(used), "left_out": sum(row.get("used") is False for row in rows), **fit}
 
 
-def _stated(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
+def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
     """95 % bound of the position, standard deviation of the rotation, from what the pictures scatter."""
     from anchors.alignment import position_error_p95
 
@@ -319,14 +328,14 @@ def _stated(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
     return {"error_mm_p95": 1e3 * position_error_p95(covariance, at[0], at[0]), "sigma_deg": math.degrees(turn)}
 
 
-def _pose(T: PoseTuple) -> dict[str, list[float]]:
+def _pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
     return {"position_m": list(T[0]), "quaternion_wxyz": list(T[1])}
 
 
-def lines_of(told: dict[str, Any]) -> list[str]:
+def format_calibration(result: dict[str, Any]) -> list[str]:
     """The result for people."""
     lines = []
-    for row in told["pictures"]:
+    for row in result["pictures"]:
         name = row["file"] if row["camera"] in ("", row["file"]) else f"{row['camera']}/{row['file']}"
         if not row["found"]:
             lines.append(f"{name}  no sheet found")
@@ -337,47 +346,47 @@ def lines_of(told: dict[str, Any]) -> list[str]:
             f"{row['residual_px']:.2f} px{note}"
         )
     lines.append(
-        f"{told['used']} used, {told['left_out']} left out; residual rms {told['residual_mm_rms']:.2f} mm, "
-        f"{told['residual_deg_rms']:.3f} deg, {told['residual_px_rms']:.2f} px"
+        f"{result['used']} used, {result['left_out']} left out; residual rms {result['residual_mm_rms']:.2f} mm, "
+        f"{result['residual_deg_rms']:.3f} deg, {result['residual_px_rms']:.2f} px"
     )
-    for name, value in _named_poses(told):
+    for name, value in _list_poses(result):
         p, q = value["position_m"], value["quaternion_wxyz"]
         place = ", ".join(f"{v:.5f}" for v in p)
         lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
-    for name, part in [("", told), *told.get("cameras", {}).items()]:
+    for name, part in [("", result), *result.get("cameras", {}).items()]:
         if "error_mm_p95" in part:
             said = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
             lines.append(f"{name + ': ' if name else ''}{said}")
     return lines
 
 
-def _named_poses(told: dict[str, Any]) -> list[tuple[str, dict[str, list[float]]]]:
-    found = [(key, value) for key, value in told.items() if key.startswith("T_")]
+def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]]]]:
+    found = [(key, value) for key, value in result.items() if key.startswith("T_")]
     for kind in ("cameras", "sheets"):
-        for name, part in told.get(kind, {}).items():
+        for name, part in result.get(kind, {}).items():
             found += [(f"{key} of {name}", value) for key, value in part.items() if key.startswith("T_")]
     return found
 
 
-def to_toml(told: dict[str, Any]) -> str:
+def calibration_to_toml(result: dict[str, Any]) -> str:
     """The result as a file: poses with their names, and how well they fit."""
     lines = ["# Written by iris-session anchors calibrate-camera. Metres; quaternions w first."]
-    lines += [f'mode = "{told["mode"]}"']
-    lines += [f"{key} = {told[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
-    lines += [f"{key} = {told[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in told]
-    for key, value in told.items():
+    lines += [f'mode = "{result["mode"]}"']
+    lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
+    lines += [f"{key} = {result[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in result]
+    for key, value in result.items():
         if key.startswith("T_"):
-            lines += ["", f"[{key}]", *_toml_pose(value)]
+            lines += ["", f"[{key}]", *_format_toml_pose(value)]
     for kind in ("cameras", "sheets"):
-        for name, part in told.get(kind, {}).items():
+        for name, part in result.get(kind, {}).items():
             for key, value in part.items():
                 if key.startswith("T_"):
                     quoted = name.replace("\\", "\\\\").replace('"', '\\"')
-                    lines += ["", f'[{kind}."{quoted}".{key}]', *_toml_pose(value)]
+                    lines += ["", f'[{kind}."{quoted}".{key}]', *_format_toml_pose(value)]
     return "\n".join([*lines, ""])
 
 
-def _toml_pose(value: dict[str, list[float]]) -> list[str]:
+def _format_toml_pose(value: dict[str, list[float]]) -> list[str]:
     return [f"{key} = [{', '.join(repr(v) for v in value[key])}]" for key in ("position_m", "quaternion_wxyz")]
 
 
@@ -396,7 +405,7 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
     one.add_argument(
         "--sheet",
-        type=_named_length,
+        type=_parse_named_length,
         action="append",
         required=True,
         metavar="ID=LENGTH",
@@ -415,34 +424,34 @@ def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentPars
     )
     one.add_argument(
         "--in-hand",
-        type=pose,
+        type=parse_pose,
         metavar="X,Y,Z,QW,QX,QY,QZ",
         help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
     )
     one.add_argument(
         "--at",
-        type=_named_pose,
+        type=_parse_named_pose,
         action="append",
         default=[],
         metavar="ID=X,Y,Z,QW,QX,QY,QZ",
         help="the place of a sheet is known, T_base_sheet; repeatable",
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_calibrate)
 
 
-def _named_length(text: str) -> tuple[str, float]:
+def _parse_named_length(text: str) -> tuple[str, float]:
     name, _, rest = text.rpartition("=")
-    return _named(name, text), length(rest)
+    return _check_sheet_id(name, text), parse_length(rest)
 
 
-def _named_pose(text: str) -> tuple[str, PoseTuple]:
+def _parse_named_pose(text: str) -> tuple[str, PoseTuple]:
     name, _, rest = text.rpartition("=")
-    return _named(name, text), pose(rest)
+    return _check_sheet_id(name, text), parse_pose(rest)
 
 
-def _named(name: str, text: str) -> str:
+def _check_sheet_id(name: str, text: str) -> str:
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
     return name
@@ -452,18 +461,18 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
     from anchors.robot_world import CalibrationError
 
     try:
-        told = calibrate(arguments)
+        told = calibrate_cameras(arguments)
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
         try:
-            arguments.out.write_text(to_toml(told), encoding="utf-8")
+            arguments.out.write_text(calibration_to_toml(told), encoding="utf-8")
         except OSError as error:
             raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
     if arguments.json:
         print_json(told)
     else:
-        print("\n".join(lines_of(told)))
+        print("\n".join(format_calibration(told)))
     return 0
 
 
@@ -471,7 +480,7 @@ def run_calibrate(arguments: argparse.Namespace) -> int:
 
 
 #: Lines about alignments and outliers per tracking frame; `--json` has all.
-MAX_SHOWN: Final = 12
+MAX_LISTED: Final = 12
 
 
 def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -494,7 +503,7 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
         "--anchors", type=Path, metavar="TOML", help="where the anchors really were (default: as the session had them)"
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="write where the sheets lie, for `serve --anchors`")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_solve)
 
 
@@ -507,19 +516,19 @@ def run_solve(arguments: argparse.Namespace) -> int:
 
     given = None if arguments.anchors is None else load_anchors(arguments.anchors)
     with Recording.open(arguments.recording, warn=False) as recording:
-        looks = read_looks(recording, progress("reading"))
-        saved = _saved(recording, given)
+        looks = read_looks(recording, make_progress_printer("reading"))
+        saved = _load_reference_anchors(recording, given)
         anchors = Anchors(looks, dict(saved.anchors), given)
-        results = _resolved(looks, anchors, saved.sizes)
-        relative = constellation(looks, _with(saved, anchors.last))
+        results = _resolve_frames(looks, anchors, saved.sizes)
+        relative = constellation(looks, _replace_anchors(saved, anchors.last))
         damage = recording.damage + recording.missing
     wanted = arguments.out is not None
-    written = _write(arguments.out, relative) if wanted and relative.solved is not None else ""
+    written = _write_constellation(arguments.out, relative) if wanted and relative.solved is not None else ""
     if arguments.json:
-        print_json(as_dict(str(arguments.recording), looks, results, relative, damage, written))
+        print_json(solution_to_dict(str(arguments.recording), looks, results, relative, damage, written))
     else:
-        for line in lines(looks, results, relative, damage):
-            print(printable(line))
+        for line in format_solution(looks, results, relative, damage):
+            print(to_printable(line))
         if written:
             print(f"written: {written}    use it: iris-session serve SCENE --anchors {written}")
     if wanted and not written:  # after what was found out all the same
@@ -527,7 +536,7 @@ def run_solve(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def progress(what: str) -> Callable[[int, int], None] | None:
+def make_progress_printer(what: str) -> Callable[[int, int], None] | None:
     """Shows how far it is, on a terminal."""
     if not sys.stderr.isatty():
         return None
@@ -539,7 +548,7 @@ def progress(what: str) -> Callable[[int, int], None] | None:
     return show
 
 
-def _saved(recording: Recording, given: Constellation | None) -> Constellation:
+def _load_reference_anchors(recording: Recording, given: Constellation | None) -> Constellation:
     """Where the anchors ought to be: the file, else as the session had them when it began."""
     from anchors.constellation import Constellation
 
@@ -551,18 +560,18 @@ def _saved(recording: Recording, given: Constellation | None) -> Constellation:
     return Constellation(next(iter(places), ""), places, {}, sizes)
 
 
-def _with(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
+def _replace_anchors(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
     from anchors.constellation import Constellation
 
     return Constellation(saved.reference, anchors, saved.error_m, saved.sizes)
 
 
-def _resolved(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Result]:
+def _resolve_frames(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Result]:
     from iris_session.alignment.resolve import resolve
 
     by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.looks}
     total = sum(map(len, by_frame.values()))
-    show, done = progress("solving"), 0
+    show, done = make_progress_printer("solving"), 0
     results = []
 
     def told() -> None:
@@ -576,7 +585,7 @@ def _resolved(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Resul
     return results
 
 
-def _write(path: Path, relative: Relative) -> str:
+def _write_constellation(path: Path, relative: Relative) -> str:
     """The constellation as a file for `serve --anchors`."""
     assert relative.solved is not None
     try:
@@ -589,7 +598,7 @@ def _write(path: Path, relative: Relative) -> str:
 # --- as text ----------------------------------------------------------------------------------------------------------
 
 
-def lines(looks: Looks, results: list[Result], relative: Relative, damage: list[str]) -> Iterator[str]:
+def format_solution(looks: Looks, results: list[Result], relative: Relative, damage: list[str]) -> Iterator[str]:
     """Everybody who was to be aligned, then the sheets, then what could not be read."""
     wearers = [one for one in looks.people.values() if one.aligned]
     if not wearers:
@@ -599,8 +608,8 @@ def lines(looks: Looks, results: list[Result], relative: Relative, damage: list[
         if not own:
             yield f"{person.name} ({person.id}): no observations"
         for result in own:
-            yield from _result(person, result)
-    yield from _relative(relative)
+            yield from _format_frame(person, result)
+    yield from _format_sheets(relative)
     if looks.unowned:
         yield f"{looks.unowned} observations over connections whose join is not in this recording"
     if looks.unreadable:
@@ -608,7 +617,7 @@ def lines(looks: Looks, results: list[Result], relative: Relative, damage: list[
     yield from (f"damaged: {line}" for line in damage)
 
 
-def _result(person: Person, r: Result) -> Iterator[str]:
+def _format_frame(person: Person, r: Result) -> Iterator[str]:
     run = f", run {r.frame.run}" if len(person.runs) > 1 else ""
     run += f", after jump {r.frame.jumps}" if r.frame.jumps else ""
     sheets = ", ".join(f"{name} {n}" for name, n in sorted(r.sheets.items()))
@@ -622,75 +631,84 @@ def _result(person: Person, r: Result) -> Iterator[str]:
     else:
         tilt = math.degrees(r.last.residual_tilt_rad)
         advice = f"; {r.last.advice}" if r.last.advice else ""
-        yield f"    solved again: {_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
+        yield (
+            f"    solved again: {_format_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
+        )
     if 2 * r.unused.get("against gravity", 0) > r.looks:
         yield "    most looks contradict the vertical: the sheet does not lie as configured (on the table, on a wall?)"
-    yield from _shown([_compared(one) for one in _worst(r.compared)], len(r.compared), "alignments")
+    yield from _limit_lines(
+        [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
+    )
     told = [
         f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} looks: "
-        f"{_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, 95 % expected below {_mm(o.expected_p95_m)}"
+        f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
+        f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
     ]
-    yield from _shown(told[:MAX_SHOWN], len(told), "outliers")
+    yield from _limit_lines(told[:MAX_LISTED], len(told), "outliers")
 
 
-def _worst(compared: list[Compared]) -> list[Compared]:
+def _select_worst(compared: list[Compared]) -> list[Compared]:
     """The worst of them, in order of time."""
-    kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_SHOWN]
+    kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
     return sorted(kept, key=lambda one: one.live.since_ns)
 
 
-def _shown(shown: list[str], of: int, what: str) -> Iterator[str]:
+def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
     yield from shown
     if of > len(shown):
         yield f"    ... {of - len(shown)} more {what}, which --json lists"
 
 
-def _compared(one: Compared) -> str:
+def _format_comparison(one: Compared) -> str:
     a, until = one.live.alignment, one.live.until_ns
     end = "the end" if until < 0 else f"{until * 1e-9:.1f} s"
     kind = a.kind + (" with offset" if a.offset else "")
     head = f"    version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
     if one.off_m is None or one.off_rad is None:
         return f"{head}: nothing to compare with"
-    stated = "nothing stated" if one.stated_m is None else f"stated {_mm(one.stated_m)}"
-    at_end = "" if one.off_end_m is None else f", {_mm(one.off_end_m)} at its end"
-    solved = "" if one.solved_m is None else f", solved again {_mm(one.solved_m)}"
+    stated = "nothing stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"
+    at_end = "" if one.off_end_m is None else f", {_format_mm(one.off_end_m)} at its end"
+    solved = "" if one.solved_m is None else f", solved again {_format_mm(one.solved_m)}"
     beyond = "  BEYOND WHAT WAS STATED" if one.beyond else ""
-    return f"{head}: {_mm(one.off_m)}, {math.degrees(one.off_rad):.2f} deg off{at_end}; {stated}{solved}{beyond}"
+    return f"{head}: {_format_mm(one.off_m)}, {math.degrees(one.off_rad):.2f} deg off{at_end}; {stated}{solved}{beyond}"
 
 
-def _relative(relative: Relative) -> Iterator[str]:
+def _format_sheets(relative: Relative) -> Iterator[str]:
     if relative.solved is None:
         yield f"sheets to each other: {relative.advice}"
         return
     c = relative.solved.constellation
     for name in sorted(c.anchors):
         (x, y, z), q = c.anchors[name]
-        what = "reference" if name == c.reference else f"known to {_mm(c.error_m[name])} (95 %)"
+        what = "reference" if name == c.reference else f"known to {_format_mm(c.error_m[name])} (95 %)"
         residual = relative.solved.residuals_m.get(name, 0.0)
         turned = ",".join(f"{v:.5g}" for v in q)
-        yield f"sheet '{name}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {turned}; {what}, looks scatter {_mm(residual)}"
+        yield (
+            f"sheet '{name}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {turned}; {what}, "
+            f"looks scatter {_format_mm(residual)}"
+        )
     for headset, epoch, viewpoint, name in relative.solved.rejected:
         participant = headset.split(" ")[0]
         yield f"left out: '{name}' as {participant} saw it from place {viewpoint} in epoch {epoch}, it fits nowhere"
     for moved in relative.moved:
         yield (
-            f"MOVED: sheet '{moved.anchor_id}' lies {_mm(moved.distance_m)}, {math.degrees(moved.angle_rad):.1f} deg "
+            f"MOVED: sheet '{moved.anchor_id}' lies {_format_mm(moved.distance_m)}, "
+            f"{math.degrees(moved.angle_rad):.1f} deg "
             "from where it ought to, as seen from the others"
         )
     if relative.unsaid:
         yield f"moved sheets: {relative.unsaid}"
 
 
-def _mm(metres: float) -> str:
+def _format_mm(metres: float) -> str:
     return f"{metres * 1e3:.1f} mm"
 
 
 # --- as JSON ----------------------------------------------------------------------------------------------------------
 
 
-def as_dict(
+def solution_to_dict(
     path: str, looks: Looks, results: list[Result], relative: Relative, damage: list[str], written: str
 ) -> dict[str, Any]:
     """For `--json`."""
@@ -699,7 +717,7 @@ def as_dict(
             "id": one.id,
             "name": one.name,
             "role": one.role,
-            "frames": [_frame(r) for r in results if r.frame.participant == one.id],
+            "frames": [_frame_to_dict(r) for r in results if r.frame.participant == one.id],
         }
         for one in looks.people.values()
         if one.aligned
@@ -707,7 +725,7 @@ def as_dict(
     return {
         "recording": path,
         "participants": people,
-        "constellation": _constellation(relative),
+        "constellation": _constellation_to_dict(relative),
         "unowned": looks.unowned,
         "unreadable": looks.unreadable,
         "damage": damage,
@@ -715,7 +733,7 @@ def as_dict(
     }
 
 
-def _frame(r: Result) -> dict[str, Any]:
+def _frame_to_dict(r: Result) -> dict[str, Any]:
     return {
         "run": r.frame.run,
         "tracking_epoch": r.frame.tracking_epoch,
@@ -728,10 +746,10 @@ def _frame(r: Result) -> dict[str, Any]:
         "unused": r.unused,
         "refused": r.last.refused,
         "advice": r.last.advice,
-        "T_world_tracking": None if r.last.refused else _pose(r.last.T_world_tracking),
+        "T_world_tracking": None if r.last.refused else _pose_to_dict(r.last.T_world_tracking),
         "error_at_anchor_m": None if r.last.refused else r.last.error_at_anchor_m,
         "residual_tilt_rad": r.last.residual_tilt_rad,
-        "alignments": [_alignment(one) for one in r.compared],
+        "alignments": [_alignment_to_dict(one) for one in r.compared],
         "outliers": [
             {
                 "anchor_id": o.anchor_id,
@@ -747,7 +765,7 @@ def _frame(r: Result) -> dict[str, Any]:
     }
 
 
-def _alignment(one: Compared) -> dict[str, Any]:
+def _alignment_to_dict(one: Compared) -> dict[str, Any]:
     a, until = one.live.alignment, one.live.until_ns
     return {
         "version": a.version,
@@ -764,12 +782,12 @@ def _alignment(one: Compared) -> dict[str, Any]:
     }
 
 
-def _constellation(relative: Relative) -> dict[str, Any]:
+def _constellation_to_dict(relative: Relative) -> dict[str, Any]:
     if relative.solved is None:
         return {"advice": relative.advice}
     c = relative.solved.constellation
     sheets = {
-        name: {**_pose(pose), "error_m": c.error_m[name], "residual_m": relative.solved.residuals_m.get(name)}
+        name: {**_pose_to_dict(pose), "error_m": c.error_m[name], "residual_m": relative.solved.residuals_m.get(name)}
         for name, pose in c.anchors.items()
     }
     moved = [{"anchor_id": m.anchor_id, "distance_m": m.distance_m, "angle_rad": m.angle_rad} for m in relative.moved]

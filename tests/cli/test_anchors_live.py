@@ -15,7 +15,7 @@ import pytest
 
 from iris_session.authority import AuthorityConfig
 from iris_session.cli import anchors
-from iris_session.cli.anchors import as_dict, chosen, screen
+from iris_session.cli.anchors import format_alignment_status, select_participants, to_dict
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
 from iris_session.client import Client, DeniedError
@@ -77,8 +77,8 @@ REPORT = StatusReport(
 
 
 def test_the_screen_says_what_every_alignment_rests_on() -> None:
-    text = "\n".join(screen(REPORT))
-    ann = next(line for line in screen(REPORT) if "ann" in line)
+    text = "\n".join(format_alignment_status(REPORT))
+    ann = next(line for line in format_alignment_status(REPORT) if "ann" in line)
     assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
     assert "saw door 90 times, 4 s ago; table 120 times, 5 min ago; 2 of no use" in text
     assert "none STOPPED" in text
@@ -88,7 +88,7 @@ def test_the_screen_says_what_every_alignment_rests_on() -> None:
     assert "advice: step closer" in text
     assert "anchor 'table': at 0.0000, -0.4500, 0.0000 m, turned 1,0,0,0, 160 mm" in text
     assert "anchor 'door': at 0.0000, 0.0000, 0.0000 m, turned 1,0,0,0" in text
-    pair, other = (line for line in screen(REPORT) if " apart at " in line)
+    pair, other = (line for line in format_alignment_status(REPORT) if " apart at " in line)
     assert "bob (p2): 31.0 mm, 0.57 deg apart at 'table', 95 % expected below 8.2 mm; 40 looks, 4 s ago" in pair
     assert pair.endswith("TOO FAR APART")
     assert " - gone: 3.0 mm" in other
@@ -97,7 +97,7 @@ def test_the_screen_says_what_every_alignment_rests_on() -> None:
 
 
 def test_names_of_strangers_move_no_cursor() -> None:
-    assert all(line.isprintable() for line in screen(REPORT))
+    assert all(line.isprintable() for line in format_alignment_status(REPORT))
 
 
 def test_offsets_and_placed_alignments_state_no_error() -> None:
@@ -106,18 +106,18 @@ def test_offsets_and_placed_alignments_state_no_error() -> None:
         {"alignment_report": msgspec.structs.replace(ANN.alignment_report, offset=True)},
     ):
         report = msgspec.structs.replace(REPORT, participants=(msgspec.structs.replace(ANN, **fields),))
-        assert "2.1 mm" not in "\n".join(screen(report))
+        assert "2.1 mm" not in "\n".join(format_alignment_status(report))
 
 
 def test_what_an_old_session_does_not_say_is_left_out() -> None:
     old = StatusReport(1, "s1", "lab", 0, participants=(msgspec.structs.replace(ANN, alignment_report=None),))
-    assert any("ann" in line for line in screen(old))
-    assert "this session has no anchors" in screen(old)
-    assert as_dict(old)["participants"][0]["alignment_report"] is None
+    assert any("ann" in line for line in format_alignment_status(old))
+    assert "this session has no anchors" in format_alignment_status(old)
+    assert to_dict(old)["participants"][0]["alignment_report"] is None
 
 
 def test_json_has_everything() -> None:
-    told = json.loads(json.dumps(as_dict(REPORT)))
+    told = json.loads(json.dumps(to_dict(REPORT)))
     assert [one["id"] for one in told["participants"]] == ["p1", "p2"]
     assert told["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
     assert [one["as_expected"] for one in told["cross_checks"]] == [False, True]
@@ -166,31 +166,31 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     )
 
     @contextmanager
-    def directing(arguments: argparse.Namespace) -> Iterator[Session]:
+    def join_as_director(arguments: argparse.Namespace) -> Iterator[Session]:
         yield here
 
-    monkeypatch.setattr(anchors, "directing", directing)
+    monkeypatch.setattr(anchors, "join_as_director", join_as_director)
     return here
 
 
 def test_participants_are_meant_by_id_or_name(session: Any) -> None:
-    assert [one.id for one in chosen(session, "ann")] == ["p1"]
-    assert [one.id for one in chosen(session, "p10")] == ["p10"]
-    assert [one.id for one in chosen(session, "all")] == ["p1", "p2"], "who is here and has a headset"
+    assert [one.id for one in select_participants(session, "ann")] == ["p1"]
+    assert [one.id for one in select_participants(session, "p10")] == ["p10"]
+    assert [one.id for one in select_participants(session, "all")] == ["p1", "p2"], "who is here and has a headset"
     with pytest.raises(
         CommandError, match=r"2 participants are called 'bob', give an id: p2 \(operator\), p10 \(observ"
     ):
-        chosen(session, "bob")
+        select_participants(session, "bob")
     with pytest.raises(CommandError, match=r"called 'carl'; with a headset: ann \(p1\), bob \(p2\), bob \(p10\)$"):
-        chosen(session, "carl")
+        select_participants(session, "carl")
     with pytest.raises(CommandError, match="no participant is called 'all'"):
-        chosen(session, "all", several=False)
+        select_participants(session, "all", allow_all=False)
 
 
 def test_nobody_to_align(monkeypatch: pytest.MonkeyPatch) -> None:
     empty: Any = Session()
     with pytest.raises(CommandError, match="nobody in this session has a headset") as caught:
-        chosen(empty, "all")
+        select_participants(empty, "all")
     assert caught.value.status == 1
 
 
