@@ -24,7 +24,7 @@ from iris_session.link.config import Ports, SceneInfo
 from iris_session.protocol import codec, entries
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope
-from iris_session.protocol.decoding import decoder
+from iris_session.protocol.codec import decoder
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import CLASSES, MediaHeader, MediaPush, media_topic, parse_topic

@@ -38,6 +38,7 @@ class CommandError(Exception):
 
 def list_expected_errors() -> tuple[type[Exception], ...]:
     """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
+    from iris_session.assets.errors import AssetStoreError
     from iris_session.client import ClientError
     from iris_session.control import ControlError
     from iris_session.link import FrontError
@@ -52,6 +53,7 @@ def list_expected_errors() -> tuple[type[Exception], ...]:
     return (
         SessionError,
         SceneBuildError,
+        AssetStoreError,
         PhysicsError,
         ControlError,
         FrontError,
