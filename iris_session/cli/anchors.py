@@ -1,41 +1,41 @@
-"""`iris-session anchors`: print a sheet, an anchors file to edit, and where a camera stands.
+"""`iris-session anchors`: print anchor sheets, calibrate cameras.
 
-What concerns sessions lies in `anchors_live` (one that runs) and `anchors_solve` (a recorded one).
+Commands on sessions, running or recorded, are in `anchors_session`.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from math import degrees
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.anchors_offline import register_calibrate, register_solve
+from iris_session.cli.anchors_session import (
+    register_align,
+    register_move,
+    register_place,
+    register_solve,
+    register_status,
+)
 from iris_session.cli.common import (
     CommandError,
-    add_address_options,
     add_json_option,
-    add_pose_option,
-    check_session_reachable,
     open_scene,
     parse_length,
+    parse_pose,
+    pose_to_dict,
     print_json,
-    to_printable,
 )
-from iris_session.cli.status import add_watch_options, open_status, watch_status
-from iris_session.doctor.headset_checks import is_consistent
-from iris_session.protocol.names import AlignAction, AlignmentKind
 
 if TYPE_CHECKING:
-    from iris_session.client import Client
-    from iris_session.protocol.server_messages import ParticipantInfo
-    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
-
-
-# --- anchors ---
+    pass
+    from anchors.camera import Camera
+    from anchors.detection import Sighting
+    from anchors.pose import PoseTuple
+    from anchors.sheet import Sheet
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -57,10 +57,10 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
-    _register_status(actions)
-    _register_align(actions)
-    _register_place(actions)
-    _register_move(actions)
+    register_status(actions)
+    register_align(actions)
+    register_place(actions)
+    register_move(actions)
     register_solve(actions)
     register_calibrate(actions)
 
@@ -149,334 +149,450 @@ def run_example(arguments: argparse.Namespace) -> int:
     return 0
 
 
-# --- anchors_live ---
+# --- calibrate-camera -------------------------------------------------------------------------------------------------
 
 
-ALL_PARTICIPANTS: Final = "all"
-#: Sheets that are told of per headset, those seen last first.
-MAX_LISTED_SHEETS: Final = 8
+PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "status",
-        help="how well the headsets of a running session are aligned",
-        description="Joins as an observer, asks, and prints for every headset what its alignment rests on, then the "
-        "anchors, and how far apart pairs of headsets put the same thing.",
-        epilog="examples:\n"
-        "  iris-session anchors status\n"
-        "  iris-session anchors status 192.168.1.20 --watch\n"
-        "  iris-session anchors status --json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_address_options(one)
-    add_watch_options(one, one)
-    add_json_option(one)
-    one.set_defaults(run=run_status)
+@dataclass(frozen=True)
+class Picture:
+    """One picture, and what was found in it. `camera_name`: the folder it lies in."""
+
+    path: Path
+    camera_name: str
+    camera: Camera
+    sightings: tuple[Sighting, ...]
 
 
-def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "align",
-        help="start or stop measuring the alignment of headsets",
-        description="`start` measures anew, from nothing; `stop` keeps what is in force, whatever is seen from then "
-        "on. Until there is a better one the present alignment stays. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors align start                   everybody with a headset\n"
-        "  iris-session anchors align start ann\n"
-        "  iris-session anchors align stop p3 --address 192.168.1.20",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.add_argument("what", choices=sorted(AlignAction.ALL))
-    one.add_argument(
-        "participant",
-        nargs="?",
-        default=ALL_PARTICIPANTS,
-        metavar="PARTICIPANT",
-        help="name or id, or `all` (%(default)s)",
-    )
-    add_address_options(one, option=True)
-    add_json_option(one)
-    one.set_defaults(run=run_align)
+def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The result as it is printed with `--json`. Raises `CommandError`, and `CalibrationError` where the pictures do
+    not determine a result."""
+    sheets = _parse_sheets(arguments)
+    _check_options(arguments, sheets)
+    if arguments.at:
+        return _solve_from_known_sheets(_read_pictures(arguments.folder, arguments.intrinsics, sheets), arguments)
+    poses = read_poses(arguments.poses)
+    pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
+    if len({picture.camera_name for picture in pictures}) > 1:
+        raise CommandError("--poses calibrates one camera at a time: give the folder of that camera")
+    return _solve_from_robot_poses(pictures, poses, arguments)
 
 
-def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "place",
-        help="align a headset by hand",
-        description="Says where the tracking frame of a headset is, T_world_tracking, or with --offset by how much the "
-        "measured one is to be moved, which voids its stated error. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
-        "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
-    add_pose_option(one, "T_world_tracking, or the offset in the world")
-    one.add_argument("--offset", action="store_true", help="on top of the measured alignment")
-    add_address_options(one, option=True)
-    add_json_option(one)
-    one.set_defaults(run=run_place)
+def _parse_sheets(arguments: argparse.Namespace) -> list[Sheet]:
+    from anchors.sheet import Sheet, SheetError
+
+    try:
+        sheets = [Sheet(name, edge) for name, edge in arguments.sheet]
+    except SheetError as error:
+        raise CommandError(str(error)) from error
+    if len({sheet.anchor_id for sheet in sheets}) != len(sheets):
+        raise CommandError("--sheet names the same sheet twice")
+    return sheets
 
 
-def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "move",
-        help="say where an anchor of the session is",
-        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
-        "what is measured. Further than 5 m only with --force. Joins as a director.",
-        epilog="examples:\n"
-        "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
-        "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
-    add_pose_option(one, "T_world_anchor")
-    one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
-    add_address_options(one, option=True)
-    add_json_option(one)
-    one.set_defaults(run=run_move)
+def _check_options(arguments: argparse.Namespace, sheets: list[Sheet]) -> None:
+    if (arguments.poses is None) == (not arguments.at):
+        raise CommandError("give --poses CSV (the robot's hand moves) or --at ID=POSE (sheets of known place)")
+    if arguments.at and (arguments.in_hand or arguments.camera_on_hand):
+        raise CommandError("--in-hand and --camera-on-hand belong to --poses")
+    if arguments.in_hand and arguments.camera_on_hand:
+        raise CommandError("--in-hand is the place of the sheet on the hand: not with --camera-on-hand")
+    if arguments.poses is not None and len(sheets) != 1:
+        raise CommandError(
+            "with --poses exactly one --sheet: the one on the hand, or with --camera-on-hand in the room"
+        )
+    unknown = {name for name, _ in arguments.at} - {sheet.anchor_id for sheet in sheets}
+    if unknown:
+        raise CommandError(f"--at {sorted(unknown)[0]}: its size is missing, add --sheet {sorted(unknown)[0]}=160mm")
 
 
-# --- what a director says ---------------------------------------------------------------------------------------------
+# --- input ------------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def join_as_director(arguments: argparse.Namespace) -> Iterator[Client]:
-    """A director in the session that is meant."""
-    from iris_session.client import Client
-
-    check_session_reachable(arguments)
-    with Client(
-        arguments.address,
-        session=arguments.session,
-        join_code=arguments.code,
-        role="director",
-        name="anchors",
-        alignment=AlignmentKind.NOT_NEEDED,
-    ) as client:
-        yield client
-
-
-def run_align(arguments: argparse.Namespace) -> int:
-    """Exit status 1 when it was denied for one of several."""
-    from iris_session.client import DeniedError
-
-    done: list[dict[str, Any]] = []
-    with join_as_director(arguments) as client:
-        people = select_participants(client, arguments.participant)
-        for person in people:
-            denied = ""
-            try:
-                client.align(arguments.what, person.id)
-            except DeniedError as error:
-                if len(people) == 1:
-                    raise
-                denied = str(error)
-            done.append({"id": person.id, "name": person.name, "denied": denied})
-    ok = not any(one["denied"] for one in done)
-    if arguments.json:
-        print_json({"ok": ok, "action": arguments.what, "participants": done})
-        return 0 if ok else 1
-    word = "started: look at the sheets" if arguments.what == AlignAction.START else "stopped: the alignment stays"
-    for one in done:
-        print(to_printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
-    return 0 if ok else 1
+def read_poses(path: Path) -> dict[str, PoseTuple]:
+    """`T_base_ee` by the name of the picture."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), skipinitialspace=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CommandError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
+        raise CommandError(f"{path}: the first line must be {','.join(COLUMNS)}")
+    poses: dict[str, PoseTuple] = {}
+    for number, row in enumerate(rows[1:], 2):
+        if not any(word.strip() for word in row):
+            continue
+        try:
+            name, x, y, z, *q = row[0].strip(), *map(float, row[1:])
+        except ValueError:
+            q = []
+        if len(q) != 4 or not all(map(math.isfinite, (x, y, z, *q))) or abs(math.hypot(*q) - 1.0) > 0.01:
+            raise CommandError(
+                f"{path}, line {number}: wanted are the name of a picture, x,y,z in metres, and a unit quaternion "
+                "with w first"
+            )
+        if name in poses:
+            raise CommandError(f"{path}, line {number}: a second pose for {name}")
+        n = math.hypot(*q)
+        poses[name] = ((x, y, z), (q[0] / n, q[1] / n, q[2] / n, q[3] / n))
+    return poses
 
 
-def run_place(arguments: argparse.Namespace) -> int:
-    with join_as_director(arguments) as client:
-        (one,) = select_participants(client, arguments.participant, allow_all=False)
-        client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
-    if arguments.json:
-        print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
-    else:
-        print(to_printable(f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"))
-    return 0
-
-
-def run_move(arguments: argparse.Namespace) -> int:
-    """Whoever is not measured, or no more, is told of: their alignments stay."""
-    from anchors.pose import distance
-
-    with join_as_director(arguments) as client:
-        report = client.status()
-        was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
-        away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
-        client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
-    aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
-    stay = {
-        p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))
-    }
-    follow = [p for p in aligned if p.id not in stay]
-    if arguments.json:
-        ids = {"follow": [p.id for p in follow], "stay": list(stay)}
-        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
-        return 0
-    by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
-    print(to_printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
-    for line in stay.values():
-        print(to_printable(f"    not that of {line}"))
-    return 0
-
-
-def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
-    """Why an alignment does not follow an anchor that is moved; empty: it does."""
-    r = p.alignment_report
-    if r is not None and not r.running:
-        return f"its run is stopped; `iris-session anchors align start {p.id}`"
-    if p.alignment == AlignmentKind.PLACED:
-        return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
-    if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
-        return f"it has not looked at '{anchor}' since it came; it follows when it does"
-    return ""
-
-
-def select_participants(client: Client, name: str, *, allow_all: bool = True) -> list[ParticipantInfo]:
-    """Who is meant by an id, a name, or `all`. Raises `CommandError` that lists who could be."""
-    people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
-    headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
-    there = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "nobody"
-    found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
-    if not found and name == ALL_PARTICIPANTS and allow_all:
-        found = [one for one in headsets if one.connected]
-        if not found:
-            raise CommandError("nobody in this session has a headset that is aligned", status=1)
-        return found
+def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+    """Every picture of the folder, or of the folders in it, looked through for sheets."""
+    if not folder.is_dir():
+        raise CommandError(f"{folder} is not a folder")
+    folders = [folder] if _list_pictures(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
+    found = [picture for one in folders for picture in _read_camera_folder(one, intrinsics, sheets)]
     if not found:
-        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {there}"))
-    if len(found) > 1:
-        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', lost'})" for one in found)
-        raise CommandError(to_printable(f"{len(found)} participants are called '{name}', give an id: {ids}"))
+        raise CommandError(f"no pictures in {folder}: files that end in {', '.join(PICTURES)}")
     return found
 
 
-# --- how it stands ----------------------------------------------------------------------------------------------------
+def _list_pictures(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
 
 
-def run_status(arguments: argparse.Namespace) -> int:
-    """Prints the alignment of everybody; with --watch until Ctrl-C."""
-    with open_status(arguments) as (client, report):
-        if arguments.watch:
-            return watch_status(client, arguments.period, print_alignment_status, as_json=arguments.json)
-        print_alignment_status(report, as_json=arguments.json)
-    return 0
+def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+    import cv2
+
+    from anchors.detection import DetectionError, SheetDetector
+
+    pictures: list[Picture] = []
+    detectors: dict[tuple[int, int], SheetDetector] = {}
+    for path in _list_pictures(folder):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise CommandError(f"{path} is not a picture that can be read")
+        height, width = image.shape
+        if (width, height) not in detectors:
+            detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
+        detector = detectors[width, height]
+        try:
+            pictures.append(Picture(path, folder.name, detector.camera, tuple(detector.detect(image))))
+        except DetectionError as error:
+            raise CommandError(f"{path}: {error}") from error
+    return pictures
 
 
-def print_alignment_status(report: StatusReport, *, as_json: bool) -> None:
-    if as_json:
-        print_json(to_dict(report))
+def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> Camera:
+    from anchors.camera import CameraError, parse_camera
+
+    places = [intrinsics] if intrinsics is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise CommandError(
+            f"no intrinsics at {places[0]}: a TOML file with width, height, fx, fy, cx, cy [pixels] and distortion, "
+            "from the maker of the camera or a calibration; name it with --intrinsics"
+        )
+    try:
+        return parse_camera(path.read_text(encoding="utf-8"), width, height)
+    except (CameraError, OSError, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: {error}") from error
+
+
+# --- solving ----------------------------------------------------------------------------------------------------------
+
+
+def _solve_from_robot_poses(
+    pictures: list[Picture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
+) -> dict[str, Any]:
+    from anchors.pose import compose, inverse
+    from anchors.robot_world import CalibrationError, camera_on_hand, solve
+
+    missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
+    if missing:
+        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures without a pose)")
+    seen = [picture for picture in pictures if picture.sightings]
+    if not seen:
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
+    robot = [poses[picture.path.name] for picture in seen]
+    if arguments.in_hand is not None:
+        return _solve_with_known_hand_pose(pictures, seen, robot, arguments.in_hand)
+    found = [picture.sightings[0] for picture in seen]
+    solver = camera_on_hand if arguments.camera_on_hand else solve
+    solved = solver(robot, [one.T_camera_sheet for one in found], [one.covariance for one in found])
+    X, Y = solved.T_base_camera, solved.T_ee_marker
+    result: dict[str, Any]
+    if arguments.camera_on_hand:
+        expected = [compose(inverse(compose(T, Y)), X) for T in robot]
+        result = {"T_ee_camera": pose_to_dict(Y), "T_base_sheet": pose_to_dict(X)}
     else:
-        print("\n".join(format_alignment_status(report)), flush=True)
-
-
-def list_headsets(report: StatusReport) -> list[ParticipantReport]:
-    """Those who are, or are to be, aligned."""
-    return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
-
-
-def to_dict(report: StatusReport) -> dict[str, Any]:
-    """For `--json`: fields as in `StatusReport`."""
-    import msgspec
-
-    kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
-    people = [
-        {**{name: getattr(p, name) for name in kept}, "alignment_report": msgspec.to_builtins(p.alignment_report)}
-        for p in list_headsets(report)
-    ]
-    checks = [{**msgspec.to_builtins(one), "as_expected": is_consistent(one)} for one in report.cross_checks]
+        expected = [compose(inverse(X), compose(T, Y)) for T in robot]
+        result = {
+            "T_base_camera": pose_to_dict(X),
+            "T_ee_sheet": pose_to_dict(Y),
+            **_estimate_error(solved.covariance, X),
+        }
+    left_out = {str(seen[k].path) for k in solved.left_out}
+    rows = _compute_residuals(pictures, {p.path: [T] for p, T in zip(seen, expected, strict=True)}, left_out)
     return {
-        "session": report.session_name,
-        "session_time": report.session_time,
-        "participants": people,
-        "anchors": msgspec.to_builtins(report.anchors),
-        "cross_checks": checks,
+        "mode": "camera-on-hand" if arguments.camera_on_hand else "sheet-on-hand",
+        **result,
+        **_summarize_fit(rows),
+        "turned_deg": math.degrees(solved.spread_rad),
+        "pictures": rows,
     }
 
 
-def format_alignment_status(report: StatusReport) -> list[str]:
-    """One screen of printable lines."""
-    return [to_printable(line) for line in _format_lines(report)]
+def _solve_with_known_hand_pose(
+    pictures: list[Picture], seen: list[Picture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
+) -> dict[str, Any]:
+    """The place of the sheet on the hand is known, so in every picture it is a sheet of known place."""
+    from anchors.camera_rig import View, solve_rig
+    from anchors.pose import compose, inverse
+
+    known = {str(p.path): compose(T, T_ee_sheet) for p, T in zip(seen, robot, strict=True)}
+    views = [View("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
+    rig = solve_rig(views, known)
+    at = rig.cameras["camera"]
+    rows = _compute_residuals(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
+    return {
+        "mode": "sheet-in-hand",
+        "T_base_camera": pose_to_dict(at),
+        **_estimate_error(rig.covariances["camera"], at),
+        **_summarize_fit(rows),
+        "pictures": rows,
+    }
 
 
-def _format_lines(report: StatusReport) -> Iterator[str]:
-    people = list_headsets(report)
-    still = f"  STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
-    yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
-    yield ""
-    yield (
-        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
-        f"{'looks':>6s} {'places':>6s} {'tilt':>8s}  correction"
+def _solve_from_known_sheets(pictures: list[Picture], arguments: argparse.Namespace) -> dict[str, Any]:
+    from anchors.camera_rig import View, solve_rig
+    from anchors.pose import compose, inverse
+    from anchors.robot_world import CalibrationError
+
+    views = [
+        View(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
+        for picture in pictures
+        for one in picture.sightings
+        if not one.ambiguous
+    ]
+    if not views:
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
+    blind = {picture.camera_name for picture in pictures} - {view.camera for view in views}
+    if blind:
+        raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
+    rig = solve_rig(views, dict(arguments.at))
+    expected = {
+        p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
+        for p in pictures
+    }
+    rows = _compute_residuals(pictures, expected, set())
+    cameras = {
+        name: {"T_base_camera": pose_to_dict(at), **_estimate_error(rig.covariances[name], at)}
+        for name, at in rig.cameras.items()
+    }
+    return {
+        "mode": "sheets-of-known-place",
+        **(next(iter(cameras.values())) if len(cameras) == 1 else {"cameras": cameras}),
+        "sheets": {name: {"T_base_sheet": pose_to_dict(at)} for name, at in rig.sheets.items()},
+        **_summarize_fit(rows),
+        "pictures": rows,
+    }
+
+
+_NO_SHEET_HINT: Final = (
+    "are --sheet and its size those of the print, are the pictures sharp, is the whole sheet in them?"
+)
+
+
+def _format_no_sheet_found(n: int) -> str:
+    return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_NO_SHEET_HINT}"
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def _compute_residuals(
+    pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
+) -> list[dict[str, Any]]:
+    """Per picture and sheet: how far the sheet is seen from where the result puts it, in space and in the picture."""
+    import numpy as np
+
+    from anchors.pose import distance, quat_angle
+    from anchors.sheet import Sheet
+
+    rows: list[dict[str, Any]] = []
+    for picture in pictures:
+        if not picture.sightings:
+            rows.append({"file": picture.path.name, "camera": picture.camera_name, "found": False})
+        for one, T in zip(picture.sightings, expected.get(picture.path, []), strict=False):
+            corners = Sheet(one.anchor_id, one.edge_m).marker_corners.reshape(-1, 3)
+            off = picture.camera.project(corners, one.T_camera_sheet) - picture.camera.project(corners, T)
+            rows.append(
+                {
+                    "file": picture.path.name,
+                    "camera": picture.camera_name,
+                    "found": True,
+                    "sheet": one.anchor_id,
+                    "used": str(picture.path) not in left_out,
+                    "residual_mm": 1e3 * distance(one.T_camera_sheet[0], T[0]),
+                    "residual_deg": math.degrees(quat_angle(one.T_camera_sheet[1], T[1])),
+                    "residual_px": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+                    "markers": one.markers,
+                }
+            )
+    return rows
+
+
+def _summarize_fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    used = [row for row in rows if row.get("used")]
+
+    def rms(key: str) -> float:
+        return math.sqrt(sum(row[key] ** 2 for row in used) / max(len(used), 1))
+
+    fit = {f"{key}_rms": rms(key) for key in ("residual_mm", "residual_deg", "residual_px")}
+    return {"used": len(used), "left_out": sum(row.get("used") is False for row in rows), **fit}
+
+
+def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
+    """95 % bound of the position, standard deviation of the rotation, from what the pictures scatter."""
+    from anchors.alignment import position_error_p95
+
+    turn = math.sqrt(covariance[21] + covariance[28] + covariance[35])
+    return {"error_mm_p95": 1e3 * position_error_p95(covariance, at[0], at[0]), "sigma_deg": math.degrees(turn)}
+
+
+def format_calibration(result: dict[str, Any]) -> list[str]:
+    """The result for people."""
+    lines = []
+    for row in result["pictures"]:
+        name = row["file"] if row["camera"] in ("", row["file"]) else f"{row['camera']}/{row['file']}"
+        if not row["found"]:
+            lines.append(f"{name}  no sheet found")
+            continue
+        note = "" if row["used"] else "  LEFT OUT: contradicts the others"
+        lines.append(
+            f"{name}  {row['sheet']}  {row['residual_mm']:.2f} mm  {row['residual_deg']:.3f} deg  "
+            f"{row['residual_px']:.2f} px{note}"
+        )
+    lines.append(
+        f"{result['used']} used, {result['left_out']} left out; residual rms {result['residual_mm_rms']:.2f} mm, "
+        f"{result['residual_deg_rms']:.3f} deg, {result['residual_px_rms']:.2f} px"
     )
-    for p in people:
-        yield from _format_headset(p)
-    yield ""
-    for anchor in report.anchors:
-        x, y, z = anchor.T_world_anchor.p
-        q = ",".join(f"{c:.5g}" for c in anchor.T_world_anchor.q)
-        size = f", {anchor.size_m * 1e3:.0f} mm" if anchor.size_m > 0.0 else ""
-        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {q}{size}"
-    if not report.anchors:
-        yield "this session has no anchors"
-    names = {p.id: p.name for p in report.participants}
-    for check in report.cross_checks:
-        yield _format_cross_check(check, names)
+    for name, value in _list_poses(result):
+        p, q = value["position_m"], value["quaternion_wxyz"]
+        place = ", ".join(f"{v:.5f}" for v in p)
+        lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
+    for name, part in [("", result), *result.get("cameras", {}).items()]:
+        if "error_mm_p95" in part:
+            said = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
+            lines.append(f"{name + ': ' if name else ''}{said}")
+    return lines
 
 
-def _format_headset(p: ParticipantReport) -> Iterator[str]:
-    r = p.alignment_report
-    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
-    if r is None:
-        yield f"{name:20.20s} {p.alignment:16.16s}"
-        return
-    kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
-    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)
-    stated = aligned and p.alignment == AlignmentKind.MEASURED and not r.offset
-    at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
-    yield (
-        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
-        f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
-        f"{format_pending_correction(r)}"
+def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]]]]:
+    found = [(key, value) for key, value in result.items() if key.startswith("T_")]
+    for kind in ("cameras", "sheets"):
+        for name, part in result.get(kind, {}).items():
+            found += [(f"{key} of {name}", value) for key, value in part.items() if key.startswith("T_")]
+    return found
+
+
+def calibration_to_toml(result: dict[str, Any]) -> str:
+    """The result as a file: poses with their names, and how well they fit."""
+    lines = ["# Written by iris-session anchors calibrate-camera. Metres; quaternions w first."]
+    lines += [f'mode = "{result["mode"]}"']
+    lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
+    lines += [f"{key} = {result[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in result]
+    for key, value in result.items():
+        if key.startswith("T_"):
+            lines += ["", f"[{key}]", *_format_toml_pose(value)]
+    for kind in ("cameras", "sheets"):
+        for name, part in result.get(kind, {}).items():
+            for key, value in part.items():
+                if key.startswith("T_"):
+                    quoted = name.replace("\\", "\\\\").replace('"', '\\"')
+                    lines += ["", f'[{kind}."{quoted}".{key}]', *_format_toml_pose(value)]
+    return "\n".join([*lines, ""])
+
+
+def _format_toml_pose(value: dict[str, list[float]]) -> list[str]:
+    return [f"{key} = [{', '.join(repr(v) for v in value[key])}]" for key in ("position_m", "quaternion_wxyz")]
+
+
+def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "calibrate-camera",
+        help="find out where a camera stands",
+        description="T_base_camera from pictures: of a sheet on the robot's hand while the hand moves (--poses), or of "
+        "sheets of known place (--at). Says how well it fits, and refuses what does not determine the result.",
+        epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
+        "  image,x,y,z,qw,qx,qy,qz\n"
+        "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
+        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    if not aligned and p.alignment_void_ns >= 0:
-        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
-    seen = sorted(r.seen, key=lambda one: one.age_ns)
-    if seen:
-        told = [
-            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
-            for one in seen[:MAX_LISTED_SHEETS]
-        ]
-        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
-        unusable = f"; {r.unusable} of no use" if r.unusable else ""
-        yield f"    saw {'; '.join(told)}{more}{unusable}"
-    elif r.unusable:
-        yield f"    saw nothing of use, {r.unusable} times"
-    if r.alarm:
-        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
-    if r.advice:
-        yield f"    advice: {r.advice}"
-
-
-def format_pending_correction(r: AlignmentReport) -> str:
-    """A correction that waits or slides in."""
-    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
-        return "-"
-    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
-
-
-def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
-    a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
-    verdict = "" if is_consistent(check) else "  TOO FAR APART"
-    return (
-        f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, "
-        f"{format_duration(check.age_ns)} ago{verdict}"
+    one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
+    one.add_argument(
+        "--sheet",
+        type=_parse_named_length,
+        action="append",
+        required=True,
+        metavar="ID=LENGTH",
+        help="a sheet that may be seen and the edge of its code, as printed: table=160mm; repeatable",
     )
+    one.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
+        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
+    )
+    one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
+    one.add_argument(
+        "--camera-on-hand", action="store_true", help="with --poses: the hand carries the camera, the sheet lies still"
+    )
+    one.add_argument(
+        "--in-hand",
+        type=parse_pose,
+        metavar="X,Y,Z,QW,QX,QY,QZ",
+        help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
+    )
+    one.add_argument(
+        "--at",
+        type=_parse_named_pose,
+        action="append",
+        default=[],
+        metavar="ID=X,Y,Z,QW,QX,QY,QZ",
+        help="the place of a sheet is known, T_base_sheet; repeatable",
+    )
+    one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
+    add_json_option(one)
+    one.set_defaults(run=run_calibrate)
 
 
-def format_duration(duration_ns: int) -> str:
-    """How long ago, as people say it."""
-    seconds = duration_ns * 1e-9
-    if seconds < 0.0:
-        return "never"
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
+def _parse_named_length(text: str) -> tuple[str, float]:
+    name, _, rest = text.rpartition("=")
+    return _check_sheet_id(name, text), parse_length(rest)
+
+
+def _parse_named_pose(text: str) -> tuple[str, PoseTuple]:
+    name, _, rest = text.rpartition("=")
+    return _check_sheet_id(name, text), parse_pose(rest)
+
+
+def _check_sheet_id(name: str, text: str) -> str:
+    if not name:
+        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
+    return name
+
+
+def run_calibrate(arguments: argparse.Namespace) -> int:
+    from anchors.robot_world import CalibrationError
+
+    try:
+        told = calibrate_cameras(arguments)
+    except CalibrationError as error:
+        raise CommandError(str(error), status=1) from error
+    if arguments.out is not None:
+        try:
+            arguments.out.write_text(calibration_to_toml(told), encoding="utf-8")
+        except OSError as error:
+            raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
+    if arguments.json:
+        print_json(told)
+    else:
+        print("\n".join(format_calibration(told)))
+    return 0

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from iris_session.demo.named_scenes import Scene
 
 
-# --- common ---
-
-
 #: Whatever is there has taken a connection by then.
 CONNECT_S: Final = 2.0
 
@@ -231,9 +228,6 @@ def print_json(value: dict[str, Any]) -> None:
     print(json.dumps(value, allow_nan=False), flush=True)
 
 
-# --- poses ---
-
-
 _UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 POSE_FORMAT: Final = "X,Y,Z,QW,QX,QY,QZ"
 #: Numbers with a comma between them, the first negative: no option looks like that.
@@ -253,6 +247,11 @@ def parse_pose(text: str) -> PoseTuple:
     x, y, z, *q = numbers
     norm = math.hypot(*q)
     return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
+    """Return a pose as a JSON object."""
+    return {"position_m": list(T[0]), "quaternion_wxyz": list(T[1])}
 
 
 def join_negative_poses(arguments: Sequence[str]) -> list[str]:

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from iris_session.scene.report import SceneReport
 
 
-# --- scene ---
-
-
 class _ParsedScene(NamedTuple):
     """A scene. `skipped`: what clients will not see. `notes`: what looks like a mistake."""
 
@@ -220,9 +217,6 @@ def _compose_file(path: Path, arguments: argparse.Namespace, store: AssetStore) 
 
 def _format_size(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 100_000 else f"{n_bytes / 1e3:.1f} kB"
-
-
-# --- scene_files ---
 
 
 #: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
