@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import zmq
 
-from iris_session.scene import AssetStore
+from iris_session.assets.store import AssetStore
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import Log, group_clients, measure
 from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult

@@ -99,7 +99,7 @@ def _make_stone(
 
 def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
     """What a server does at its start with a compiled model."""
-    from iris_session.scene import AssetStore
+    from iris_session.assets.store import AssetStore
     from iris_session.physics.load import load_model
     from iris_session.protocol.scene import asset_addresses, encode_scene
     from iris_session.scene.mujoco_scene import parse_mujoco
