@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import logging
+import os
 import shutil
 import signal
 import sys
@@ -17,8 +19,16 @@ from iris_session.link.sockets import raise_descriptor_limit
 from iris_session.system.parent import die_with_parent, parent_ends, parent_is
 
 
+def configure_logging() -> None:
+    """Log to standard error, from the level in the environment variable `IRIS_LOG` on; warnings by default."""
+    level = os.environ.get("IRIS_LOG", "warning").upper()
+    known = level in logging.getLevelNamesMapping()
+    logging.basicConfig(format="iris-session: %(message)s", level=level if known else logging.WARNING)
+
+
 def main() -> int:
-    """Serves one session. Exit status 1 when the front could not start; the link has told why."""
+    """Serve one session. The exit status is 1 if the front cannot start; the authority was notified over the link."""
+    configure_logging()
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=FrontStart)
     raise_descriptor_limit()
     try:
@@ -35,7 +45,7 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, on_signal)
     die_with_parent(signal.SIGHUP)
-    # Everything made so far lives as long as the process; the loop collects the rest when it is idle.
+    # All objects made so far live as long as the process; the loop collects the rest when it is idle.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -44,7 +54,7 @@ def main() -> int:
     finally:
         front.close()
         if (front.cut_off or front.ended == ORPHANED) and parent_ends(start.parent_pid):
-            # Killed: nobody else removes the folder of the link.
+            # The parent was killed, so the folder of the link is removed here.
             shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
     return 0
 
