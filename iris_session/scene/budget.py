@@ -1,4 +1,4 @@
-"""What a scene costs (bytes to fetch, texture memory, triangles), and the levels of detail that fit a client's budget."""
+"""Cost of a scene (bytes to fetch, texture memory, triangles), and levels of detail that fit the budget of a client."""
 
 from __future__ import annotations
 
