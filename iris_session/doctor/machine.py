@@ -29,7 +29,7 @@ def machine(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
 
 def scheduling() -> Finding:
     """Whether the tick loop may run before other work."""
-    from iris_session.session.scheduling import tick_priority
+    from iris_session.system.priority import tick_priority
 
     with tick_priority() as reached:
         pass
