@@ -16,7 +16,8 @@ class Replacement:
         with Replacement(path, durable=True) as replacement:
             replacement.file.write(data)
 
-    Leaving the context commits, an error inside it discards. A link at `path` is replaced, not followed.
+    Leaving the context commits unless `commit` or `discard` was called, and discards after an error. A link at `path`
+    is replaced, not followed.
 
     Args:
         path: The file to replace, in an existing folder.
@@ -30,6 +31,7 @@ class Replacement:
         self._durable = durable
         descriptor, name = tempfile.mkstemp(prefix=f".{path.name[:100]}-", suffix=suffix, dir=path.parent)
         self._temporary = Path(name)
+        self._is_pending = True
         self.file: BinaryIO = os.fdopen(descriptor, "wb")
         if permissions != 0o600:
             try:
@@ -38,18 +40,20 @@ class Replacement:
                 self.discard()
                 raise
 
-    def flush(self) -> None:
-        """Write everything to the temporary file; with `durable`, to the disk."""
-        self.file.flush()
-        if self._durable:
-            os.fsync(self.file.fileno())
+    def finish(self) -> None:
+        """Write everything to the temporary file; with `durable`, to the disk. `commit` does it too."""
+        if not self.file.closed:
+            self.file.flush()
+            if self._durable:
+                os.fsync(self.file.fileno())
+            self.file.close()
 
     def commit(self) -> None:
         """Replace the file with what was written."""
         try:
-            self.flush()
-            self.file.close()
+            self.finish()
             os.replace(self._temporary, self.path)
+            self._is_pending = False
         except BaseException:
             self.discard()
             raise
@@ -58,6 +62,7 @@ class Replacement:
 
     def discard(self) -> None:
         """Remove the temporary file; the old content stays."""
+        self._is_pending = False
         with suppress(OSError):
             self.file.close()
         self._temporary.unlink(missing_ok=True)
@@ -68,6 +73,8 @@ class Replacement:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if not self._is_pending:
+            return
         if error is None:
             self.commit()
         else:
