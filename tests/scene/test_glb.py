@@ -56,7 +56,7 @@ def test_a_full_disk_leaves_what_was_there(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     if fault == "write":
-        monkeypatch.setattr(os, "fdopen", lambda descriptor, mode: FullDisk(descriptor, mode))
+        monkeypatch.setattr(os, "fdopen", FullDisk)
     else:
         monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="No space left"):
