@@ -17,8 +17,8 @@ from iris_session.alignment.estimation import UNSOLVABLE
 from iris_session.alignment.head_history import HeadRing
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.entries import AlignmentAlarm
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.token_bucket import TokenBucket
 
 #: A jump that follows another before anything was proposed says nothing new.
 JUMP_AGAIN_NS: Final = 1_000_000_000
