@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import zmq
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.scene import decode_image, decode_mesh
 from iris_session.system.priority import lower_thread_priority
@@ -60,7 +60,7 @@ def join(job: JoinJob) -> JoinResult:
     """One client, from nothing to a whole scene. Raises what the client raises."""
     begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
     with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
-        client.asset_cache = AssetCache(job.cache)
+        client.asset_cache = AssetStore(job.cache)
         scene = client.connection.mirror.scene_hash
         first = client.fetch_assets([scene], decode=lambda _, data: decode_scene(data))
         client.wait_for(lambda _: first.done, JOIN_S)
