@@ -15,7 +15,7 @@ from anchors.pose import PoseTuple, Vec3, is_rigid
 from iris_session.alignment.cross_check import Comparisons
 from iris_session.alignment.drift import AlignmentWatch
 from iris_session.alignment.estimation import AlignmentDesk
-from iris_session.front.connections import ClientTable, Connection
+from iris_session.front.connections import ConnectionTable, FrontConnection
 from iris_session.link.config import FrontConfig
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
@@ -83,7 +83,9 @@ class _Person:
 class Anchoring:
     """A `Service`. `offer` takes entries for the authority; false: dropped and counted."""
 
-    def __init__(self, config: FrontConfig, clients: ClientTable, offer: Callable[[Entry], bool], drops: Drops) -> None:
+    def __init__(
+        self, config: FrontConfig, clients: ConnectionTable, offer: Callable[[Entry], bool], drops: Drops
+    ) -> None:
         self._config = config
         self._clients = clients
         self._offer = offer
@@ -100,7 +102,7 @@ class Anchoring:
 
     # --- from clients ------------------------------------------------------------------------------------------------
 
-    def sampled(self, connection: Connection, sample: Sample, now_ns: int) -> None:
+    def sampled(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
         """Every sample: those of a head are kept, and watched for jumps."""
         if sample.device != _HEAD or sample.pose is None or sample.kind != SampleKind.POSE or not sample.tracked:
             return
@@ -110,7 +112,7 @@ class Anchoring:
         if alarm is not None:
             self._alarmed(connection.number, person, alarm, sample.tracking_epoch, now_ns)
 
-    def observed(self, connection: Connection, observation: Observation, now_ns: int) -> None:
+    def observed(self, connection: FrontConnection, observation: Observation, now_ns: int) -> None:
         """Every observation: for the watch first, then for the estimate."""
         number = connection.number
         person = self._people.get(number) or self._meet(connection)
@@ -152,7 +154,7 @@ class Anchoring:
             now_ns,
         )
 
-    def _meet(self, connection: Connection) -> _Person:
+    def _meet(self, connection: FrontConnection) -> _Person:
         config = self._config
         desk = AlignmentDesk(self.anchors, config.proposal_period_ns, config.anchor_sizes)
         person = self._people[connection.number] = _Person(desk, AlignmentWatch(self.anchors))
@@ -269,7 +271,7 @@ class Anchoring:
 
     # --- now and then ------------------------------------------------------------------------------------------------
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """At most one estimate or comparison: either takes up to milliseconds, and state waits meanwhile."""
         for number, person in self._people.items():
             if person.desk.due(now_ns):

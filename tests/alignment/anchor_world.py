@@ -7,7 +7,7 @@ import numpy as np
 
 from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_yaw
 from iris_session.alignment.service import Anchoring
-from iris_session.front.connections import ClientTable, Connection, Peer, Route
+from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route
 from iris_session.link.config import FrontConfig
 from iris_session.protocol.client_messages import Hello, Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
@@ -31,7 +31,8 @@ class Wearer:
         self.lab = lab
         self.rng = np.random.default_rng(seed)
         self.frame = headset(self.rng)
-        self.connection = Connection(number, Route(bytes([number])), Peer(number, ""), ("", 0), "", Hello("o", "A"), 0)
+        route, peer = Route(bytes([number])), Peer(number, "")
+        self.connection = FrontConnection(number, route, peer, ("", 0), "", Hello("o", "A"), 0)
         self.connection.admitted, self.connection.participant_id = True, f"p{number}"
         self.viewpoint = self.seq = 0
         self.epoch = 1
@@ -100,7 +101,7 @@ class Lab:
     def __init__(self, anchors: dict[str, PoseTuple] = ANCHORS, **config: object) -> None:
         self.now_ns = SECOND
         self.entries: list[Entry] = []
-        self.clients, self.drops = ClientTable(), Drops()
+        self.clients, self.drops = ConnectionTable(), Drops()
         self.world = dict(anchors)
         poses = {name: Pose(*T) for name, T in anchors.items()}
         self.config = FrontConfig(anchors=poses, **config)  # type: ignore[arg-type]
@@ -117,7 +118,7 @@ class Lab:
         """Several passes of the front's loop: each proposes for one at most."""
         for _ in range(times):
             self.now_ns += MS
-            self.anchoring.turn(self.now_ns)
+            self.anchoring.tick(self.now_ns)
 
     def put_in_force(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
         alignment = Alignment(
