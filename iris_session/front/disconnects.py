@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import Doors
@@ -38,7 +38,7 @@ class Departures:
         coalescer: Coalescer,
         drops: Drops,
         status: StatusDesk,
-        anchoring: Anchoring,
+        anchoring: AlignmentService,
         session_ns: Callable[[], int],
         doors: Doors,
     ) -> None:
@@ -120,5 +120,5 @@ class Departures:
         self._clients.remove(connection)
         if reason in STILL_THERE:
             self._clients.give_up(connection)
-        self._anchoring.forget(connection.number)
+        self._anchoring.remove_connection(connection.number)
         self._drops.forget(connection.number)

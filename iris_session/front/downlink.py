@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.connections import ClientTable, Connection, Outbox, encode_message
 from iris_session.front.revocation import Revocation
@@ -50,7 +50,7 @@ class Downlink:
         session_ns: Callable[[], int],
         forget: Callable[[Connection, str], None],
         revocation: Revocation,
-        anchoring: Anchoring,
+        anchoring: AlignmentService,
         on_scene: Callable[[], None],
     ) -> None:
         self._socket = socket
@@ -125,7 +125,7 @@ class Downlink:
                 self._answer(outgoing)
         for event in decided.events:
             self.broadcast(event)
-            self._anchoring.heard(event.body)
+            self._anchoring.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.left(event.body.participant)
         for outgoing in snapshots:
@@ -150,7 +150,7 @@ class Downlink:
             return
         if isinstance(message, Snapshot):
             # What only the front knows: the scene, and the poses of the newest state frame.
-            self._anchoring.shown(message.participants)
+            self._anchoring.process_snapshot(message.participants)
             state_seq, poses = self._publisher.keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(

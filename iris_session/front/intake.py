@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
@@ -87,7 +87,7 @@ class Intake:
         pairing: PairingDesk,
         audit: AuditTrail,
         doors: Doors,
-        anchoring: Anchoring,
+        anchoring: AlignmentService,
     ) -> None:
         self._config = config
         self._clients = clients
@@ -222,7 +222,7 @@ class Intake:
             return
         elif isinstance(message, Observation):
             self._raw.put(connection.number, now_ns, message)
-            self._anchoring.observed(connection, message, now_ns)
+            self._anchoring.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
@@ -253,7 +253,7 @@ class Intake:
         """What is done with every sample as it came, before samples are coalesced."""
         self._raw.put(connection.number, now_ns, sample)
         self._status.sampled(connection.number, sample, now_ns)
-        self._anchoring.sampled(connection, sample, now_ns)
+        self._anchoring.process_sample(connection, sample, now_ns)
 
     def _not_taken(self, peer: Peer, connection: Connection | None, now_ns: int, what: str = BEFORE_HELLO) -> None:
         """Counts towards being cut off."""

@@ -11,7 +11,7 @@ import time
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.announce import Facts, announce
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
@@ -101,8 +101,15 @@ class Front:
         self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
         self._media = self._make_media()
         self._status.media_row = self._media.row
-        anchoring = Anchoring(config, self._clients, self._coalescer.offer, self._drops)
-        self._status.alignment_report = anchoring.report
+        anchoring = AlignmentService(
+            self._coalescer.offer,
+            self._drops,
+            anchors=config.anchors,
+            anchor_sizes=config.anchor_sizes,
+            proposal_period_ns=config.proposal_period_ns,
+            max_connections=config.limits.connections,
+        )
+        self._status.alignment_report = anchoring.complete_report
         memory = MemoryWatch(config.limits.memory_bytes, lambda: doors.shed(self._give_way), self._shed)
         self._services += [self._keyring, self._status, self._media, doors, memory]
         self._intake = Intake(
