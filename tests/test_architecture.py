@@ -43,8 +43,8 @@ FORBIDDEN = {
 }
 #: Imports between rooms that are still to be untied.
 TRANSITIONAL = {
-    ("assets", "client"), ("assets", "scene"), ("netsim", "session"), ("protocol", "anchors"),
-    ("security", "link"), ("session", "client"), ("assets", "link"),
+    ("netsim", "session"),
+    ("security", "link"), ("session", "client"),
 }  # fmt: skip
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")

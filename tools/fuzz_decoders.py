@@ -20,7 +20,7 @@ from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
 from iris_session.protocol import codec, entries
 from iris_session.protocol.client_messages import ClientEnvelope
-from iris_session.protocol.decoding import decoder
+from iris_session.protocol.codec import decoder
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import PROTOCOL_VERSION

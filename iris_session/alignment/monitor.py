@@ -18,8 +18,8 @@ from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, is_rigid
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.entries import AlignmentAlarm
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.token_bucket import TokenBucket
 
 #: A jump that follows another before anything was proposed carries no news.
 MIN_JUMP_INTERVAL_NS: Final = 1_000_000_000

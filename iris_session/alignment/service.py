@@ -20,6 +20,7 @@ from iris_session.alignment.monitor import AlignmentMonitor
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentProposal, Entry
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind, AlignmentKind, AnchorKind, SampleKind
 from iris_session.protocol.server_messages import (
     AlignmentAlarmed,
@@ -33,7 +34,6 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
 )
 from iris_session.protocol.status import AlignmentReport
-from iris_session.protocol.token_bucket import Drops
 
 _HEAD: Final = "head"
 _COVARIANCE_VALUES: Final = 36

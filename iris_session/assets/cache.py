@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from iris_session.client.errors import AssetError
+from iris_session.assets.errors import AssetMissingError, AssetStoreError
 from iris_session.protocol.assets import is_address
 
 try:
@@ -46,7 +46,8 @@ def default_folder() -> Path:
 
 
 class AssetCache:
-    """A folder, made when something is first stored. Any thread may use it; raises `AssetError` when it cannot be used.
+    """A folder, made when something is first stored. Any thread may use it. Raises `AssetStoreError` where it
+    cannot be used.
 
     Above `max_bytes` the assets that were used longest ago are taken away; twice as many are never stored.
     """
@@ -82,7 +83,7 @@ class AssetCache:
         return None
 
     def read(self, address: str) -> bytes:
-        """The bytes of an asset that `find` found, or that was stored. Raises `AssetError` when they are gone."""
+        """The bytes of an asset that `find` found, or that was stored. Raises `AssetStoreError` when they are gone."""
         return bytes(self.view(address))
 
     def view(self, address: str) -> memoryview:
@@ -90,10 +91,10 @@ class AssetCache:
         try:
             return _mapped(self.path(address))[0]
         except OSError as error:
-            raise AssetError(address, "gone", f"asset {address} is not in {self.folder}: fetch it again") from error
+            raise AssetMissingError(f"asset {address} is not in {self.folder}: fetch it again", address) from error
 
     def begin(self, address: str) -> Part:
-        """The part of an asset that is here already, to be gone on with. Raises `AssetError`."""
+        """The part of an asset that is here already, to be gone on with. Raises `AssetStoreError`."""
         path = self.path(address)
         try:
             try:
@@ -105,7 +106,7 @@ class AssetCache:
             raise _unusable(self.folder, error) from error
 
     def stored(self, size: int) -> None:
-        """So many bytes were written: makes room now and then. Raises `AssetError` when there is none."""
+        """So many bytes were written: makes room now and then. Raises `AssetStoreError` when there is none."""
         most = FULL * self.max_bytes
         with self._lock:
             self._unlooked += size
@@ -120,7 +121,7 @@ class AssetCache:
         if self._held > most:
             text = f"the cache of assets {self.folder} is full: {self._held >> 20} MiB were used in the last minutes"
             more = f"or allow more than {self.max_bytes >> 20} MiB: AssetCache(max_bytes=...)"
-            raise AssetError("", "cache", f"{text}; {ANOTHER}, {more}")
+            raise AssetStoreError(f"{text}; {ANOTHER}, {more}")
 
     def trim(self) -> int:
         """Takes away what is too much, the longest unused first. The bytes that stay."""
@@ -159,7 +160,7 @@ class Part:
                 self.offset += len(block)
 
     def append(self, data: bytes | memoryview) -> None:
-        """The next bytes. Raises `AssetError` when they cannot be written."""
+        """The next bytes. Raises `AssetStoreError` when they cannot be written."""
         rest = memoryview(data)
         while rest:
             try:
@@ -253,6 +254,6 @@ def _is_written(path: Path) -> bool:
     return written
 
 
-def _unusable(folder: Path, error: OSError | ValueError) -> AssetError:
+def _unusable(folder: Path, error: OSError | ValueError) -> AssetStoreError:
     why = getattr(error, "strerror", None) or error
-    return AssetError("", "cache", f"the cache of assets {folder} cannot be used: {why}; {ANOTHER}")
+    return AssetStoreError(f"the cache of assets {folder} cannot be used: {why}; {ANOTHER}")

@@ -22,7 +22,7 @@ from typing import Final
 
 from filelock import FileLock, Timeout
 
-from iris_session.scene.errors import AssetMissingError
+from iris_session.assets.errors import AssetMissingError
 
 DEFAULT_LIMIT: Final = 4 << 30
 #: A file used this short ago [s] stays: another process may be about to hold it.
@@ -103,11 +103,13 @@ class AssetStore:
         try:
             data = path.read_bytes()
         except OSError:
-            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again") from None
+            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again", address) from None
         if hashlib.sha256(data).hexdigest() != address:
             with contextlib.suppress(OSError):  # a disk that cannot be written: `put` says so
                 path.unlink()
-            raise AssetMissingError(f"asset {address} was damaged on the disk and is gone: build the scene again")
+            raise AssetMissingError(
+                f"asset {address} was damaged on the disk and is gone: build the scene again", address
+            )
         return data
 
     def path(self, address: str) -> Path:
@@ -121,7 +123,7 @@ class AssetStore:
         try:
             return self.path(address).stat().st_size
         except OSError:
-            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again") from None
+            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again", address) from None
 
     def __contains__(self, address: object) -> bool:
         return isinstance(address, str) and _ADDRESS.fullmatch(address) is not None and self.path(address).is_file()

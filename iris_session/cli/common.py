@@ -32,6 +32,7 @@ class CommandError(Exception):
 
 def expected_errors() -> tuple[type[Exception], ...]:
     """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
+    from iris_session.assets.errors import AssetStoreError
     from iris_session.client import ClientError
     from iris_session.control import ControlError
     from iris_session.link import FrontError
@@ -46,6 +47,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
     return (
         SessionError,
         SceneBuildError,
+        AssetStoreError,
         PhysicsError,
         ControlError,
         FrontError,

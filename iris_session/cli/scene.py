@@ -127,6 +127,7 @@ def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes the file and says how large it is, and what is not in it."""
+    from iris_session.assets.errors import AssetStoreError
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
     from iris_session.scene.references import files_read
@@ -143,7 +144,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} is a file that {arguments.scene} is made of: name another one to write")
     try:
         size = write_glb(parsed.spec, store, out)
-    except SceneBuildError as error:
+    except (SceneBuildError, AssetStoreError) as error:
         raise CommandError(str(error)) from None
     except OSError as error:
         raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 from iris_session.assets.cache import AssetCache, Part
+from iris_session.assets.errors import AssetStoreError
 from iris_session.client.errors import AssetError
 from iris_session.system.priority import give_way
 
@@ -175,6 +176,9 @@ class AssetWorkers:
             return work()
         except AssetError as error:
             failure = error
+        except AssetStoreError as error:
+            failure = AssetError.from_store(error)
+            failure.__cause__ = error
         except Exception as error:  # a fault of ours: it must not leave somebody waiting
             failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
             failure.__cause__ = error

@@ -13,12 +13,11 @@ import zmq
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, TrustError
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import envelope
+from iris_session.protocol.client_messages import Pair, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.server_messages import ProtocolFault, Refused
+from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused
 from iris_session.security import KeyPair, raw_key
 
 ANSWER_S: Final = 5.0

@@ -12,11 +12,10 @@ from iris_session.link.config import FrontConfig, Ports
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.limits import Drops, RateLimiter
 from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import Keyring, roles_behind
 from iris_session.security.resume_tokens import ResumeTokens

@@ -12,8 +12,8 @@ from iris_session.link.config import FrontConfig, Ports
 from iris_session.link.interfaces import WILDCARDS, interfaces, public_host, reachable
 from iris_session.link.sockets import host_in_address
 from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.protocol.token_bucket import Drops
 
 
 class Facts(NamedTuple):

@@ -10,8 +10,8 @@ from iris_session.front.asset_server import AssetServer, Store, Table
 from iris_session.front.connections import ClientTable, Connection
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import MILLISECOND, SceneInfo
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import AssetsReport
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.keyring import Keyring
 
 LOOK_NS: Final = 250 * MILLISECOND

@@ -14,7 +14,7 @@ from iris_session.link.config import MILLISECOND, SECOND
 from iris_session.link.interfaces import LOOPBACK_BROADCAST, Interface, interfaces, public_host, reachable
 from iris_session.protocol.codec import encode_beacon
 from iris_session.protocol.discovery import Beacon
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 PERIOD_NS: Final = 200 * MILLISECOND
 #: Networks come and go: a laptop changes its Wi-Fi, a lease gives another address.

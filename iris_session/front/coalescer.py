@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 
 from iris_session.link.config import FrontLimits
-from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample, TrackingEpoch
+from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, RemoveParticipant, Sample, TrackingEpoch
 from iris_session.protocol.entries import (
     HOST,
     URGENT,
@@ -25,9 +25,8 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
 
 #: A gripper closed further than this counts as pressed: crossing it is an edge.
 GRIPPER_EDGE = 0.5

@@ -19,8 +19,8 @@ from iris_session.front.traffic import Traffic
 from iris_session.front.visitors import Visitor, Visitors, crowd
 from iris_session.link.config import MEBIBYTE, MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp
+from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind
-from iris_session.protocol.token_bucket import Drops, TokenBucket
 
 LOOK_NS: Final = 250 * MILLISECOND
 #: Who was cut off may say hello again after it.

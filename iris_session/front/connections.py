@@ -17,10 +17,9 @@ from iris_session.front.traffic import Traffic
 from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.limits import Drops, RateLimiter, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import ServerMessage
-from iris_session.protocol.token_bucket import Drops, TokenBucket
 
 _encoder = msgspec.msgpack.Encoder()
 #: Connections that were given up and may still stop the session.

@@ -15,9 +15,9 @@ from iris_session.front.status import StatusDesk
 from iris_session.link.config import MILLISECOND
 from iris_session.link.sockets import close_tcp, next_tcp_event, peer_of, readable
 from iris_session.protocol.entries import Entry, Lost
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.token_bucket import Drops
 
 #: How long what a closed connection has sent may wait behind the messages of others.
 LAST_WORDS_NS = 100 * MILLISECOND
@@ -121,4 +121,4 @@ class Departures:
         if reason in STILL_THERE:
             self._clients.give_up(connection)
         self._anchoring.remove_connection(connection.number)
-        self._drops.forget(connection.number)
+        self._drops.remove(connection.number)

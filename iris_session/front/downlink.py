@@ -14,6 +14,7 @@ from iris_session.front.revocation import Revocation
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.sockets import readable
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
     Event,
@@ -24,7 +25,6 @@ from iris_session.protocol.server_messages import (
     Snapshot,
 )
 from iris_session.protocol.steps import Outgoing
-from iris_session.protocol.token_bucket import Drops
 
 _BOUND = 64  # messages taken at once
 #: Why a director ends a participation: nobody joins again by itself after that.

@@ -23,7 +23,7 @@ from iris_session.link.sockets import (
     open_state,
     watch_tcp,
 )
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security.keyring import open_keyring
 from iris_session.security.zap import Authenticator
 

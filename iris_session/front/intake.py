@@ -25,6 +25,7 @@ from iris_session.protocol.client_messages import (
     EStop,
     Hello,
     Observation,
+    Pair,
     Sample,
     Samples,
     TrackingEpoch,
@@ -33,12 +34,10 @@ from iris_session.protocol.codec import decode_client, tag_of
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.errors import MalformedError, ProtocolError, RateError, VersionError
-from iris_session.protocol.limits import LIMITS
+from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
-from iris_session.protocol.security import Pair
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
-from iris_session.protocol.token_bucket import Drops, TokenBucket
 from iris_session.security import fingerprint, raw_key
 from iris_session.security.keyring import stranger_key
 

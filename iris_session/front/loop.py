@@ -39,9 +39,9 @@ from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import readable
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.resume_tokens import ResumeTokens
 from iris_session.system.parent import parent_is
 

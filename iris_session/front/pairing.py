@@ -18,10 +18,10 @@ from iris_session.front.connections import Outbox, Peer, Route
 from iris_session.link.config import SECOND
 from iris_session.link.sockets import peer_of
 from iris_session.protocol import pairing
+from iris_session.protocol.client_messages import Pair
+from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind, RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.server_messages import Refused
-from iris_session.protocol.token_bucket import Drops, TokenBucket
+from iris_session.protocol.server_messages import Paired, Refused
 from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
 from iris_session.security.file_worker import PATIENCE_S
 from iris_session.security.join_codes import Attempt

@@ -18,9 +18,9 @@ from iris_session.front.connections import ClientTable, Connection, Outbox
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import MILLISECOND, SECOND, FrontError
 from iris_session.link.sockets import close_tcp
+from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
-from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
 from iris_session.security.file_worker import PATIENCE_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from iris_session.link.config import FrontLimits
-from iris_session.protocol.token_bucket import TokenBucket
+from iris_session.protocol.limits import TokenBucket
 
 MAX_SOURCES: Final = 256
 

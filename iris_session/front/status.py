@@ -16,6 +16,7 @@ import msgspec
 from iris_session.front.connections import ClientTable, Connection, Outbox
 from iris_session.link.config import FrontConfig
 from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import (
     AlignmentReport,
     AssetsReport,
@@ -27,7 +28,6 @@ from iris_session.protocol.status import (
     StatusReport,
     quantiles,
 )
-from iris_session.protocol.token_bucket import Drops
 
 #: Samples of one connection whose way is remembered: five devices at 90 Hz for a second, one for six.
 DELAYS: Final = 512

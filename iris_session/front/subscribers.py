@@ -14,7 +14,7 @@ import zmq
 from iris_session.front.visitors import Visitor, Visitors, crowd
 from iris_session.link.config import MILLISECOND, SECOND, FrontLimits
 from iris_session.link.sockets import next_tcp_event, readable, tcp_counts
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 LOOK_NS: Final = 250 * MILLISECOND
 #: A subscriber has no more to say than its handshake and a few topics.

@@ -11,7 +11,7 @@ from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND
 from iris_session.protocol.entries import Entry, encode_entries
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security.resume_tokens import ResumeTokens
 
 STATUS_NS = 500 * MILLISECOND

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import Protocol
 
 from iris_session.link.sockets import close_tcp, peer_of
-from iris_session.protocol.token_bucket import Drops, TokenBucket
+from iris_session.protocol.limits import Drops, TokenBucket
 
 
 class Visitor:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Vec3
-from iris_session.protocol.scene_looks import MeshLevel, TextureLevel
-from iris_session.protocol.scene_names import AssetEncoding, TextureKind
+from iris_session.protocol.names import AssetEncoding, TextureKind
+from iris_session.protocol.scene import MeshLevel, TextureLevel
 from iris_session.scene.images import Pixels, encode_image, halved
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 from iris_session.scene.simplify import simplified

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from anchors.pose import compose, inverse
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Pose
+from iris_session.protocol.names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.protocol.scene import Body, SceneSpec, Visual
-from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.collected import composed
 from iris_session.scene.coordinates import on_deformable, with_coordinates

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from iris_session.link.config import FrontConfig, FrontError
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import Role
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security import (
     DEFAULT_ROLES,
     AllowedKey,

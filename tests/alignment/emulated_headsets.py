@@ -12,8 +12,8 @@ from iris_session.alignment.service import AlignmentService
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, Entry
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import AlignmentChanged
-from iris_session.protocol.token_bucket import Drops
 from tests.anchors.worlds import Look, around, headset, shifted
 
 MS = 1_000_000

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.assets.cache import IN_USE_S
-from iris_session.client import AssetCache, AssetError
+from iris_session.assets.cache import IN_USE_S, AssetCache
+from iris_session.assets.errors import AssetStoreError
 
 DATA = os.urandom(100_000)
 ADDRESS = hashlib.sha256(DATA).hexdigest()
@@ -68,14 +68,14 @@ def test_damage_on_the_disk_is_found_and_taken_away(tmp_path: Path) -> None:
         file.write(b"damaged")
     assert cache.find(ADDRESS) is None
     assert not cache.path(ADDRESS).exists()
-    with pytest.raises(AssetError, match="fetch it again") as caught:
+    with pytest.raises(AssetStoreError, match="fetch it again") as caught:
         cache.read(ADDRESS)
     assert caught.value.reason == "gone"
 
 
 OTHER = """
 import sys
-from iris_session.client import AssetCache
+from iris_session.assets.cache import AssetCache
 part = AssetCache(sys.argv[1]).begin(sys.argv[2])
 part.append(b"of somebody else")
 print(part.offset, flush=True)
@@ -130,13 +130,13 @@ def stored(cache: AssetCache, data: bytes) -> str:
 
 FULL_DISK = """
 import resource, sys
-from iris_session.client import AssetCache, AssetError
-from iris_session.assets.cache import IN_USE_S
+from iris_session.assets.cache import AssetCache
+from iris_session.assets.errors import AssetStoreError
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 part = AssetCache(sys.argv[1]).begin(sys.argv[2])
 try:
     part.append(sys.stdin.buffer.read())
-except AssetError as error:
+except AssetStoreError as error:
     part.close()
     print(error.reason, error)
 """
@@ -218,7 +218,7 @@ def test_more_than_twice_its_bound_is_never_stored(tmp_path: Path) -> None:
     for i in range(2):
         stored(cache, bytes([i]) * (1 << 20))
     part = cache.begin(ADDRESS)
-    with pytest.raises(AssetError, match=r"full.*more than 1 MiB") as caught:
+    with pytest.raises(AssetStoreError, match=r"full.*more than 1 MiB") as caught:
         part.append(DATA)
     assert caught.value.reason == "cache"
     part.close()
@@ -256,7 +256,7 @@ def test_parts_of_other_people_in_a_shared_folder_do_no_harm(tmp_path: Path) -> 
 
 def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(AssetError, match="cannot be used") as caught:
+    with pytest.raises(AssetStoreError, match="cannot be used") as caught:
         AssetCache(tmp_path / "file").begin(ADDRESS)
     assert caught.value.reason == "cache"
     assert "client.asset_cache = AssetCache(folder)" in str(caught.value), "how to name another one"

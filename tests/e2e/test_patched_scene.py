@@ -16,7 +16,7 @@ from iris_session.client import AssetCache
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.scene import SetVisual
 from tests.e2e.publisher import cloth, grid
 
 pytestmark = pytest.mark.e2e

@@ -12,8 +12,8 @@ from iris_session.assets.cache import AssetCache
 from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
+from iris_session.protocol.names import ArrayKind
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
-from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
 from tests.e2e.conftest import Server, Stage

@@ -17,7 +17,7 @@ from iris_session.front.connections import ClientTable, Connection, Peer, Route
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.client_messages import Hello
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import AllowedKey, KeyPair
 from iris_session.security.keyring import Keyring
 

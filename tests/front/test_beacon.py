@@ -11,7 +11,7 @@ from iris_session.front.beacon import LOOK_AGAIN_NS, PERIOD_NS, BeaconSender
 from iris_session.link.interfaces import Interface
 from iris_session.protocol.codec import decode_beacon
 from iris_session.protocol.discovery import Beacon
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 BEACON = Beacon(1, "s1", "lab-1", "live", "", 7721, 7722, 0, 0, 0, "mark")
 LO = Interface("lo", "127.0.0.1", "127.255.255.255")

@@ -16,6 +16,7 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Marker,
     Release,
+    RemoveParticipant,
     Sample,
     TrackingEpoch,
 )
@@ -31,8 +32,7 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
-from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 SAMPLE = Sample("controller/right", "pose", 1, 0, 1, 0, 1, pose=IDENTITY, targets=(Target("left", 1),))
 

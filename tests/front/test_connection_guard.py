@@ -21,7 +21,7 @@ from iris_session.link.config import SECOND, FrontLimits
 from iris_session.link.sockets import close_tcp, peer_of, tcp_counts
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Audit, Entry
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 LIMITS = FrontLimits(strangers=3, hello_timeout_ns=10 * SECOND)
 

@@ -20,8 +20,8 @@ from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.entries import Lost
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import Message, ProtocolFault
-from iris_session.protocol.token_bucket import Drops
 
 
 class Door:

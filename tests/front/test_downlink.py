@@ -15,8 +15,8 @@ from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import SceneInfo
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
-from iris_session.protocol.token_bucket import Drops
 
 
 class Far:

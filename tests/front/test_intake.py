@@ -29,9 +29,9 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Audit, Entry, Join
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.keyring import Keyring
 from iris_session.security.resume_tokens import ResumeTokens
 

@@ -17,9 +17,10 @@ from iris_session.front.pairing import AGAIN_S, BURST, MAX_WAITING, PATIENCE_NS,
 from iris_session.front.revocation import LOOK_NS, Revocation
 from iris_session.link.config import SECOND, FrontConfig
 from iris_session.protocol import pairing
+from iris_session.protocol.client_messages import Pair
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
 from iris_session.security.keyring import STRANGER, Keyring, open_keyring
 from iris_session.security.resume_tokens import ResumeTokens

@@ -12,7 +12,7 @@ import zmq
 from iris_session.front.subscribers import LOOK_NS, Subscribers
 from iris_session.link.config import SECOND, FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port, open_state, watch_tcp
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 LIMITS = FrontLimits(strangers=4, subscribers=3, hello_timeout_ns=1000 * SECOND)
 

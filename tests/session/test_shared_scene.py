@@ -10,9 +10,7 @@ import mujoco
 import pytest
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneError
-from iris_session.protocol.scene_looks import Mesh, MeshLevel
-from iris_session.protocol.scene_patch import AddMesh, SetVisual
+from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, SetVisual
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
 from iris_session.session.config import SessionConfig

@@ -16,10 +16,10 @@ from iris_session.front.media.budget import (
 )
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import Listener, StreamFacts, Tally
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.media import CLASSES, StreamBudget
 from iris_session.protocol.names import BudgetClass, Role
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.keyring import Keyring
 
 LOOK_NS: Final = 250 * MILLISECOND
