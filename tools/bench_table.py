@@ -1,4 +1,4 @@
-"""Runs the benchmarks of a session under every profile and prints the table of docs/links.md.
+"""Runs the benchmarks of a session under every profile and prints the table of docs/evidence/links.md.
 
 python tools/bench_table.py --seconds 20 > table.md
 python tools/bench_table.py --profiles lan,busy-wifi --seconds 5 --json

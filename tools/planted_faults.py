@@ -1,6 +1,6 @@
 """Plants faults, one after the other, and looks whether `iris-session doctor` names each of them.
 
-    python tools/planted_faults.py                 the table of docs/doctor.md; exit status 1 when one is not named
+    python tools/planted_faults.py                 table of docs/evidence/doctor.md; exit status 1 when one is not named
     python tools/planted_faults.py --only revoked --only full-disk --verbose
     python tools/planted_faults.py --list
 

@@ -59,7 +59,7 @@ def main() -> int:
     parser.add_argument(
         "--per-process", type=int, default=2, help="people who share a process, and a link (%(default)s)"
     )
-    parser.add_argument("--profile", default="busy-wifi", help="of every link: docs/links.md (%(default)s)")
+    parser.add_argument("--profile", default="busy-wifi", help="of every link: docs/evidence/links.md (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of disturbances, people and weather")
     parser.add_argument("--keep", type=Path, help="folder for recording and logs (default: a temporary one)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")

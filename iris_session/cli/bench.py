@@ -50,7 +50,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--profile",
         default="",
         metavar="NAME",
-        help="everybody joins over a link like this (docs/links.md); no bars then",
+        help="everybody joins over a link like this (docs/evidence/links.md); no bars then",
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
     crypto = parser.add_mutually_exclusive_group()

@@ -46,7 +46,10 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
-        "--profile", default="", metavar="NAME", help="people join over links like this (docs/links.md), e.g. busy-wifi"
+        "--profile",
+        default="",
+        metavar="NAME",
+        help="links of the operators (docs/evidence/links.md), e.g. busy-wifi",
     )
     link.add_argument(
         "--latency", type=milliseconds, metavar="MS", help="people join over links that delay by this much each way"

@@ -123,7 +123,7 @@ def media(people: tuple[ParticipantReport, ...]) -> Finding:
         wanted = any(p.media for p in people)
         return ok("media", "everybody gets all they asked for" if wanted else "nobody has asked for media")
     why = "their link does not carry more; state and control come first"
-    advice = "a better network for them, or fewer and smaller streams; docs/links.md"
+    advice = "a better network for them, or fewer and smaller streams; docs/evidence/links.md"
     return warning("media", "; ".join(texts), why, advice)
 
 

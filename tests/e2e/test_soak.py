@@ -1,4 +1,4 @@
-"""The short form of `tools/soak.py`, and that its checks can fail. An hour of it is run by hand: docs/links.md."""
+"""The short form of `tools/soak.py`, and that its checks can fail. docs/evidence/links.md has the long one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The short form of `tools/fuzz.py`, and that it can find something. A million inputs each: docs/fuzzing.md."""
+"""The short form of `tools/fuzz.py`, and that it can find something. docs/evidence/fuzzing.md has the long one."""
 
 from __future__ import annotations
 

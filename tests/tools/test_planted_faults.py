@@ -1,5 +1,5 @@
 """How `tools/planted_faults.py` judges: a doctor who does not name a fault fails. Planting them needs root and minutes:
-docs/doctor.md has what was seen."""
+docs/evidence/doctor.md has what was seen."""
 
 from __future__ import annotations
 
