@@ -311,7 +311,7 @@ class AlignmentService:
 
     # --- periodic work -----------------------------------------------------------------------------------------------
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Compute at most one estimate or one cross-check: either takes up to milliseconds and delays state frames."""
         for number, state in self._states.items():
             if state.estimator.is_due(now_ns):

@@ -122,7 +122,7 @@ class Lab:
         """Run several passes of the front's loop; each computes one proposal at most."""
         for _ in range(times):
             self.now_ns += MS
-            self.service.turn(self.now_ns)
+            self.service.tick(self.now_ns)
 
     def put_in_force(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
         alignment = Alignment(

@@ -568,7 +568,7 @@ def test_a_proposal_of_the_same_instant_as_an_alarm_is_later() -> None:
         lab.now_ns += 10 * MS
         ann.head(((x, 0.0, 1.6), IDENTITY.q))
     ann.observe(Observation("sheet", "qr", IDENTITY, lab.now_ns, 1))
-    lab.service.turn(lab.now_ns)
+    lab.service.tick(lab.now_ns)
     alarm, refusal = ann.entries()[-2:]
     assert isinstance(alarm.message, AlignmentAlarm)
     assert isinstance(refusal.message, AlignmentProposal)

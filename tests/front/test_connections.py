@@ -7,16 +7,16 @@ import time
 import pytest
 import zmq
 
-from iris_session.front.traffic import Traffic
+from iris_session.front.connections import TrafficCounter
 
 #: Greeting and handshake, both ways, and what the other end says of itself.
 HANDSHAKE = 2000
 
 
-def settled(traffic: Traffic, descriptor: int, above: int, below: int) -> int:
+def settled(traffic: TrafficCounter, descriptor: int, above: int, below: int) -> int:
     """What is held, once it is within bounds: acknowledgements take their time."""
     deadline = time.monotonic() + 30.0
-    while not above <= (held := traffic.held(descriptor)) <= below:
+    while not above <= (held := traffic.pending_bytes(descriptor)) <= below:
         assert time.monotonic() < deadline, held
         time.sleep(0.005)
     return held
@@ -34,7 +34,7 @@ def test_what_waits_is_known_to_the_byte_but_for_the_handshake(curve: bool) -> N
         router.curve_server, router.curve_secretkey = True, secret
         dealer.curve_serverkey, (dealer.curve_publickey, dealer.curve_secretkey) = public, zmq.curve_keypair()
     dealer.connect(f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
-    traffic = Traffic(curve=curve)
+    traffic = TrafficCounter(curve=curve)
     descriptor = -1
 
     def take(n: int) -> bytes:
@@ -44,7 +44,7 @@ def test_what_waits_is_known_to_the_byte_but_for_the_handshake(curve: bool) -> N
             route = router.recv()
             frame = router.recv(copy=False)
             descriptor = int(frame.get(zmq.SRCFD))
-            traffic.taken(descriptor, len(frame.buffer))
+            traffic.count_received(descriptor, len(frame.buffer))
         return route
 
     for size in (0, 1, 200, 223, 255, 256, 5000):
@@ -61,12 +61,12 @@ def test_what_waits_is_known_to_the_byte_but_for_the_handshake(curve: bool) -> N
     for _ in range(1000):
         message = (b"x" * 10_000, b"y" * 100)
         router.send_multipart((route, *message))
-        traffic.handed(descriptor, message)
-    assert traffic.held(descriptor) > 2_000_000
+        traffic.count_sent(descriptor, message)
+    assert traffic.pending_bytes(descriptor) > 2_000_000
     for _ in range(1000):
         assert dealer.poll(30_000)
         dealer.recv_multipart()
     settled(traffic, descriptor, 0, HANDSHAKE)
-    traffic.begin(descriptor)
+    traffic.reset(descriptor)
     context.destroy(linger=0)
-    assert traffic.held(descriptor) == 0, "gone"
+    assert traffic.pending_bytes(descriptor) == 0, "gone"
