@@ -16,7 +16,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from iris_session.assets.cache import AssetCache
     from iris_session.assets.store import AssetStore
     from iris_session.authority.config import AuthorityConfig
     from iris_session.client import Client, ClientError, CurveKeys, DeniedError, FoundSession, find_sessions
@@ -82,7 +81,6 @@ _PUBLIC: Final = {
     "iris_session.scene.mujoco_scene": ("parse_mujoco",),
     "iris_session.scene.budget": ("Budget", "QUEST_3"),
     "iris_session.assets.store": ("AssetStore",),
-    "iris_session.assets.cache": ("AssetCache",),
     "iris_session.protocol.common": ("Pose",),
     "iris_session.protocol.scene": (
         "Geometry",
@@ -148,7 +146,6 @@ __all__ = [
     "FetchedScene",
     "Budget",
     "QUEST_3",
-    "AssetCache",
     "Deformables",
     "DeformableEncoder",
     "DeformableDecoder",

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, AssetHub, Reader
-from iris_session.assets.mapped_files import AssetFiles
+from iris_session.assets.store import ServedAssets
 from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
@@ -101,7 +101,7 @@ class AssetServer:
         self._guard = guard
         self._now_ns = now_ns
         self._encrypted = sockets.zap is not None
-        self._files = AssetFiles()
+        self._files = ServedAssets()
         self._scheduler = AssetHub(self._files.size)
         self._access = self._applied = AssetAccess()
         self._counts = {"bytes": 0, "chunks": 0, "requests": 0}

@@ -12,7 +12,7 @@ import pytest
 TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
-from soak_checks import check_log, check_memory  # noqa: E402
+from soak import check_log, check_memory  # noqa: E402
 
 RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
 

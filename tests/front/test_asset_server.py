@@ -15,7 +15,7 @@ import psutil
 import pytest
 import zmq
 
-from iris_session.assets.mapped_files import AssetFiles
+from iris_session.assets.store import ServedAssets
 from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
 from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
@@ -315,7 +315,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         def fail(*_: object) -> None:
             raise ZeroDivisionError("planted")
 
-        broken.setattr(AssetFiles, "chunk", fail)
+        broken.setattr(ServedAssets, "chunk", fail)
         assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
     assert _fetched(sockets, address) == b"asset"
     assert server.read_counters().reasons["assets_fault"] == 2

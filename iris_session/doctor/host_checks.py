@@ -10,24 +10,41 @@ from typing import Any, Final
 
 import psutil
 
-from iris_session.doctor.condition import FULL_DISK, LOW_DISK
 from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.doctor.session_checks import FULL_DISK, LOW_DISK
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.security import KeyHome, KeysError
 
 CONTROL_PORT: Final = 7721
 #: TCP ports of a session, from the control port.
-BLOCK: Final = {-1: "introduction", 0: "control", 1: "state", 2: "media", 3: "assets", 4: "web", 5: "media ingest"}
+PORT_OFFSETS: Final = {
+    -1: "introduction",
+    0: "control",
+    1: "state",
+    2: "media",
+    3: "assets",
+    4: "web",
+    5: "media ingest",
+}
 CLOCK_SOURCE: Final = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 SLOW_CLOCKS: Final = frozenset({"hpet", "acpi_pm", "jiffies", "pit"})
 
 
-def machine(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
+def check_host(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
     """All findings. `folder`: where recordings go."""
-    return [scheduling(), processors(), memory(), room(folder), key_home(), ports(control_port), interfaces(), clock()]
+    return [
+        check_scheduling(),
+        check_processors(),
+        check_memory(),
+        check_disk_space(folder),
+        check_key_home(),
+        check_ports(control_port),
+        check_interfaces(),
+        check_clock_source(),
+    ]
 
 
-def scheduling() -> Finding:
+def check_scheduling() -> Finding:
     """Whether the tick loop may run before other work."""
     from iris_session.session.scheduling import tick_priority
 
@@ -41,11 +58,11 @@ def scheduling() -> Finding:
     return warning("scheduling", "no real-time priority: other programs can make ticks late", "", advice)
 
 
-def processors() -> Finding:
+def check_processors() -> Finding:
     """How many, and how busy."""
     count, load = os.cpu_count() or 1, os.getloadavg()[0]
     busy = sorted(
-        ((p.info["cpu_percent"] or 0.0, p.info["name"], p.pid) for p in _processes(0.3)),
+        ((p.info["cpu_percent"] or 0.0, p.info["name"], p.pid) for p in _sample_processes(0.3)),
         reverse=True,
         key=lambda x: x[0],
     )
@@ -58,7 +75,7 @@ def processors() -> Finding:
     return ok("processors", text + (f"; busiest: {top}" if top else ""))
 
 
-def _processes(interval_s: float) -> list[psutil.Process]:
+def _sample_processes(interval_s: float) -> list[psutil.Process]:
     """All processes, with their share of a processor over `interval_s`."""
     for process in psutil.process_iter(["cpu_percent"]):
         del process  # the first look begins the measurement
@@ -66,7 +83,7 @@ def _processes(interval_s: float) -> list[psutil.Process]:
     return list(psutil.process_iter(["cpu_percent", "name"]))
 
 
-def memory() -> Finding:
+def check_memory() -> Finding:
     """What is left of it."""
     left = psutil.virtual_memory().available
     text = f"{left / 1e9:.1f} GB of memory are free"
@@ -75,7 +92,7 @@ def memory() -> Finding:
     return ok("memory", text)
 
 
-def room(folder: Path) -> Finding:
+def check_disk_space(folder: Path) -> Finding:
     """Room for recordings in `folder`, or where it will be made."""
     there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
     free = psutil.disk_usage(str(there)).free
@@ -87,7 +104,7 @@ def room(folder: Path) -> Finding:
     return warning("disk", text, "", "make room") if free < LOW_DISK else ok("disk", text)
 
 
-def key_home() -> Finding:
+def check_key_home() -> Finding:
     """Whether the home of keys can be read by its owner only, and is not damaged."""
     home = KeyHome()
     folder = home.path
@@ -104,16 +121,16 @@ def key_home() -> Finding:
     return ok("key_home", f"{folder}: {len(clients)} keys on the list, {len(codes)} join codes")
 
 
-def ports(control: int) -> Finding:
+def check_ports(control: int) -> Finding:
     """Whether the ports of a session are free, and who has them."""
-    wanted = {control + offset: name for offset, name in BLOCK.items()}
+    wanted = {control + offset: name for offset, name in PORT_OFFSETS.items()}
     taken: dict[int, str] = {}
     for port in wanted:
-        if _in_use(port):
+        if _is_port_in_use(port):
             taken[port] = "another program"
-    for connection in _connections():
+    for connection in _list_connections():
         if connection.status == psutil.CONN_LISTEN and connection.laddr.port in taken:
-            taken[connection.laddr.port] = _who(connection.pid)
+            taken[connection.laddr.port] = _describe_process(connection.pid)
     if not taken:
         return ok("ports", f"TCP {min(wanted)} to {max(wanted)} and UDP {DISCOVERY_PORT} are free for a session")
     text = "; ".join(
@@ -126,7 +143,7 @@ def ports(control: int) -> Finding:
     return warning("ports", f"in use: {text}", "another program has ports of a session", advice)
 
 
-def _in_use(port: int) -> bool:
+def _is_port_in_use(port: int) -> bool:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -136,14 +153,14 @@ def _in_use(port: int) -> bool:
     return False
 
 
-def _connections() -> list[Any]:
+def _list_connections() -> list[Any]:
     try:
         return list(psutil.net_connections("tcp"))
     except psutil.AccessDenied:
         return []
 
 
-def _who(pid: int | None) -> str:
+def _describe_process(pid: int | None) -> str:
     if pid is None:
         return "a program of another user"
     try:
@@ -153,9 +170,9 @@ def _who(pid: int | None) -> str:
         return f"process {pid}"
 
 
-def interfaces() -> Finding:
+def check_interfaces() -> Finding:
     """The addresses that others can type."""
-    from iris_session.doctor.reach import own_networks
+    from iris_session.doctor.network_checks import list_own_networks
 
     up = psutil.net_if_stats()
     typed = [
@@ -164,12 +181,12 @@ def interfaces() -> Finding:
         for one in addresses
         if one.family == socket.AF_INET and not one.address.startswith("127.") and (name not in up or up[name].isup)
     ]
-    if not typed and not own_networks():
+    if not typed and not list_own_networks():
         return warning("interfaces", "this machine is in no network", "", "connect it: only its own programs can join")
     return ok("interfaces", f"others type one of: {', '.join(typed) or 'IPv6 only'}")
 
 
-def clock() -> Finding:
+def check_clock_source() -> Finding:
     """Whether reading the clock is quick: a tick does so a dozen times."""
     try:
         source = CLOCK_SOURCE.read_text().strip()

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from iris_session.bench.contract import BenchReport, bar
+from iris_session.bench.report import BenchReport, make_bar
 from iris_session.cli.main import main
 
 STATE_KEYS = {
@@ -110,14 +110,14 @@ def test_bench_of_an_unknown_profile_is_one_line(capsys: pytest.CaptureFixture[s
 
 def _report(value: float) -> BenchReport:
     results = {"age_ms_p99": value, "extra": 1}
-    return BenchReport("state", {"clients": 2}, results, (bar(results, "age_ms_p99", "<=", 3.0),))
+    return BenchReport("state", {"clients": 2}, results, (make_bar(results, "age_ms_p99", "<=", 3.0),))
 
 
 @pytest.mark.parametrize(("value", "ok"), [(2.9, True), (3.0, True), (3.1, False), (math.nan, False)])
 def test_a_bar_is_kept_or_missed(value: float, ok: bool) -> None:
     report = _report(value)
     assert report.ok is ok
-    assert ("MISSED" in report.lines()) is not ok
+    assert ("MISSED" in report.format()) is not ok
 
 
 def test_what_never_came_is_null() -> None:

@@ -4,7 +4,7 @@ No physics, no people, no codec: a loop at real-time priority and bare libzmq fr
 run in which the session is measured. Where even this is late, so is every session. `bench state` and `bench input` give
 it as their reference.
 
-    python -m iris_session.bench.bare ADDRESS SOCKETS     one process of receivers
+    python -m iris_session.bench.baseline ADDRESS SOCKETS     one process of receivers
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 from iris_session.session.scheduling import quiet_collector, tick_priority
 from iris_session.system import children
 
@@ -34,7 +34,7 @@ _END: Final = -1
 _JOIN_S: Final = 30.0
 
 
-def bare(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
+def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
     """Reference figures, keys as of the session's own: `bare_age_ms_*` from sending to the receiving program,
     `bare_late_tick_share`, `bare_lateness_ms_p99` of a loop of 2 ms that does nothing else."""
     with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
@@ -42,15 +42,15 @@ def bare(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
         socket.setsockopt(zmq.XPUB_VERBOSE, 1)
         port = socket.bind_to_random_port("tcp://127.0.0.1")
         shares = [min(PER_PROCESS, receivers - i) for i in range(0, receivers, PER_PROCESS)]
-        processes = [_receiver(f"tcp://127.0.0.1:{port}", n) for n in shares]
+        processes = [_start_receiver(f"tcp://127.0.0.1:{port}", n) for n in shares]
         try:
             for _ in range(receivers):
                 if not socket.poll(round(_JOIN_S * 1e3)):
                     raise BenchError(f"the receivers of the reference did not join within {_JOIN_S:g} s")
                 socket.recv()
-            lateness = _loop(socket, seconds)
-            socket.send(_frame(_END))
-            ages = np.concatenate([_ages(process) for process in processes])
+            lateness = _run_loop(socket, seconds)
+            socket.send(_encode_frame(_END))
+            ages = np.concatenate([_read_ages(process) for process in processes])
         finally:
             for process in processes:
                 process.kill()
@@ -64,12 +64,12 @@ def bare(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
     }
 
 
-def _receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
-    command = children.command("iris_session.bench.bare", address, str(sockets))
+def _start_receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
+    command = children.command("iris_session.bench.baseline", address, str(sockets))
     return subprocess.Popen(command, stdout=subprocess.PIPE, env=children.environment())
 
 
-def _ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
+def _read_ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
     out, _ = process.communicate(timeout=_JOIN_S)
     ages = np.frombuffer(out, np.int64).astype(np.float64) * 1e-6
     if process.returncode or not len(ages):
@@ -77,7 +77,7 @@ def _ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
     return ages
 
 
-def _loop(socket: zmq.Socket[bytes], seconds: float) -> list[int]:
+def _run_loop(socket: zmq.Socket[bytes], seconds: float) -> list[int]:
     """Lateness [ns] of every tick; deadlines are start + k * period, as the session's."""
     lateness: list[int] = []
     with tick_priority(), quiet_collector():
@@ -87,14 +87,14 @@ def _loop(socket: zmq.Socket[bytes], seconds: float) -> list[int]:
             time.sleep(max(0, deadline - time.monotonic_ns()) * 1e-9)
             now = time.monotonic_ns()
             if now >= published:
-                socket.send(_frame(now))
+                socket.send(_encode_frame(now))
                 published += FRAME_NS
             lateness.append(time.monotonic_ns() - deadline)
             deadline += PERIOD_NS
     return lateness
 
 
-def _frame(sent_ns: int) -> bytes:
+def _encode_frame(sent_ns: int) -> bytes:
     return sent_ns.to_bytes(8, "little", signed=True) + bytes(FRAME_BYTES - 8)
 
 

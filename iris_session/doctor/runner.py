@@ -14,17 +14,17 @@ from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
 from iris_session.client.errors import ClientError
 from iris_session.client.meeting import is_loopback
-from iris_session.doctor import condition, door, reach
+from iris_session.doctor import join_checks, network_checks, session_checks
 from iris_session.doctor.findings import OK, Findings, failed, ok
-from iris_session.doctor.machine import machine
+from iris_session.doctor.host_checks import check_host
 from iris_session.protocol.names import Role
 from iris_session.protocol.status import StatusReport
 from iris_session.security import KeyHome, KeysError
 
 LOCAL: Final = "127.0.0.1:7721"
-DOOR: Final = ("server_key", "key", "role", "join")
-ARRIVAL: Final = ("clock", "state")
-CONDITION: Final = (
+JOIN_CHECKS: Final = ("server_key", "key", "role", "join")
+STREAM_CHECKS: Final = ("clock", "state")
+SESSION_CHECKS: Final = (
     "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
     "age", "ticks", "media", "recorder", "disk", "drops",
 )  # fmt: skip
@@ -42,13 +42,13 @@ ORDER: Final = (
     "code",
     "role",
     "join",
-    *ARRIVAL,
-    *CONDITION,
+    *STREAM_CHECKS,
+    *SESSION_CHECKS,
 )
 
 
 @dataclass
-class Examination:
+class DoctorReport:
     """`address`: what was looked at, as far as it is known. `report`: what the session said, if it did."""
 
     address: str = ""
@@ -69,44 +69,46 @@ class Examination:
         }
 
 
-def examine(
+def run_checks(
     address: str = "",
     *,
     session: str = "",
     code: str = "",
     role: str = Role.OBSERVER,
-    told: Callable[[str], None] = lambda _: None,
-) -> Examination:
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> DoctorReport:
     """Looks at the session at `address` (or called `session`; neither: that of this user, see `here`). Takes seconds.
 
     `told` hears what is done next. Nothing is changed there: it joins as `doctor`, and leaves. A `code` is used up.
     """
-    result = Examination()
+    result = DoctorReport()
     findings = result.findings
     try:
-        target = None if session else Address.parse(address or here())
+        target = None if session else Address.parse(address or find_default_address())
     except ClientError as error:
         findings.add(failed("address", str(error)))
-        findings.skip("tcp", *DOOR, *ARRIVAL, *CONDITION)
+        findings.skip("tcp", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return result
-    told("listening for sessions")
-    heard, found = reach.beacon(session, target)
+    on_progress("listening for sessions")
+    heard, found = network_checks.check_beacon(session, target)
     findings.add(heard)
     if target is None and not heard.failed:
         target = Address.parse(next(one.address for one in found if one.name == session))
     if target is None:
-        findings.skip("address", "subnet", "tcp", "introduction", "version", *DOOR, *ARRIVAL, *CONDITION)
+        findings.skip(
+            "address", "subnet", "tcp", "introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS
+        )
         return result
     result.address = str(target)
-    told(f"looking for {target}")
-    if not _way(target, findings, found):
-        findings.skip("introduction", "version", *DOOR, *ARRIVAL, *CONDITION)
+    on_progress(f"looking for {target}")
+    if not _check_network(target, findings, found):
+        findings.skip("introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return result
-    _door(result, target, address or str(target), code or target.join_code, role, told)
+    _check_join(result, target, address or str(target), code or target.join_code, role, on_progress)
     return result
 
 
-def here() -> str:
+def find_default_address() -> str:
     """Address of the encrypted session that this user serves on this machine, if it is the only one; else that of a
     session on loopback at the usual port."""
     try:
@@ -116,33 +118,38 @@ def here() -> str:
     return str(Address(notes[0].hosts[0], notes[0].control)) if len(notes) == 1 and notes[0].hosts else LOCAL
 
 
-def _way(target: Address, findings: Findings, heard: list[FoundSession]) -> bool:
-    named, ip = reach.resolved(target)
+def _check_network(target: Address, findings: Findings, heard: list[FoundSession]) -> bool:
+    named, ip = network_checks.check_address(target)
     findings.add(named)
     if not ip:
         return False
-    findings.add(reach.subnet(ip), reach.heard_elsewhere(reach.tcp(target, ip), target, heard))
+    findings.add(
+        network_checks.check_subnet(ip),
+        network_checks.mention_heard_sessions(network_checks.check_tcp(target, ip), target, heard),
+    )
     return not findings["tcp"].failed
 
 
-def _door(result: Examination, target: Address, typed: str, code: str, role: str, told: Callable[[str], None]) -> None:
+def _check_join(
+    result: DoctorReport, target: Address, typed: str, code: str, role: str, on_progress: Callable[[str], None]
+) -> None:
     findings = result.findings
-    introduced, version, said = reach.introduction(target)
-    base = reach.base_of_ports(target) if introduced.state != OK else None
+    introduced, version, said = network_checks.check_introduction(target)
+    base = network_checks.check_port_base(target) if introduced.state != OK else None
     if base is not None:
         findings.add(base)
-        findings.skip("version", *DOOR, *ARRIVAL, *CONDITION)
+        findings.skip("version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return
     findings.add(introduced, version)
     if version.failed:
-        findings.skip(*DOOR, *ARRIVAL, *CONDITION)
+        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return
-    findings.add(door.server_key(target, said))
+    findings.add(join_checks.check_server_key(target, said))
     if findings["server_key"].failed:
-        findings.skip(*DOOR, *ARRIVAL, *CONDITION)
+        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
         return
-    told(f"joining {target} as {role}")
-    visit = door.knock(target, typed, code, role, said)
+    on_progress(f"joining {target} as {role}")
+    visit = join_checks.attempt_join(target, typed, code, role, said)
     findings.add(*visit.findings)
     if any(one.check == "join" and not one.failed for one in visit.findings):
         plain = is_loopback(target.host) and not (said is not None and said.server_key)
@@ -150,35 +157,37 @@ def _door(result: Examination, target: Address, typed: str, code: str, role: str
         findings.add(ok("key", text))
     result.report = visit.report
     if visit.report is not None:
-        findings.add(*condition.conditions(visit.report, visit.own_id))
-    findings.skip(*DOOR, *ARRIVAL, *CONDITION)
+        findings.add(*session_checks.check_session_report(visit.report, visit.own_id))
+    findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
     findings.sort(ORDER)
 
 
-def examine_server(address: str, recordings: Path, *, told: Callable[[str], None] = lambda _: None) -> Examination:
+def run_host_checks(
+    address: str, recordings: Path, *, on_progress: Callable[[str], None] = lambda _: None
+) -> DoctorReport:
     """Looks at this machine, and at the session that runs on it, if one does. `recordings`: the folder for them.
 
     `address`: of that session; empty: that of this user, see `here`, else the first that tells of itself from here.
     """
-    told("looking at this machine")
-    target = Address.parse(address or here())
-    result = Examination(str(target))
-    result.findings.add(*machine(recordings, target.port))
-    named, ip = reach.resolved(target)
+    on_progress("looking at this machine")
+    target = Address.parse(address or find_default_address())
+    result = DoctorReport(str(target))
+    result.findings.add(*check_host(recordings, target.port))
+    named, ip = network_checks.check_address(target)
     if not ip:
         result.findings.add(named)
         return result
-    if reach.tcp(target, ip).failed and not address:
+    if network_checks.check_tcp(target, ip).failed and not address:
         own = {one.address for addresses in psutil.net_if_addrs().values() for one in addresses}
-        local = [found for found in map(_address, reach.beacon("", None)[1]) if found.host in own]
+        local = [found for found in map(_to_address, network_checks.check_beacon("", None)[1]) if found.host in own]
         target = local[0] if local else target
-        ip = reach.resolved(target)[1]
-    if not reach.tcp(target, ip).failed:
-        inside = examine(str(target), told=told)
+        ip = network_checks.check_address(target)[1]
+    if not network_checks.check_tcp(target, ip).failed:
+        inside = run_checks(str(target), on_progress=on_progress)
         result.address, result.report = inside.address, inside.report
         result.findings.add(*(one for one in inside.findings if one.check not in ("beacon", "address", "subnet")))
     return result
 
 
-def _address(found: FoundSession) -> Address:
+def _to_address(found: FoundSession) -> Address:
     return Address.parse(found.address)

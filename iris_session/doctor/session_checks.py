@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from iris_session.doctor import headsets
-from iris_session.doctor.dropped import told
+from iris_session.doctor import headset_checks
+from iris_session.doctor.drop_explanations import explain_drops
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.common import Nanoseconds
 from iris_session.protocol.names import AlignmentKind, CommandKind, HoldReason, LateCause, Role
@@ -31,7 +31,7 @@ STAGES: Final = {
     "authority -> state": (15.0, "the front has too little processor time: see load, and other programs"),
     "state -> client": (OLD_MS, "the network to that client, or the client itself is too slow"),
 }
-CAUSES: Final = {
+LATE_CAUSES: Final = {
     LateCause.SCHEDULER: (
         "the session did not get the processor when it was ready",
         "end other programs, or permit real-time priority (docs/network.md)",
@@ -45,7 +45,7 @@ CAUSES: Final = {
     "skipped": ("the session stood still for more than a second", "look at the program that owns it"),
 }
 #: Why a robot that somebody has holds still without them wanting it.
-UNWANTED: Final = {
+HOLD_ADVICE: Final = {
     HoldReason.NO_SAMPLE: "no sample has counted yet: does the app send samples that name this robot?",
     HoldReason.STALE: "no counted sample for 150 ms: a slow network, or the app stopped sending",
     HoldReason.UNTRACKED: "the device is not tracked: bring it into view",
@@ -55,34 +55,34 @@ UNWANTED: Final = {
 }
 
 
-def conditions(report: StatusReport, own_id: str = "") -> list[Finding]:
+def check_session_report(report: StatusReport, own_id: str = "") -> list[Finding]:
     """All findings of a report, in the order of a person's questions. `own_id`: the doctor itself, left out.
 
     Of a session that stands still only what does not change meanwhile: nobody keeps up with it.
     """
     people = tuple(p for p in report.participants if p.id != own_id)
     stepping = [
-        robots(report.robots, people),
-        clients(people),
-        age(people, report),
-        ticks(report),
-        headsets.media(people),
+        check_robots(report.robots, people),
+        check_clients(people),
+        check_data_age(people, report),
+        check_ticks(report),
+        headset_checks.check_media(people),
     ]
-    first = session(report)
+    first = check_stepping(report)
     return [
         first,
-        alignment(people, ", ".join(one.anchor_id for one in report.anchors), driven=bool(report.robots)),
-        *headsets.headsets(people, report),
-        leases(people, report.robots),
+        check_alignment(people, ", ".join(one.anchor_id for one in report.anchors), driven=bool(report.robots)),
+        *headset_checks.check_headsets(people, report),
+        check_leases(people, report.robots),
         *([] if first.failed and not report.estop else stepping),
-        recorder(report),
-        disk(report),
-        drops(report),
+        check_recorder(report),
+        check_disk(report),
+        check_drops(report),
         *([warning("warnings", "; ".join(report.warnings))] if report.warnings else []),
     ]
 
 
-def session(report: StatusReport) -> Finding:
+def check_stepping(report: StatusReport) -> Finding:
     """Whether it steps, is paused, or stopped."""
     silent_s = report.authority_silent_ns * 1e-9
     if report.authority_silent_ns < 0:
@@ -110,11 +110,11 @@ def session(report: StatusReport) -> Finding:
     return ok("session", f"steps: tick {report.tick}, at the pace of the program that owns it")
 
 
-def alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, driven: bool = True) -> Finding:
+def check_alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, driven: bool = True) -> Finding:
     """Who cannot drive, or sees the scene in the wrong place, for want of an alignment. `sheets`: of the session.
     `driven`: there are robots; where none is, only headsets that look for a sheet, or have lost it, want one."""
-    void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE and (driven or _looks(p))]
-    texts = [f"{p.name} has no alignment{_unaligned(p)}" for p in void]
+    void = [p for p in people if p.connected and p.alignment == AlignmentKind.NONE and (driven or _has_seen_sheet(p))]
+    texts = [f"{p.name} has no alignment{_explain_unaligned(p)}" for p in void]
     measured = [p for p in people if p.alignment == AlignmentKind.MEASURED]
     fine = ", ".join(f"{p.name} {p.alignment_error_m * 1e3:.0f} mm" for p in measured)
     if not texts:
@@ -129,17 +129,17 @@ def alignment(people: tuple[ParticipantReport, ...], sheets: str = "", *, driven
     return say("alignment", "; ".join(texts), why, advice)
 
 
-def _looks(p: ParticipantReport) -> bool:
+def _has_seen_sheet(p: ParticipantReport) -> bool:
     """Whether it has seen a sheet, or what may be one: a screen sees none."""
     seen = p.alignment_report
     return p.alignment_void_ns >= 0 or (seen is not None and bool(seen.seen or seen.unusable))
 
 
-def _unaligned(p: ParticipantReport) -> str:
+def _explain_unaligned(p: ParticipantReport) -> str:
     """Why it has none, as far as can be told."""
     seen = p.alignment_report
     if p.alignment_void_ns >= 0:
-        return f" (lost {_seconds(p.alignment_void_ns)} ago: its tracking frame jumped)"
+        return f" (lost {_format_seconds(p.alignment_void_ns)} ago: its tracking frame jumped)"
     if seen is None or seen.seen:
         return ""
     return (
@@ -147,7 +147,7 @@ def _unaligned(p: ParticipantReport) -> str:
     )
 
 
-def leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotReport, ...]) -> Finding:
+def check_leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotReport, ...]) -> Finding:
     """Who has which robot, and who has none."""
     held = ", ".join(f"{r.name}: {r.holder_name or r.holder or 'free'}" for r in all_robots) or "no robots here"
     without = [p for p in people if p.connected and p.role in DRIVERS and not p.holds]
@@ -168,28 +168,28 @@ def leases(people: tuple[ParticipantReport, ...], all_robots: tuple[RobotReport,
     )
 
 
-def robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantReport, ...]) -> Finding:
+def check_robots(all_robots: tuple[RobotReport, ...], people: tuple[ParticipantReport, ...]) -> Finding:
     """Robots that somebody has and that hold still unwillingly."""
     rejected = {p.id: p.rejected for p in people}
     texts, reasons = [], []
     for r in all_robots:
-        if r.holder and r.state == CommandKind.HOLD and r.hold_reason in UNWANTED:
+        if r.holder and r.state == CommandKind.HOLD and r.hold_reason in HOLD_ADVICE:
             counts = rejected.get(r.holder) or {}
             some = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items(), key=lambda item: -item[1])[:3])
             texts.append(f"{r.name} ({r.holder_name}) holds: {r.hold_reason}" + (f", rejected: {some}" if some else ""))
-            reasons.append(UNWANTED[r.hold_reason])
+            reasons.append(HOLD_ADVICE[r.hold_reason])
     if texts:
         return warning("robots", "; ".join(texts), "", "; ".join(dict.fromkeys(reasons)))
     states = ", ".join(f"{r.name} {r.hold_reason or r.state}" for r in all_robots)
     return ok("robots", states or "none")
 
 
-def clients(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_clients(people: tuple[ParticipantReport, ...]) -> Finding:
     """Who does not keep up, or has gone."""
     bad: list[str] = []
     worst: list[str] = []
     for p in people:
-        trouble = list(_trouble(p))
+        trouble = list(_list_client_problems(p))
         if trouble:
             (worst if not p.connected or p.heard_ns > SILENT_NS else bad).append(f"{p.name}: {', '.join(trouble)}")
     if not bad and not worst:
@@ -199,12 +199,12 @@ def clients(people: tuple[ParticipantReport, ...]) -> Finding:
     return (failed if worst else warning)("clients", "; ".join(worst + bad), why, advice)
 
 
-def _trouble(p: ParticipantReport) -> Iterator[str]:
+def _list_client_problems(p: ParticipantReport) -> Iterator[str]:
     if not p.connected:
         yield f"connection lost ({p.lost or 'unknown'})"
         return
     if p.heard_ns > SILENT_NS:
-        yield f"silent for {_seconds(p.heard_ns)}"
+        yield f"silent for {_format_seconds(p.heard_ns)}"
     if p.reported and p.state_age is None:
         yield "gets no state: is its state port open?"
     if p.missed_share > MISSED_SHARE:
@@ -213,9 +213,9 @@ def _trouble(p: ParticipantReport) -> Iterator[str]:
         yield f"sees data of {p.state_age.p50:.0f} ms ago"
 
 
-def age(people: tuple[ParticipantReport, ...], report: StatusReport) -> Finding:
+def check_data_age(people: tuple[ParticipantReport, ...], report: StatusReport) -> Finding:
     """How old the data is by stage of its way, and which stage is to blame."""
-    took = stages(people, report)
+    took = measure_stages(people, report)
     if not took:
         return ok("age", "nothing moves along its way now")
     text = ", ".join(f"{stage} {ms:.1f} ms" + (f" ({who})" if who else "") for stage, (ms, who) in took.items())
@@ -226,7 +226,7 @@ def age(people: tuple[ParticipantReport, ...], report: StatusReport) -> Finding:
     return warning("age", f"{guilty} is slow; p99: {text}", STAGES[guilty][1], "see docs/troubleshooting.md, Old data")
 
 
-def stages(people: tuple[ParticipantReport, ...], report: StatusReport) -> dict[str, tuple[float, str]]:
+def measure_stages(people: tuple[ParticipantReport, ...], report: StatusReport) -> dict[str, tuple[float, str]]:
     """99th percentile [ms] of the worst one, and who that is, per stage that was measured."""
     took: dict[str, tuple[float, str]] = {}
     devices = [(p.capture_to_receive.p99, p.name) for p in people if p.capture_to_receive is not None]
@@ -245,7 +245,7 @@ def stages(people: tuple[ParticipantReport, ...], report: StatusReport) -> dict[
     return took
 
 
-def ticks(report: StatusReport) -> Finding:
+def check_ticks(report: StatusReport) -> Finding:
     """Late ticks, and what they are late for."""
     if report.lateness is None:
         return ok("ticks", "the owner's loop sets the pace: nothing is late")
@@ -260,12 +260,12 @@ def ticks(report: StatusReport) -> Finding:
         return warning("ticks", text)
     counts = ", ".join(f"{cause} {n}" for cause, n in sorted(report.late_causes.items(), key=lambda item: -item[1]))
     main = max(sorted(report.late_causes), key=report.late_causes.__getitem__)
-    why, advice = CAUSES.get(main, (main, ""))
+    why, advice = LATE_CAUSES.get(main, (main, ""))
     say = failed if report.late_share > VERY_LATE_SHARE else warning
     return say("ticks", f"{text}; causes: {counts}", f"{main}: {why}", advice)
 
 
-def recorder(report: StatusReport) -> Finding:
+def check_recorder(report: StatusReport) -> Finding:
     """Whether the recording goes on."""
     one = report.recorder
     if one is None or one.state == "off":
@@ -284,7 +284,7 @@ def recorder(report: StatusReport) -> Finding:
     return ok("recorder", f"{text}{waiting}")
 
 
-def disk(report: StatusReport) -> Finding:
+def check_disk(report: StatusReport) -> Finding:
     """Room for the recording."""
     one = report.recorder
     if one is None or one.state == "off" or not one.disk_free_bytes:
@@ -301,10 +301,10 @@ def disk(report: StatusReport) -> Finding:
     return ok("disk", text)
 
 
-def drops(report: StatusReport) -> Finding:
+def check_drops(report: StatusReport) -> Finding:
     """What was thrown away, and front or recorder that had to be started again."""
     restarts = ", ".join(f"{name} {n} times" for name, n in sorted(report.restarts.items()) if n)
-    text = told(report.drops)
+    text = explain_drops(report.drops)
     if restarts:
         return warning(
             "drops", f"started again: {restarts}; dropped: {text or 'nothing'}", "", "see the session's terminal"
@@ -312,5 +312,5 @@ def drops(report: StatusReport) -> Finding:
     return ok("drops", f"dropped so far: {text or 'nothing'}")
 
 
-def _seconds(duration_ns: Nanoseconds) -> str:
+def _format_seconds(duration_ns: Nanoseconds) -> str:
     return f"{duration_ns * 1e-9:.1f} s"

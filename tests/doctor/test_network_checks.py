@@ -12,9 +12,9 @@ import pytest
 
 from iris_session.client.address import Address
 from iris_session.client.discovery import FoundSession
-from iris_session.doctor import reach
-from iris_session.doctor.examination import examine
+from iris_session.doctor import network_checks
 from iris_session.doctor.findings import failed, ok
+from iris_session.doctor.runner import run_checks
 from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import PROTOCOL_VERSION
@@ -68,7 +68,7 @@ def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
 
 def test_a_session_introduces_itself() -> None:
     with says(introduction()) as address:
-        introduced, version, said = reach.introduction(address)
+        introduced, version, said = network_checks.check_introduction(address)
     assert (introduced.state, version.state) == ("ok", "ok")
     assert "'lab' (live), 3 participants, a join code is open" in introduced.text
     assert said is not None
@@ -77,7 +77,7 @@ def test_a_session_introduces_itself() -> None:
 @pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
 def test_another_version(theirs: int, older: str) -> None:
     with says(introduction(theirs)) as address:
-        _, version, said = reach.introduction(address)
+        _, version, said = network_checks.check_introduction(address)
     assert version.failed
     assert f"version {theirs}" in version.text
     assert version.advice.startswith(f"update {older}")
@@ -89,12 +89,12 @@ def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         nothing = Address("127.0.0.1", free.getsockname()[1])
-    assert reach.base_of_ports(nothing) is None
+    assert network_checks.check_port_base(nothing) is None
     with says(b"SSH-2.0-OpenSSH_9.2\r\n" + bytes(64)) as above:
-        assert reach.base_of_ports(Address("127.0.0.1", above.port - 1)) is None
+        assert network_checks.check_port_base(Address("127.0.0.1", above.port - 1)) is None
     with says_of_itself() as above:
         base = Address("127.0.0.1", above.port - 1)
-        found = reach.base_of_ports(base)
+        found = network_checks.check_port_base(base)
     assert found is not None
     assert found.failed
     assert f"port {base.port} is the base of the ports of session 'lab', which is joined at {above}" in found.text
@@ -102,9 +102,9 @@ def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
 
 
 def test_the_examination_ends_at_the_base_of_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reach, "LISTEN_S", 0.01)
+    monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
     with says_of_itself(times=2) as above:
-        result = examine(f"127.0.0.1:{above.port - 1}")
+        result = run_checks(f"127.0.0.1:{above.port - 1}")
     found = {one.check: one for one in result.findings}
     assert found["introduction"].advice == f"use {above}"
     assert found["join"].state == "skipped"
@@ -113,7 +113,7 @@ def test_the_examination_ends_at_the_base_of_a_block(monkeypatch: pytest.MonkeyP
 
 def test_something_else_introduces_itself() -> None:
     with says(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n") as address:
-        introduced, version, _ = reach.introduction(address)
+        introduced, version, _ = network_checks.check_introduction(address)
     assert introduced.state in ("failed", "warning")
     assert version.state == "skipped"
 
@@ -122,10 +122,10 @@ def test_closed_port() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    found = reach.tcp(Address("127.0.0.1", port), "127.0.0.1")
+    found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
     assert found.failed
     assert "nothing listens" in found.text
-    introduced, _, _ = reach.introduction(Address("127.0.0.1", port + 1))
+    introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
     assert introduced.state == "warning"
 
 
@@ -133,11 +133,11 @@ def test_open_port() -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(1)
-        assert reach.tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
+        assert network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
 
 
 def test_a_firewall_is_told_from_a_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reach, "CONNECT_S", 0.2)
+    monkeypatch.setattr(network_checks, "CONNECT_S", 0.2)
     with socket.socket() as listener, contextlib.ExitStack() as stack:
         listener.bind(("127.0.0.1", 0))
         listener.listen(0)  # full after one: the system throws the rest away
@@ -145,39 +145,41 @@ def test_a_firewall_is_told_from_a_closed_port(monkeypatch: pytest.MonkeyPatch) 
             filling = stack.enter_context(socket.socket())
             filling.setblocking(False)
             filling.connect_ex(listener.getsockname())
-        found = reach.tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1")
+        found = network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1")
     assert found.failed
     assert "firewall" in found.why
 
 
 def test_own_machine_and_own_networks() -> None:
-    assert reach.subnet("127.0.0.1").state == "ok"
-    assert reach.subnet("::1").state == "ok"
-    for name, network in reach.own_networks():
+    assert network_checks.check_subnet("127.0.0.1").state == "ok"
+    assert network_checks.check_subnet("::1").state == "ok"
+    for name, network in network_checks.list_own_networks():
         inside = str(next(network.hosts()))
-        found = reach.subnet(inside)
+        found = network_checks.check_subnet(inside)
         assert found.state == "ok"
         assert name in found.text or str(network) in found.text or "in the network of" in found.text
 
 
 def test_foreign_network() -> None:
     """Addresses of TEST-NET-3 are in nobody's network."""
-    found = reach.subnet("203.0.113.77")
+    found = network_checks.check_subnet("203.0.113.77")
     assert found.state in ("warning", "failed")
     assert "none of this machine's networks" in found.text
     assert found.advice
 
 
 def test_names() -> None:
-    found, ip = reach.resolved(Address("localhost", 7721))
+    found, ip = network_checks.check_address(Address("localhost", 7721))
     assert found.state == "ok"
     assert ip in ("127.0.0.1", "::1")
     for nobody in ("a..b", "x" * 300, ""):
-        found, ip = reach.resolved(Address(nobody, 7721))
+        found, ip = network_checks.check_address(Address(nobody, 7721))
         assert (found.state, ip) == ("failed", "")
-        assert reach.tcp(Address(nobody, 7721), ip).failed  # not this machine, which an empty address means
-        assert reach.tcp(Address(nobody, 7721), nobody).failed
-    found, ip = reach.resolved(Address("no-such-machine.invalid", 7721))
+        assert network_checks.check_tcp(
+            Address(nobody, 7721), ip
+        ).failed  # not this machine, which an empty address means
+        assert network_checks.check_tcp(Address(nobody, 7721), nobody).failed
+    found, ip = network_checks.check_address(Address("no-such-machine.invalid", 7721))
     assert found.failed
     assert ip == ""
 
@@ -222,11 +224,11 @@ def test_beacon(
     state: str,
     text: str,
 ) -> None:
-    monkeypatch.setattr(reach, "LISTEN_S", 0.01)
-    monkeypatch.setattr(reach, "BeaconListener", Listener)
+    monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
+    monkeypatch.setattr(network_checks, "BeaconListener", Listener)
     monkeypatch.setattr(Listener, "sessions_heard", sessions)
     monkeypatch.setattr(Listener, "ignored", ignored)
-    found, _ = reach.beacon(name, None)
+    found, _ = network_checks.check_beacon(name, None)
     assert found.state == state
     assert text in found.text
 
@@ -235,14 +237,14 @@ def test_sessions_that_are_heard_elsewhere_may_be_meant() -> None:
     typed = Address("10.0.0.9", 7721)
     there = [heard("lab", "10.0.0.1:7721"), heard("itself", str(typed))]
     dead = failed("tcp", "nothing listens", "why", "look")
-    told = reach.heard_elsewhere(dead, typed, there)
+    told = network_checks.mention_heard_sessions(dead, typed, there)
     assert "lab (10.0.0.1:7721)" in told.advice
     assert "itself" not in told.advice
     assert (told.text, told.why) == (dead.text, dead.why)
-    assert reach.heard_elsewhere(dead, typed, there[1:]) is dead
+    assert network_checks.mention_heard_sessions(dead, typed, there[1:]) is dead
     well = ok("tcp", "takes connections")
-    assert reach.heard_elsewhere(well, typed, there) is well
+    assert network_checks.mention_heard_sessions(well, typed, there) is well
 
 
 def test_networks_that_cannot_be_used_are_not_told() -> None:
-    assert not any(network.version == 6 and network.is_link_local for _, network in reach.own_networks())
+    assert not any(network.version == 6 and network.is_link_local for _, network in network_checks.list_own_networks())

@@ -22,7 +22,7 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 from iris_session.netsim.process import ImpairmentProcess
 from iris_session.netsim.session_link import link_address, links_before
 from iris_session.physics import PacerStats
@@ -43,12 +43,12 @@ Log = dict[str, NDArray[Any]]
 Group = tuple[ClientJob, ...]  # the clients of one process
 
 
-def grouped(specs: Sequence[ClientJob]) -> list[Group]:
+def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
     """`specs` in processes of at most `CLIENTS_PER_PROCESS`."""
     return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
 
 
-def linked(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
+def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
     """Each of `specs` on a link of its own, and the profile by link; as they are when `profile` is empty."""
     if not profile:
         return list(specs), {}
@@ -57,7 +57,7 @@ def linked(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], d
 
 
 @dataclass
-class Measured:
+class Measurement:
     """One window, from session time `begin_ns` on.
 
     `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
@@ -91,19 +91,19 @@ class ClientProcess:
         self._process.stdin.flush()
         os.set_blocking(self._process.stdout.fileno(), False)
 
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """True once its clients have joined. Raises when it died."""
         assert self._process.stdout is not None
         if self._process.poll() is not None:
             raise BenchError(f"a client process ended with status {self._process.returncode} before it was ready")
         return (self._process.stdout.read(6) or b"").startswith(b"ready")
 
-    def window(self, begin_ns: int, end_ns: int) -> None:
+    def set_window(self, begin_ns: int, end_ns: int) -> None:
         assert self._process.stdin is not None
         self._process.stdin.write(f"{begin_ns} {end_ns}\n".encode())
         self._process.stdin.flush()
 
-    def result(self) -> dict[str, Log]:
+    def read_result(self) -> dict[str, Log]:
         """The logs by client name, once the process has ended."""
         if self._process.wait(60.0) != 0:
             raise BenchError(f"a client process failed with status {self._process.returncode}")
@@ -118,7 +118,7 @@ class ClientProcess:
     def running(self) -> bool:
         return self._process.poll() is None
 
-    def signal(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         """Stops or continues the process, for example."""
         self._process.send_signal(number)
 
@@ -129,7 +129,7 @@ class ClientProcess:
 
 
 @dataclass
-class Arena:
+class BenchRun:
     """What an action of `measure` acts on. `processes`: by the name of each of their clients."""
 
     session: Session
@@ -139,7 +139,7 @@ class Arena:
 
 
 #: Seconds after the beginning of the window, and what happens then; it must be quick.
-Action = tuple[float, Callable[[Arena], None]]
+Action = tuple[float, Callable[[BenchRun], None]]
 
 
 def measure(
@@ -155,9 +155,9 @@ def measure(
     assets: bool | Path = False,
     module: str = CLIENTS,
     make_job: Callable[..., Job] = Job,
-    beside: Callable[[Session], None] = lambda _: None,
+    on_tick: Callable[[Session], None] = lambda _: None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Measured:
+) -> Measurement:
     """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
 
     `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `assets`: the store
@@ -166,7 +166,7 @@ def measure(
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
-        keys = _keys(folder) if curve else None
+        keys = _create_keys(folder) if curve else None
         config = SessionConfig(
             name="bench",
             control_port=0,
@@ -178,7 +178,7 @@ def measure(
         )
         session = stack.enter_context(Session(model, config=config))
         proxy = stack.enter_context(links_before(session, links, seed)) if links else None
-        arena = Arena(session, [], {}, proxy)
+        arena = BenchRun(session, [], {}, proxy)
         for i, group in enumerate(groups):
             job = make_job(
                 session.address,
@@ -192,53 +192,53 @@ def measure(
             stack.callback(process.kill)
             arena.processes.append(process)
             arena.by_client.update((spec.name, process) for spec in group)
-        return _run(arena, seconds, actions, beside, keep_poses, progress)
+        return _run_session(arena, seconds, actions, on_tick, keep_poses, progress)
 
 
-def _run(
-    arena: Arena,
+def _run_session(
+    arena: BenchRun,
     seconds: float,
     actions: Sequence[Action],
-    beside: Callable[[Session], None],
+    on_tick: Callable[[Session], None],
     keep_poses: bool,
     progress: Callable[[str], None],
-) -> Measured:
+) -> Measurement:
     session, processes = arena.session, arena.processes
     waiting = list(processes)
     progress(f"waiting for {len(processes)} client processes")
-    session.run(seconds=60.0, until=_every(0.05, session.clock, lambda: _all_ready(waiting)))
-    _unless_stopped(session)
+    session.run(seconds=60.0, until=_limit_rate(0.05, session.clock, lambda: _are_all_ready(waiting)))
+    _raise_if_stopped(session)
     if waiting:
         raise BenchError("the clients did not join within 60 s")
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
     if keep_poses:
-        session.stepper.on_state = lambda header, poses: _keep(truth, header, poses)
-    session.stepper.on_entries = lambda entries: _note(received, entries)
+        session.stepper.on_state = lambda header, poses: _store_poses(truth, header, poses)
+    session.stepper.on_entries = lambda entries: _store_receipts(received, entries)
     connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
     begin = session.clock() + round(WARM_UP_S * 1e9)
     end = begin + round(seconds * 1e9)
     for process in processes:
-        process.window(begin, end)
-    restart = [] if arena.proxy is None else [(0.0, _begin_profiles)]
+        process.set_window(begin, end)
+    restart = [] if arena.proxy is None else [(0.0, _start_profiles)]
     meter = _Meter(session, begin, end)
-    script = _Script(arena, begin, [*restart, *actions])
+    script = _Schedule(arena, begin, [*restart, *actions])
 
     def until() -> bool:
-        beside(session)
-        return script.due() or meter.passed()
+        on_tick(session)
+        return script.run_due() or meter.is_window_over()
 
     session.run(until=until)
-    _unless_stopped(session)
+    _raise_if_stopped(session)
     stats, cpu_share = meter.result()
-    session.run(seconds=30.0, until=_every(0.05, session.clock, lambda: not any(p.running for p in processes)))
-    _unless_stopped(session)
+    session.run(seconds=30.0, until=_limit_rate(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    _raise_if_stopped(session)
     received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
-    logs = {name: log for process in processes for name, log in process.result().items()}
+    logs = {name: log for process in processes for name, log in process.read_result().items()}
     status = session.status()
     ledger = session.stepper.ledger
-    return Measured(
+    return Measurement(
         seconds,
         stats,
         cpu_share,
@@ -254,26 +254,26 @@ def _run(
     )
 
 
-def _unless_stopped(session: Session) -> None:
+def _raise_if_stopped(session: Session) -> None:
     """Ctrl-C ends a session in order; a benchmark then has no result."""
     if session.stopping:
         raise KeyboardInterrupt
 
 
-def _begin_profiles(arena: Arena) -> None:
+def _start_profiles(arena: BenchRun) -> None:
     """The moments of a profile count from the beginning of the window."""
     assert arena.proxy is not None
     arena.proxy.post("start")
 
 
-class _Script:
+class _Schedule:
     """Does what is to happen during the window, each thing once."""
 
-    def __init__(self, arena: Arena, begin_ns: int, actions: Sequence[Action]) -> None:
+    def __init__(self, arena: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
         self._arena = arena
         self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
 
-    def due(self) -> bool:
+    def run_due(self) -> bool:
         """Does what is due; never true."""
         while self._actions and self._arena.session.clock() >= self._actions[0][0]:
             self._actions.pop(0)[1](self._arena)
@@ -289,7 +289,7 @@ class _Meter:
         self._readings: list[tuple[PacerStats, float]] = []
         self.late_causes: dict[str, int] = {}
 
-    def passed(self) -> bool:
+    def is_window_over(self) -> bool:
         """Whether the window is over; for `Session.run(until=...)`."""
         now = self._session.clock()
         if now >= (self._end_ns if self._readings else self._begin_ns):
@@ -312,12 +312,12 @@ class _Meter:
         return stats, (cpu1 - cpu0) / ((self._end_ns - self._begin_ns) * 1e-9)
 
 
-def _all_ready(waiting: list[ClientProcess]) -> bool:
-    waiting[:] = [process for process in waiting if not process.ready()]
+def _are_all_ready(waiting: list[ClientProcess]) -> bool:
+    waiting[:] = [process for process in waiting if not process.is_ready()]
     return not waiting
 
 
-def _every(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
+def _limit_rate(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
     """`check` at most every `period_s`: it must not disturb the ticks that are measured."""
     due = 0
 
@@ -332,18 +332,18 @@ def _every(period_s: float, clock: Callable[[], int], check: Callable[[], bool])
     return until
 
 
-def _keep(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:
+def _store_poses(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:
     truth[header.tick] = poses.copy()
 
 
-def _note(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Sequence[Entry]) -> None:
+def _store_receipts(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Sequence[Entry]) -> None:
     for entry in entries:
         if isinstance(entry.message, Sample):
             key = (entry.connection, entry.message.device)
             received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
 
 
-def _keys(folder: Path) -> dict[str, str]:
+def _create_keys(folder: Path) -> dict[str, str]:
     """A server and a client certificate in `folder`, as an installation would have them."""
     import zmq.auth
 

@@ -9,10 +9,18 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.doctor import condition
-from iris_session.doctor.condition import CAUSES, DRIVERS, FULL_DISK, STAGES, UNWANTED, conditions, stages
-from iris_session.doctor.dropped import _MEANINGS, told
+from iris_session.doctor import session_checks
+from iris_session.doctor.drop_explanations import EXPLANATIONS, explain_drops
 from iris_session.doctor.findings import Finding
+from iris_session.doctor.session_checks import (
+    DRIVERS,
+    FULL_DISK,
+    HOLD_ADVICE,
+    LATE_CAUSES,
+    STAGES,
+    check_session_report,
+    measure_stages,
+)
 from iris_session.protocol.common import Pose
 from iris_session.protocol.names import HoldReason, LateCause
 from iris_session.protocol.status import (
@@ -75,7 +83,7 @@ def with_ann(**fields: object) -> StatusReport:
 
 
 def troubles(report: StatusReport) -> dict[str, Finding]:
-    return {one.check: one for one in conditions(report, "p9") if one.state != "ok"}
+    return {one.check: one for one in check_session_report(report, "p9") if one.state != "ok"}
 
 
 def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
@@ -176,11 +184,11 @@ def test_directors_need_no_robot() -> None:
     assert troubles(change(WELL, participants=(ANN, director))) == {}
 
 
-@pytest.mark.parametrize("reason", sorted(UNWANTED))
+@pytest.mark.parametrize("reason", sorted(HOLD_ADVICE))
 def test_robots_that_hold_against_the_will(reason: str) -> None:
     held = change(LEFT, state="hold", hold_reason=reason)
     report = change(WELL, robots=(held, RIGHT), participants=(change(ANN, rejected={"stale": 7}),))
-    only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", UNWANTED[reason])
+    only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", HOLD_ADVICE[reason])
 
 
 def test_an_open_clutch_is_no_fault() -> None:
@@ -217,14 +225,14 @@ def test_the_worst_stage_is_blamed_not_the_longest() -> None:
 
 
 def test_ages_of_every_stage() -> None:
-    assert set(stages(WELL.participants, WELL)) == set(STAGES)
-    assert stages((), change(WELL, robots=(), step_to_publish=None)) == {}
+    assert set(measure_stages(WELL.participants, WELL)) == set(STAGES)
+    assert measure_stages((), change(WELL, robots=(), step_to_publish=None)) == {}
 
 
-@pytest.mark.parametrize("cause", sorted(CAUSES))
+@pytest.mark.parametrize("cause", sorted(LATE_CAUSES))
 def test_late_ticks_name_their_cause(cause: str) -> None:
     report = change(WELL, late_share=0.01, late_causes={LateCause.SCHEDULER: 1, cause: 40})
-    only(report, "ticks", "warning", f"{cause}: {CAUSES[cause][0]}", CAUSES[cause][1])
+    only(report, "ticks", "warning", f"{cause}: {LATE_CAUSES[cause][0]}", LATE_CAUSES[cause][1])
 
 
 def test_very_late_ticks_are_a_failure() -> None:
@@ -233,7 +241,7 @@ def test_very_late_ticks_are_a_failure() -> None:
 
 def test_every_cause_is_explained() -> None:
     names = {value for name, value in vars(LateCause).items() if name.isupper()}
-    assert names | {"skipped"} == set(CAUSES)
+    assert names | {"skipped"} == set(LATE_CAUSES)
 
 
 @pytest.mark.parametrize(
@@ -269,15 +277,17 @@ def test_restarts_and_warnings() -> None:
 
 def test_what_drops_mean_is_told() -> None:
     (found,) = (
-        one for one in conditions(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9") if one.check == "drops"
+        one
+        for one in check_session_report(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9")
+        if one.check == "drops"
     )
     assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
     meaning = "requests for pieces of the scene that were refused"
-    assert told({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
+    assert explain_drops({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
 
 
 def test_every_reason_that_the_front_counts_is_explained() -> None:
-    rooms = Path(condition.__file__).parents[1]
+    rooms = Path(session_checks.__file__).parents[1]
     counted: set[str] = set()
     for path in (
         *(rooms / "front").rglob("*.py"),
@@ -288,7 +298,7 @@ def test_every_reason_that_the_front_counts_is_explained() -> None:
     ):
         counted |= set(re.findall(r"""drops(?:\.count\(|\[)\s*"([a-z_]+)\"""", path.read_text()))
     assert {"send_queue_full", "journal_rows", "unknown_key"} <= counted
-    assert not counted - set(_MEANINGS)
+    assert not counted - set(EXPLANATIONS)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +311,7 @@ def test_every_reason_that_the_front_counts_is_explained() -> None:
 def test_a_pace_that_is_not_ours_is_not_told(tick: int, text: str) -> None:
     """The carrier of a scene without physics has a tick of a millisecond: nobody steps at 1000 Hz."""
     report = change(WELL, lateness=None, tick=tick, tick_period_ns=1_000_000)
-    assert conditions(report, "p9")[0] == Finding("session", "ok", text)
+    assert check_session_report(report, "p9")[0] == Finding("session", "ok", text)
 
 
 def test_drivers_are_who_may_hold_robots_but_directors() -> None:

@@ -13,9 +13,9 @@ from iris_session.protocol.status import CrossCheckReport, ParticipantReport, St
 #: Tracking frames drift by millimetres a minute: after so long without a sheet the stated error is no longer true.
 STALE_NS: Final = 600_000_000_000
 #: Beyond the 95 % bound by this factor it is not chance, as in `anchors.crosscheck`.
-BEYOND: Final = 2.0
+MAX_ERROR_RATIO: Final = 2.0
 #: An older comparison says nothing about now.
-COMPARED_NS: Final = 600_000_000_000
+MAX_CROSS_CHECK_AGE_NS: Final = 600_000_000_000
 #: Fewer frames are lost while the budget of a link is being found: a second of a camera.
 MEDIA_DROPS: Final = 30
 ALARMS: Final = {
@@ -25,13 +25,19 @@ ALARMS: Final = {
 }
 
 
-def headsets(people: tuple[ParticipantReport, ...], report: StatusReport) -> list[Finding]:
+def check_headsets(people: tuple[ParticipantReport, ...], report: StatusReport) -> list[Finding]:
     """All findings about alignments that there are. `people`: without the doctor."""
     here = tuple(p for p in people if p.connected and p.alignment != AlignmentKind.NOT_NEEDED)
-    return [alarms(here), stale(here), runs(here), corrections(here), agreement(people, report.cross_checks)]
+    return [
+        check_alarms(here),
+        check_staleness(here),
+        check_runs(here),
+        check_corrections(here),
+        check_agreement(people, report.cross_checks),
+    ]
 
 
-def alarms(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
     """Alignments that were found wrong, and that no new one has answered."""
     texts, worst = [], warning
     for p in people:
@@ -39,7 +45,7 @@ def alarms(people: tuple[ParticipantReport, ...]) -> Finding:
         if r is None or not r.alarm:
             continue
         what = ALARMS.get(r.alarm, r.alarm)
-        texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {_ago(r.alarm_ns)} ago")
+        texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {_format_age(r.alarm_ns)} ago")
         if r.alarm == AlarmKind.JUMP:
             worst = failed  # it has voided the alignment: nothing that p holds moves
     if not texts:
@@ -49,7 +55,7 @@ def alarms(people: tuple[ParticipantReport, ...]) -> Finding:
     return worst("alarm", "; ".join(texts), why, advice)
 
 
-def stale(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
     """Alignments that nothing has confirmed for long."""
     texts = []
     for p in people:
@@ -58,14 +64,14 @@ def stale(people: tuple[ParticipantReport, ...]) -> Finding:
             continue
         seen_ns = min((one.age_ns for one in r.seen if one.age_ns >= 0), default=p.alignment_age_ns)
         if seen_ns > STALE_NS:
-            texts.append(f"{p.name} has seen no sheet for {_ago(seen_ns)}")
+            texts.append(f"{p.name} has seen no sheet for {_format_age(seen_ns)}")
     if not texts:
         return ok("stale", "measured alignments were confirmed within ten minutes")
     why = "tracking frames drift by millimetres a minute, and the stated error does not know it"
     return warning("stale", "; ".join(texts), why, "glance at a sheet now and then")
 
 
-def runs(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_runs(people: tuple[ParticipantReport, ...]) -> Finding:
     """Alignments that are no longer measured because somebody stopped that."""
     stopped = [p.name for p in people if p.alignment_report is not None and not p.alignment_report.running]
     if not stopped:
@@ -74,7 +80,7 @@ def runs(people: tuple[ParticipantReport, ...]) -> Finding:
     return warning("align_run", text, "somebody stopped the run", "start it: `iris-session anchors align start`")
 
 
-def corrections(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_corrections(people: tuple[ParticipantReport, ...]) -> Finding:
     """Corrections that are not in force yet."""
     texts = []
     for p in people:
@@ -87,16 +93,16 @@ def corrections(people: tuple[ParticipantReport, ...]) -> Finding:
     return warning("correction", "; ".join(texts), why, "open the clutch for some seconds")
 
 
-def agrees(check: CrossCheckReport) -> bool:
+def is_consistent(check: CrossCheckReport) -> bool:
     """Whether chance explains how far apart two headsets put the same thing."""
-    return check.error_m <= BEYOND * check.expected_p95_m
+    return check.error_m <= MAX_ERROR_RATIO * check.expected_p95_m
 
 
-def agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCheckReport, ...]) -> Finding:
+def check_agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCheckReport, ...]) -> Finding:
     """Pairs of headsets that put the same thing further apart than their stated errors allow."""
     names = {p.id: p.name for p in people}
-    recent = [one for one in checks if one.age_ns <= COMPARED_NS]
-    apart = [one for one in recent if not agrees(one)]
+    recent = [one for one in checks if one.age_ns <= MAX_CROSS_CHECK_AGE_NS]
+    apart = [one for one in recent if not is_consistent(one)]
     if apart:
         texts = [
             f"{names.get(one.a, one.a)} and {names.get(one.b, one.b)} put '{one.anchor_id}' {one.error_m * 1e3:.0f} mm "
@@ -111,7 +117,7 @@ def agreement(people: tuple[ParticipantReport, ...], checks: tuple[CrossCheckRep
     return ok("agreement", f"{len(recent)} pairs compared, at most {worst.error_m * 1e3:.0f} mm apart, as stated")
 
 
-def media(people: tuple[ParticipantReport, ...]) -> Finding:
+def check_media(people: tuple[ParticipantReport, ...]) -> Finding:
     """Who gets less of clouds, cameras and deformables than there is."""
     texts = []
     for p in people:
@@ -127,6 +133,6 @@ def media(people: tuple[ParticipantReport, ...]) -> Finding:
     return warning("media", "; ".join(texts), why, advice)
 
 
-def _ago(duration_ns: Nanoseconds) -> str:
+def _format_age(duration_ns: Nanoseconds) -> str:
     seconds = duration_ns * 1e-9
     return f"{seconds:.1f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

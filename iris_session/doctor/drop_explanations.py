@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Final
 
 #: Of those that are most, how many are told.
-TOLD: Final = 6
+MAX_LISTED: Final = 6
 _SLOW: Final = "to who did not read in time"
 _FAST: Final = "from who sends faster than the session takes it"
 _DISK: Final = "not recorded: the recorder did not keep up"
 _PAIRING: Final = "pairing refused, see the session's terminal"
 _ODD: Final = "from who breaks the protocol"
-_MEANINGS: Final[Mapping[str, str]] = {
+EXPLANATIONS: Final[Mapping[str, str]] = {
     "send_queue_full": f"answers and events {_SLOW}",
     "media_superseded": f"frames of media {_SLOW}, newer ones took their place",
     "state_superseded": "states that the front was too late for, newer ones went out",
@@ -54,16 +54,16 @@ _MEANINGS: Final[Mapping[str, str]] = {
 }
 
 #: Why a request for a piece of the scene was not answered: the reasons are those of the protocol.
-_OF_ASSETS: Final = "assets_"
+_ASSET_PREFIX: Final = "assets_"
 _ASSETS: Final = "requests for pieces of the scene that were refused"
 
 
-def told(drops: Mapping[str, int]) -> str:
+def explain_drops(drops: Mapping[str, int]) -> str:
     """The most frequent ones with what they mean; empty for none."""
-    most = sorted(((n, reason) for reason, n in drops.items() if n), reverse=True)[:TOLD]
-    return ", ".join(f"{reason} {n}{_meaning(reason)}" for n, reason in most)
+    most = sorted(((n, reason) for reason, n in drops.items() if n), reverse=True)[:MAX_LISTED]
+    return ", ".join(f"{reason} {n}{_explain_reason(reason)}" for n, reason in most)
 
 
-def _meaning(reason: str) -> str:
-    meaning = _MEANINGS.get(reason, _ASSETS if reason.startswith(_OF_ASSETS) else "")
+def _explain_reason(reason: str) -> str:
+    meaning = EXPLANATIONS.get(reason, _ASSETS if reason.startswith(_ASSET_PREFIX) else "")
     return f" ({meaning})" if meaning else ""

@@ -34,9 +34,9 @@ class Bar(msgspec.Struct, frozen=True):
     ok: bool
 
 
-def bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
+def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
     """The bar `results[key] op bound`; a dotted key is that of an object within the results."""
-    value = float(flat(results)[key] if "." in key else results[key])
+    value = float(flatten(results)[key] if "." in key else results[key])
     return Bar(key, op, bound, value, bool(_OPERATORS[op](value, bound)))
 
 
@@ -59,17 +59,17 @@ class BenchReport(msgspec.Struct, frozen=True):
         return {
             "name": self.name,
             "version": self.version,
-            "machine": machine(),
+            "machine": describe_machine(),
             "params": self.params,
-            "results": _finite(self.results),
+            "results": _replace_infinite(self.results),
             "reference": self.reference,
-            "bars": [{**msgspec.to_builtins(b), "value": _finite(b.value)} for b in self.bars],
+            "bars": [{**msgspec.to_builtins(b), "value": _replace_infinite(b.value)} for b in self.bars],
         }
 
-    def lines(self) -> str:
+    def format(self) -> str:
         """The same for people."""
         nested = any("." in b.key for b in self.bars)
-        results = flat(self.results) if nested else self.results
+        results = flatten(self.results) if nested else self.results
         width = max(map(len, results))
         rows = [f"{self.name}: {' '.join(f'{k}={v}' for k, v in self.params.items())}"]
         for key, value in results.items():
@@ -82,7 +82,7 @@ class BenchReport(msgspec.Struct, frozen=True):
         return "\n".join(rows)
 
 
-def flat(results: dict[str, Any]) -> dict[str, Any]:
+def flatten(results: dict[str, Any]) -> dict[str, Any]:
     """Objects within the results as dotted keys."""
     out: dict[str, Any] = {}
     for key, value in results.items():
@@ -93,13 +93,13 @@ def flat(results: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _finite(value: Any) -> Any:
+def _replace_infinite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _replace_infinite(one) for key, one in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """The machine as the contract names it."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {

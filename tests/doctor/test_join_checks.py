@@ -11,7 +11,13 @@ import pytest
 from iris_session.client.address import Address
 from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
 from iris_session.client.state_stream import SceneState
-from iris_session.doctor.door import knock, refusal, server_key, state_age, unpaired
+from iris_session.doctor.join_checks import (
+    attempt_join,
+    check_server_key,
+    check_state_age,
+    explain_refusal,
+    explain_unpaired_key,
+)
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused, StateHeader
@@ -44,29 +50,29 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
     ],
 )
 def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
-    found = refusal(error)  # type: ignore[arg-type]
+    found = explain_refusal(error)  # type: ignore[arg-type]
     assert (found.check, found.state) == (check, "failed")
     assert found.text
 
 
 def test_key_that_is_the_known_one(home: KeyHome) -> None:
     key = KeyPair.new().public
-    assert server_key(ADDRESS, said(key)).state == "warning"  # not known yet
+    assert check_server_key(ADDRESS, said(key)).state == "warning"  # not known yet
     home.servers.pin(str(ADDRESS), "lab", key)
-    assert server_key(ADDRESS, said(key)).state == "ok"
+    assert check_server_key(ADDRESS, said(key)).state == "ok"
 
 
 def test_key_that_is_another_one(home: KeyHome) -> None:
     home.servers.pin(str(ADDRESS), "lab", KeyPair.new().public)
-    found = server_key(ADDRESS, said(KeyPair.new().public))
+    found = check_server_key(ADDRESS, said(KeyPair.new().public))
     assert found.failed
     assert "iris-session keys forget 192.0.2.7:7721" in found.advice
 
 
 def test_key_of_a_scanned_code_counts(home: KeyHome) -> None:
     scanned = Address("192.0.2.7", 7721, server_key=KeyPair.new().public)
-    assert server_key(scanned, said(KeyPair.new().public)).failed
-    assert server_key(scanned, said(scanned.server_key)).state == "ok"
+    assert check_server_key(scanned, said(KeyPair.new().public)).failed
+    assert check_server_key(scanned, said(scanned.server_key)).state == "ok"
 
 
 def test_damaged_list_of_servers(home: KeyHome) -> None:
@@ -74,34 +80,34 @@ def test_damaged_list_of_servers(home: KeyHome) -> None:
     path = home.path / "known_servers.json"
     path.write_text("{")
     path.chmod(0o600)
-    assert server_key(ADDRESS, said(KeyPair.new().public)).failed
+    assert check_server_key(ADDRESS, said(KeyPair.new().public)).failed
 
 
 def test_nothing_to_compare() -> None:
-    assert server_key(ADDRESS, None).state == "skipped"
-    assert server_key(ADDRESS, said("")).state == "ok"
+    assert check_server_key(ADDRESS, None).state == "skipped"
+    assert check_server_key(ADDRESS, said("")).state == "ok"
 
 
 def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
-    new = unpaired(ADDRESS, said(KeyPair.new().public))
+    new = explain_unpaired_key(ADDRESS, said(KeyPair.new().public))
     assert (new.check, new.state, new.why) == ("key", "failed", "")
     assert "iris-session pair" in new.advice
     assert f"iris-session doctor {ADDRESS} --code" in new.advice
     key = KeyPair.new().public
     home.servers.pin(str(ADDRESS), "lab", key)
-    assert "let in before" in unpaired(ADDRESS, said(key)).why
+    assert "let in before" in explain_unpaired_key(ADDRESS, said(key)).why
 
 
 def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
     key = KeyPair.new()
     home.sessions.add(SessionNote("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
-    assert server_key(ADDRESS, said(key.public)).state == "ok"
-    assert unpaired(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
-    assert "pair" in unpaired(ADDRESS, said(KeyPair.new().public)).advice
+    assert check_server_key(ADDRESS, said(key.public)).state == "ok"
+    assert explain_unpaired_key(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
+    assert "pair" in explain_unpaired_key(ADDRESS, said(KeyPair.new().public)).advice
 
 
 def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:
-    [found] = knock(ADDRESS, str(ADDRESS), "abc", "observer", None).findings
+    [found] = attempt_join(ADDRESS, str(ADDRESS), "abc", "observer", None).findings
     assert (found.check, found.state) == ("code", "failed")
     assert "like 7KQ2-M4XD-9PTR" in found.text
     assert "iris-session pair" in found.advice
@@ -113,12 +119,12 @@ def state(session_time: int, age_ms: int) -> SceneState:
 
 def test_old_state_is_blamed_on_the_link_only_when_something_new_comes() -> None:
     moving = [state(n, 3) for n in range(90)]
-    assert state_age(moving, 0).state == "ok"
-    slow = state_age([state(n, 300) for n in range(90)], 7)
+    assert check_state_age(moving, 0).state == "ok"
+    slow = check_state_age([state(n, 300) for n in range(90)], 7)
     assert (slow.state, slow.why) == ("warning", "7 frames waited too long in a queue")
-    silent = state_age([state(5, 9000 + 250 * n) for n in range(6)], 0)
+    silent = check_state_age([state(5, 9000 + 250 * n) for n in range(6)], 0)
     assert silent.state == "warning"
     assert silent.text == "state comes at 4 Hz, all as it was 10.2 s ago"
     assert silent.why == "nothing new is published"
-    assert state_age([state(5, 9000), *(state(6 + n, 3) for n in range(80))], 0).state == "ok", "it goes on"
-    assert state_age([state(5, 3)], 0).state == "ok", "of one alone nobody can say"
+    assert check_state_age([state(5, 9000), *(state(6 + n, 3) for n in range(80))], 0).state == "ok", "it goes on"
+    assert check_state_age([state(5, 3)], 0).state == "ok", "of one alone nobody can say"

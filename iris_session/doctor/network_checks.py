@@ -22,11 +22,11 @@ from iris_session.protocol.names import PROTOCOL_VERSION
 CONNECT_S: Final = 4.0
 LISTEN_S: Final = 1.2
 #: For what a port that takes connections says at once, if it is the base of a block.
-BASE_S: Final = 1.0
+PORT_BASE_TIMEOUT_S: Final = 1.0
 _UNREACHABLE: Final = frozenset({errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN})
 
 
-def beacon(session: str, address: Address | None) -> tuple[Finding, list[FoundSession]]:
+def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[FoundSession]]:
     """Whether sessions are heard on the network, and the wanted one among them."""
     try:
         with BeaconListener() as listener:
@@ -72,7 +72,7 @@ def beacon(session: str, address: Address | None) -> tuple[Finding, list[FoundSe
     ), found
 
 
-def heard_elsewhere(finding: Finding, target: Address, found: list[FoundSession]) -> Finding:
+def mention_heard_sessions(finding: Finding, target: Address, found: list[FoundSession]) -> Finding:
     """A failed `finding` about `target`, with the sessions that are heard at other addresses: one may be meant."""
     others = ", ".join(f"{one.name} ({one.address})" for one in found if one.address != str(target))
     if not finding.failed or not others:
@@ -80,7 +80,7 @@ def heard_elsewhere(finding: Finding, target: Address, found: list[FoundSession]
     return failed(finding.check, finding.text, finding.why, f"heard on this network: {others}; else {finding.advice}")
 
 
-def resolved(address: Address) -> tuple[Finding, str]:
+def check_address(address: Address) -> tuple[Finding, str]:
     """The address, and the IP address it stands for (empty when there is none)."""
     try:
         ip = str(socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0][4][0])
@@ -91,10 +91,10 @@ def resolved(address: Address) -> tuple[Finding, str]:
     return ok("address", f"{address}" + ("" if ip == address.host else f" is {ip}")), ip
 
 
-def subnet(ip: str) -> Finding:
+def check_subnet(ip: str) -> Finding:
     """Whether a network of this machine holds the address."""
     target = ipaddress.ip_address(ip)
-    networks = own_networks()
+    networks = list_own_networks()
     listed = ", ".join(f"{network} ({name})" for name, network in networks) or "none"
     if target.is_loopback:
         return ok("subnet", f"{ip} is this machine")
@@ -111,7 +111,7 @@ def subnet(ip: str) -> Finding:
     return warning("subnet", text, "what you send goes through a router, which may not let it pass", advice)
 
 
-def own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Network]]:
+def list_own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Network]]:
     """Interface names and networks of this machine that are up, without loopback and IPv6 link-local ones."""
     up = psutil.net_if_stats()
     found = []
@@ -130,7 +130,7 @@ def own_networks() -> list[tuple[str, ipaddress.IPv4Network | ipaddress.IPv6Netw
     return found
 
 
-def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str = "control") -> Finding:
+def check_tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", port_name: str = "control") -> Finding:
     """Whether somebody takes a connection there. Tells a closed port from a firewall. `ip`: from `resolved`."""
     port = port or address.port
     try:
@@ -146,7 +146,7 @@ def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str 
         except TimeoutError:
             return failed(
                 check,
-                f"no answer from {ip} port {port} ({what}) within {CONNECT_S:g} s",
+                f"no answer from {ip} port {port} ({port_name}) within {CONNECT_S:g} s",
                 "packets are thrown away: a firewall, the wrong machine, or a network that keeps its guests apart",
                 f"on the server's machine let TCP {port} in (docs/network.md), and try from that machine itself",
             )
@@ -154,7 +154,7 @@ def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str 
             if error.errno == errno.ECONNREFUSED:
                 return failed(
                     check,
-                    f"nothing listens at {ip} port {port} ({what})",
+                    f"nothing listens at {ip} port {port} ({port_name})",
                     "the machine answers, but no program has this port: no session runs, it has another port, "
                     "or it listens on another address (127.0.0.1 is for its own machine only)",
                     "look at the address that `iris-session serve` prints; for other machines it needs --interface",
@@ -163,17 +163,17 @@ def tcp(address: Address, ip: str, port: int = 0, check: str = "tcp", what: str 
                 text = f"{ip} cannot be reached ({error.strerror})"
                 why = "no machine of this network has that address, it is switched off, or its cable or Wi-Fi is"
                 return failed(check, text, why, "look at the address that `iris-session serve` prints, and the cable")
-            return failed(check, f"no connection to {ip} port {port} ({what}): {error.strerror or error}")
-    return ok(check, f"{ip} port {port} ({what}) takes connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
+            return failed(check, f"no connection to {ip} port {port} ({port_name}): {error.strerror or error}")
+    return ok(check, f"{ip} port {port} ({port_name}) takes connections ({(time.monotonic() - began) * 1e3:.1f} ms)")
 
 
-def introduction(address: Address) -> tuple[Finding, Finding, Introduction | None]:
+def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction | None]:
     """What the session says of itself, and whether it speaks our version: checks `introduction` and `version`."""
     unknown = Finding("version", "skipped", "not known: there was no introduction")
     try:
-        said = _asked(address, CONNECT_S)
+        said = _request_introduction(address, CONNECT_S)
     except VersionError as error:
-        return ok("introduction", f"a session of protocol version {error.version}"), version(error.version), None
+        return ok("introduction", f"a session of protocol version {error.version}"), check_version(error.version), None
     except ProtocolError as error:
         text = f"what introduces itself at port {address.port - 1} is no session: {error}"
         return failed("introduction", text, "", "look at the port"), unknown, None
@@ -184,13 +184,13 @@ def introduction(address: Address) -> tuple[Finding, Finding, Introduction | Non
     one = said.beacon
     here = f"{said.participants} participants" + (", a join code is open" if said.pairing else "")
     text = f"session {one.session_name!r} ({one.kind}), {here}"
-    return ok("introduction", text), version(one.protocol), said
+    return ok("introduction", text), check_version(one.protocol), said
 
 
-def base_of_ports(address: Address) -> Finding | None:
+def check_port_base(address: Address) -> Finding | None:
     """That `address` is the first of a session's block of ports, where it introduces itself, not the one to join."""
     joined = Address(address.host, address.port + 1)
-    said = _introduced(joined, BASE_S)
+    said = _try_introduction(joined, PORT_BASE_TIMEOUT_S)
     if said is None or said.beacon.control != joined.port:
         return None
     name = f"session {said.beacon.session_name!r}"
@@ -198,14 +198,14 @@ def base_of_ports(address: Address) -> Finding | None:
     return failed("introduction", text, "`serve --port-base N` is joined at port N + 1", f"use {joined}")
 
 
-def _introduced(address: Address, patience_s: float) -> Introduction | None:
+def _try_introduction(address: Address, patience_s: float) -> Introduction | None:
     try:
-        return _asked(address, patience_s)
+        return _request_introduction(address, patience_s)
     except (OSError, ProtocolError):
         return None
 
 
-def _asked(address: Address, patience_s: float) -> Introduction:
+def _request_introduction(address: Address, patience_s: float) -> Introduction:
     """Raises what `ask_introduction` raises."""
     steps = ask_introduction(address.host, address.port, patience_s)
     while True:
@@ -217,7 +217,7 @@ def _asked(address: Address, patience_s: float) -> Introduction:
         time.sleep(0.005)
 
 
-def version(theirs: int) -> Finding:
+def check_version(theirs: int) -> Finding:
     """Whether a session of protocol version `theirs` can be talked to."""
     if theirs == PROTOCOL_VERSION:
         return ok("version", f"both speak protocol version {PROTOCOL_VERSION}")
