@@ -40,7 +40,7 @@ from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security.resume_tokens import ResumeTokens
-from iris_session.system.parent import parent_is
+from iris_session.system.process import is_parent
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
 ROUND = 8
@@ -333,7 +333,7 @@ class Front:
             self.end(ENDED)
         elif readable(self._sockets.link_monitor):
             self.cut_off = True
-            self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
+            self.end(ENDED if is_parent(self._start.parent_pid) else ORPHANED)
 
     def _check_stall(self, now_ns: int) -> None:
         """Called after the link was drained, so a front that was kept from running does not blame the authority."""
@@ -345,7 +345,7 @@ class Front:
         elif self._uplink.stalled and not stalled:
             self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
         self._uplink.stalled = stalled
-        if not parent_is(self._start.parent_pid):
+        if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
 
     def _telling(self) -> Telling:
