@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
@@ -86,7 +86,7 @@ class Intake:
         pairing: PairingService,
         audit: AuditTrail,
         guard: ConnectionGuard,
-        anchoring: Anchoring,
+        alignment: AlignmentService,
     ) -> None:
         self._config = config
         self._clients = clients
@@ -100,7 +100,7 @@ class Intake:
         self._pairing = pairing
         self._audit = audit
         self._guard = guard
-        self._anchoring = anchoring
+        self._alignment = alignment
         self._unknown_peer_faults = TokenBucket(_UNKNOWN_PEER_FAULTS, _UNKNOWN_PEER_FAULTS)
         #: Connections replaced by a new hello or peer on the same route; the loop takes leave of them.
         self.replaced: list[FrontConnection] = []
@@ -223,7 +223,7 @@ class Intake:
             return
         elif isinstance(message, Observation):
             self._raw.send(connection.number, now_ns, message)
-            self._anchoring.observed(connection, message, now_ns)
+            self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
@@ -254,7 +254,7 @@ class Intake:
         """What is done with every sample as it came, before samples are coalesced."""
         self._raw.send(connection.number, now_ns, sample)
         self._status.record_sample(connection.number, sample, now_ns)
-        self._anchoring.sampled(connection, sample, now_ns)
+        self._alignment.process_sample(connection, sample, now_ns)
 
     def _count_rejection(
         self, peer: Peer, connection: FrontConnection | None, now_ns: int, what: str = BEFORE_HELLO

@@ -28,7 +28,7 @@ from iris_session.protocol.server_messages import Event, SceneChanged
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.protocol.steps import Decision
 from iris_session.security import KeyPair
-from iris_session.system.priority import NICER
+from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.e2e.conftest import unavailable
 from tests.front.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.front.harness import FrontSession, RawClient
@@ -324,10 +324,10 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
 
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
-    if ours + NICER > 19:
+    if ours + LOW_PRIORITY_NICE > 19:
         unavailable("these tests run at the lowest priority already")
     found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
-    assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
+    assert found[ours + LOW_PRIORITY_NICE] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
     python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
     assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
 

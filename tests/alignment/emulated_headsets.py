@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import msgspec
 import numpy as np
 
 from anchors.pose import PoseTuple, Vec3, compose, inverse, quat_from_yaw
-from iris_session.alignment.service import Anchoring
-from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route
-from iris_session.link.config import FrontConfig
-from iris_session.protocol.client_messages import Hello, Observation, Sample
+from iris_session.alignment.service import AlignmentService
+from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentAlarm, AlignmentProposal, CrossChecked, Entry
 from iris_session.protocol.limits import Drops
@@ -24,42 +24,47 @@ ANCHORS = {"sheet": SHEET, "other": OTHER}
 PERIOD_NS = 100 * MS  # 10 observations a second
 
 
+@dataclass(frozen=True)
+class FakeConnection:
+    """A `HeadsetConnection`."""
+
+    number: int
+    participant_id: str
+
+
 class Wearer:
-    """One headset. `frame`: the true `T_world_tracking`, which a test may change behind everybody's back."""
+    """One headset. `frame`: the true `T_world_tracking`, which a test may change without a new epoch."""
 
     def __init__(self, lab: Lab, number: int, seed: int) -> None:
         self.lab = lab
         self.rng = np.random.default_rng(seed)
         self.frame = headset(self.rng)
-        route, peer = Route(bytes([number])), Peer(number, "")
-        self.connection = FrontConnection(number, route, peer, ("", 0), "", Hello("o", "A"), 0)
-        self.connection.admitted, self.connection.participant_id = True, f"p{number}"
+        self.connection = FakeConnection(number, f"p{number}")
         self.viewpoint = self.seq = 0
         self.epoch = 1
-        lab.clients.add(self.connection)
 
     def place(self, anchor: str = "sheet", d: float = 0.7, p_head_world: Vec3 | None = None) -> Look:
-        """Walks to a new place to look from."""
+        """Move to a new viewpoint."""
         self.viewpoint += 1
         self.lab.now_ns += 3 * SECOND
         T = self.lab.world[anchor]
         return Look(self.rng, T, p_head_world or around(self.rng, T[0], d))
 
     def see(self, look: Look, anchor: str = "sheet", kind: str = "qr", head: bool = True) -> None:
-        """One observation now, and the head at that time."""
+        """Send one observation and the head pose of that time."""
         if head:
             self.head(inverse_head(self.frame, look))
         p, q = look.new(self.frame, self.lab.world.get(anchor))
         self.observe(Observation(anchor, kind, Pose(p, q), self.lab.now_ns, self.epoch, self.viewpoint))
 
     def observe(self, observation: Observation) -> None:
-        self.lab.anchoring.observed(self.connection, observation, self.lab.now_ns)
+        self.lab.service.process_observation(self.connection, observation, self.lab.now_ns)
 
     def head(self, T_tracking_head: PoseTuple) -> None:
         self.seq += 1
         pose = Pose(*T_tracking_head)
         sample = Sample("head", "pose", self.seq, self.lab.now_ns, 1, self.epoch, 0, pose=pose)
-        self.lab.anchoring.sampled(self.connection, sample, self.lab.now_ns)
+        self.lab.service.process_sample(self.connection, sample, self.lab.now_ns)
 
     def watch(self, look: Look, n: int, anchor: str = "sheet") -> None:
         for _ in range(n):
@@ -68,20 +73,20 @@ class Wearer:
             self.lab.turn()
 
     def survey(self, viewpoints: int = 3, anchors: tuple[str, ...] = ("sheet",)) -> None:
-        """Looks at the sheets from several sides; what is proposed then comes into force."""
+        """Observe the sheets from several sides and put the resulting proposal in force."""
         for _ in range(viewpoints):
             for anchor in anchors:
                 self.watch(self.place(anchor), 15, anchor)
         self.accept()
 
     def accept(self) -> AlignmentProposal:
-        """The authority takes the newest proposal."""
+        """Put the newest proposal in force, as the authority does."""
         newest = self.proposals()[-1]
         self.lab.put_in_force(self, newest)
         return newest
 
     def bump(self, x: float, y: float = 0.0, z: float = 0.0) -> None:
-        """The frame moves, and no new epoch says so."""
+        """Move the frame without a new tracking epoch."""
         self.frame = shifted(self.frame, (x, y, z))
 
     def proposals(self) -> list[AlignmentProposal]:
@@ -96,16 +101,15 @@ class Wearer:
 
 
 class Lab:
-    """Anchoring, and where things really are (`world`)."""
+    """An `AlignmentService`, and the true poses of the anchors (`world`)."""
 
-    def __init__(self, anchors: dict[str, PoseTuple] = ANCHORS, **config: object) -> None:
+    def __init__(self, anchors: dict[str, PoseTuple] = ANCHORS, sizes: dict[str, float] | None = None) -> None:
         self.now_ns = SECOND
         self.entries: list[Entry] = []
-        self.clients, self.drops = ConnectionTable(), Drops()
+        self.drops = Drops()
         self.world = dict(anchors)
         poses = {name: Pose(*T) for name, T in anchors.items()}
-        self.config = FrontConfig(anchors=poses, **config)  # type: ignore[arg-type]
-        self.anchoring = Anchoring(self.config, self.clients, self._offer, self.drops)
+        self.service = AlignmentService(self._offer, self.drops, anchors=poses, anchor_sizes=sizes or {})
 
     def _offer(self, entry: Entry) -> bool:
         self.entries.append(entry)
@@ -115,17 +119,17 @@ class Lab:
         return Wearer(self, number, number if seed is None else seed)
 
     def turn(self, times: int = 8) -> None:
-        """Several passes of the front's loop: each proposes for one at most."""
+        """Run several passes of the front's loop; each computes one proposal at most."""
         for _ in range(times):
             self.now_ns += MS
-            self.anchoring.tick(self.now_ns)
+            self.service.tick(self.now_ns)
 
     def put_in_force(self, wearer: Wearer, got: AlignmentProposal, **fields: object) -> None:
         alignment = Alignment(
             1, "measured", got.T_world_tracking, got.tracking_epoch, got.covariance, got.error_at_anchor_m
         )
         alignment = msgspec.structs.replace(alignment, **fields)
-        self.anchoring.heard(AlignmentChanged(wearer.connection.participant_id, alignment))
+        self.service.process_event(AlignmentChanged(wearer.connection.participant_id, alignment))
 
     def compared(self) -> list[Entry]:
         return [e for e in self.entries if isinstance(e.message, CrossChecked)]
@@ -136,7 +140,7 @@ def inverse_head(frame: PoseTuple, look: Look) -> PoseTuple:
 
 
 def misplaced_m(wearer: Wearer, proposal: AlignmentProposal, anchor: str = "sheet") -> float:
-    """How far this proposal puts an anchor from where it is."""
+    """Return the error [m] of this proposal at an anchor."""
     p = wearer.lab.world[anchor][0]
     pose = proposal.T_world_tracking
     seen = compose(inverse(wearer.frame), (p, (1.0, 0.0, 0.0, 0.0)))
