@@ -147,11 +147,11 @@ class Builder:
                 note = piece.make()
         else:
             note = piece.make()
-        self.store.remember(key, msgspec.msgpack.encode(note))
+        self.store.write_index(key, msgspec.msgpack.encode(note))
         return note, False
 
     def _recall(self, key: str, kind: type[Note]) -> Note | None:
-        remembered = self.store.recall(key)
+        remembered = self.store.read_index(key)
         if remembered is None:
             return None
         try:
@@ -159,7 +159,7 @@ class Builder:
         except msgspec.DecodeError:  # damaged: built anew
             return None
         assets = (note,) if isinstance(note, BlobNote) else note.levels
-        return note if all(self.store.used(asset.address, asset.bytes) for asset in assets) else None
+        return note if all(self.store.mark_used(asset.address, asset.bytes) for asset in assets) else None
 
     def _mesh(self, mesh: MeshArrays) -> MeshNote:
         levels = [self._mesh_level(mesh, encode_mesh(mesh), 0.0)]

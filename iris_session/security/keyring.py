@@ -72,7 +72,7 @@ class Keyring:
         self.watching: set[str] = set()
         self.files = FileWorker()
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Tells those who had files changed."""
         self.files.turn(now_ns)
 
