@@ -83,7 +83,9 @@ def is_valid_pose(ctx: Context, T: Pose) -> bool:
 
 
 def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -> bool:
-    """Return true when a measurement differs from the alignment in force or under way, or has a smaller stated error."""
+    """Return true when a measurement differs from the alignment in force or under way, or has a smaller
+    stated error.
+    """
     now, coming = p.alignment, p.correction
     if now is None or now.kind == AlignmentKind.PLACED or (p.alarm is not None and not p.alarm.beside):
         return True

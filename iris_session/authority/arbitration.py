@@ -197,7 +197,9 @@ class CommandBuilder:
         return command
 
     def _blend_sources(self, ctx: Context, lease: LeaseState) -> Command:
-        """Blend all engaged sharers, whose samples are of one kind (`samples` ensures it), with weights summing to 1."""
+        """Blend all engaged sharers, whose samples are of one kind (`samples` ensures it), with weights
+        summing to 1.
+        """
         engaged = [g for g in lease.grants if g.engagement and g.source is not None]
         if not engaged:
             return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)

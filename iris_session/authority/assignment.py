@@ -78,7 +78,9 @@ def update_name_owners(ctx: Context) -> None:
 
 
 def choose_robots(ctx: Context, p: Participant, free: list[str]) -> tuple[str, ...] | Denial:
-    """Return robots for `p`, which named none: out of `free`, or (policy `config`) all of its own. Empty: none is free."""
+    """Return robots for `p`, which named none: out of `free`, or (policy `config`) all of its own. Empty: none is
+    free.
+    """
     policy = ctx.config.policy
     if policy == AssignmentPolicy.DIRECTOR and p.role != Role.DIRECTOR:
         return Denial(DenialReason.POLICY, "a director assigns the robots of this session", "ask a director")

@@ -119,7 +119,9 @@ class Context:
         return found
 
     def get_holder(self, lease: LeaseState) -> str:
-        """Return the participant in charge of a target: the overriding human, else the first holder; empty when free."""
+        """Return the participant in charge of a target: the overriding human, else the first holder;
+        empty when free.
+        """
         return lease.override or (lease.grants[0].participant if lease.grants else "")
 
     def get_scale(self, lease: LeaseState) -> float:
@@ -128,7 +130,9 @@ class Context:
         return next((g.scale for g in lease.grants if g.participant == holder), self.default_scale)
 
     def to_lease(self, lease: LeaseState) -> Lease:
-        """Return a lease in its public form. In mode `priority` an agent and its stand-by human are both sub-holders."""
+        """Return a lease in its public form. In mode `priority` an agent and its stand-by human are both
+        sub-holders.
+        """
         holder = self.get_holder(lease)
         expires = self.state.participants[holder].expires_ns if holder else 0
         weights: dict[str, float] = {}
@@ -188,7 +192,9 @@ def join_names(names: Iterable[str], max_count: int = 6) -> str:
 
 
 def find_grant(lease: LeaseState, participant: str, device: str = "") -> LeaseGrant | None:
-    """Return the grant that `participant` may use with `device`: one bound to that hand first, else one bound to none."""
+    """Return the grant that `participant` may use with `device`: one bound to that hand first, else one bound to
+    none.
+    """
     loose = None
     for g in lease.grants:
         if g.participant == participant:

@@ -36,7 +36,9 @@ def revoke_grant(ctx: Context, lease: LeaseState, g: LeaseGrant) -> None:
 def grant_lease(
     ctx: Context, lease: LeaseState, p: Participant, cause: str, weight: float = 1.0, hand: str = ""
 ) -> None:
-    """Grant `lease` to `p`; grants that exclude it are revoked in the same step. For a holder only the weight is set."""
+    """Grant `lease` to `p`; grants that exclude it are revoked in the same step. For a holder only the
+    weight is set.
+    """
     own = find_grant(lease, p.id, hand)
     joins = lease.mode in (LeaseMode.SHARED, LeaseMode.PRIORITY) and cause != "assigned"
     if own is not None and own.hand == hand and (joins or len(lease.grants) == 1):

@@ -332,7 +332,9 @@ def assign_robots(ctx: Context, p: Participant, m: Assign) -> None:
 
 
 def set_mode(ctx: Context, p: Participant, m: SetMode) -> None:
-    """Change the mode of a robot for a director. Of several holders only the one in charge stays, unless it is shared."""
+    """Change the mode of a robot for a director. Of several holders only the one in charge stays, unless it is
+    shared.
+    """
     lease = ctx.state.robots.get(m.robot)
     if lease is None:
         return ctx.deny(p, m.request_id, build_unknown_denial("robot", m.robot, ctx.robots))

@@ -42,7 +42,9 @@ SCENE_CHANGED: Final = "scene_changed"
 
 
 def latch_estop(ctx: Context, participant: str, m: EStop) -> None:
-    """Latch the e-stop; every robot holds from this step on. `participant`: empty for a sender that is no participant."""
+    """Latch the e-stop; every robot holds from this step on. `participant`: empty for a sender that is no
+    participant.
+    """
     ctx.estop_arrived = True
     if not ctx.state.estop:
         ctx.state.estop = True
