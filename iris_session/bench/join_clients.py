@@ -23,7 +23,7 @@ import zmq
 from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.scene import decode_image, decode_mesh
-from iris_session.system.priority import give_way
+from iris_session.system.priority import lower_thread_priority
 
 JOIN_S: Final = 60.0
 #: Memory is copied for so long, after a pause in which the machine has nothing to do with joining any more; by as many
@@ -101,7 +101,7 @@ def copy_memory(origin_ns: int) -> CopyInterval:
     end_ns = begin_ns + round(COPY_S * 1e9)
 
     def work() -> None:
-        give_way()
+        lower_thread_priority()
         source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
         while time.monotonic_ns() < end_ns:
             np.copyto(target, source)

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 from iris_session.assets.errors import AssetStoreError
 from iris_session.assets.store import AssetPart, AssetStore
 from iris_session.client.errors import AssetError
-from iris_session.system.priority import give_way
+from iris_session.system.priority import lower_thread_priority
 
 THREADS: Final = 2
 #: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything
@@ -156,7 +156,7 @@ class AssetWorkers:
     # --- the threads --------------------------------------------------------------------------------------------------
 
     def _run(self, jobs: queue.SimpleQueue[_Job | None]) -> None:
-        give_way()
+        lower_thread_priority()
         untold, woken_ns = 0, 0
         while (job := jobs.get()) is not None:
             address, work, size = job

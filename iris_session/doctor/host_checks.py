@@ -46,7 +46,7 @@ def check_host(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
 
 def check_scheduling() -> Finding:
     """Whether the tick loop may run before other work."""
-    from iris_session.session.scheduling import tick_priority
+    from iris_session.system.priority import tick_priority
 
     with tick_priority() as reached:
         pass

@@ -26,7 +26,7 @@ from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.security import KeyPair, fingerprint
 from iris_session.security.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
-from iris_session.system.priority import made_below
+from iris_session.system.priority import run_at_low_priority
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class AssetSockets:
 
 def open_asset_sockets(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
     """`AssetSockets` whose I/O thread gives way to all others. Raises `FrontError`."""
-    return made_below(lambda: AssetSockets(config, key))
+    return run_at_low_priority(lambda: AssetSockets(config, key))
 
 
 class AssetServer:

@@ -7,7 +7,7 @@ from typing import Final
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
@@ -34,7 +34,7 @@ class DisconnectHandler:
         monitor: zmq.Socket[bytes],
         admission: Admission,
         status: StatusService,
-        alignment: Anchoring,
+        alignment: AlignmentService,
     ) -> None:
         self._monitor = monitor
         self._guard = context.guard
@@ -119,5 +119,5 @@ class DisconnectHandler:
         self._connections.remove(connection)
         if reason in TCP_STAYS_OPEN:
             self._connections.keep_for_estop(connection)
-        self._alignment.forget(connection.number)
+        self._alignment.remove_connection(connection.number)
         self._drops.remove(connection.number)

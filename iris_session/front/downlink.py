@@ -7,7 +7,7 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.asset_service import AssetService
 from iris_session.front.connections import encode_message
@@ -25,7 +25,7 @@ from iris_session.protocol.server_messages import (
     ServerMessage,
     Snapshot,
 )
-from iris_session.protocol.steps import Outgoing
+from iris_session.protocol.steps import OutgoingMessage
 
 _MAX_MESSAGES: Final = 64  # read at once
 #: Reasons by which a director ends a participation: the client does not join again by itself after them.
@@ -42,7 +42,7 @@ class Downlink:
         admission: Admission,
         disconnects: DisconnectHandler,
         revocation: RevocationService,
-        alignment: Anchoring,
+        alignment: AlignmentService,
         assets: AssetService,
     ) -> None:
         self._socket = socket
@@ -115,7 +115,7 @@ class Downlink:
                 self._send_outgoing(outgoing)
         for event in decided.events:
             self.broadcast(event)
-            self._alignment.heard(event.body)
+            self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.expire_tokens(event.body.participant)
         for outgoing in snapshots:
@@ -134,14 +134,14 @@ class Downlink:
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, heard_ns)
 
-    def _send_outgoing(self, outgoing: Outgoing) -> None:
+    def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
         connection = self._connections.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
             # The front adds what only it knows: the scene, and the poses of the newest state frame.
-            self._alignment.shown(message.participants)
+            self._alignment.process_snapshot(message.participants)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(

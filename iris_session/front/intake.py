@@ -8,7 +8,7 @@ from typing import Any, Final
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.connection_guard import BEFORE_HELLO
 from iris_session.front.connections import FrontConnection, Peer, Route
@@ -112,7 +112,7 @@ class Intake:
         admission: Admission,
         pairing: PairingService,
         status: StatusService,
-        alignment: Anchoring,
+        alignment: AlignmentService,
         raw: RawFeed,
     ) -> None:
         self._config = context.config
@@ -251,7 +251,7 @@ class Intake:
             self._observe_sample(connection, message, now_ns)
         elif isinstance(message, Observation):
             self._forward_raw(connection, data, now_ns)
-            self._alignment.observed(connection, message, now_ns)
+            self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
@@ -293,7 +293,7 @@ class Intake:
     def _observe_sample(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
         """Pass every sample on to status and alignment, before samples are coalesced."""
         self._status.record_sample(connection.number, sample, now_ns)
-        self._alignment.sampled(connection, sample, now_ns)
+        self._alignment.process_sample(connection, sample, now_ns)
 
     def _count_rejection(
         self, peer: Peer, connection: FrontConnection | None, now_ns: int, detail: str = BEFORE_HELLO

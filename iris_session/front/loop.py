@@ -12,7 +12,7 @@ from typing import Final
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
 from iris_session.front.asset_service import AssetService
@@ -34,7 +34,7 @@ from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import readable
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.system.parent import parent_is
+from iris_session.system.process import is_parent
 
 #: Messages of clients handled before the link is drained again: about 0.2 ms.
 ROUND: Final = 8
@@ -72,7 +72,7 @@ class Front:
         proxy = _make_media_proxy(context, sockets)
         media = MediaService(context, proxy)
         assets = AssetService(context, _make_asset_server(context, sockets))
-        alignment = Anchoring(context.config, context.connections, context.coalescer.offer, context.drops)
+        alignment = _make_alignment_service(context)
         status = StatusService(context, media, assets, alignment)
         admission = Admission(context, (media, assets))
         pairing = PairingService(context)
@@ -208,7 +208,7 @@ class Front:
             self.end(ENDED)
         elif readable(self._sockets.link_monitor):
             self.cut_off = True
-            self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
+            self.end(ENDED if is_parent(self._start.parent_pid) else ORPHANED)
 
     def _check_stall(self, now_ns: int) -> None:
         """Notify the clients when the authority stalls or recovers. Called after the link was drained, so that a front
@@ -221,8 +221,20 @@ class Front:
         elif authority.stalled and not stalled:
             self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
         authority.stalled = stalled
-        if not parent_is(self._start.parent_pid):
+        if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
+
+
+def _make_alignment_service(context: FrontContext) -> AlignmentService:
+    config = context.config
+    return AlignmentService(
+        context.coalescer.offer,
+        context.drops,
+        anchors=config.anchors,
+        anchor_sizes=config.anchor_sizes,
+        proposal_period_ns=config.proposal_period_ns,
+        max_connections=config.limits.connections,
+    )
 
 
 def _make_media_proxy(context: FrontContext, sockets: FrontSockets) -> MediaProxy:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gc
-import logging
-import os
 import shutil
 import signal
 import sys
@@ -16,14 +14,8 @@ import msgspec
 from iris_session.front.loop import ENDED, ORPHANED, Front
 from iris_session.link.config import FrontError, FrontStart
 from iris_session.link.sockets import raise_descriptor_limit
-from iris_session.system.parent import die_with_parent, parent_ends, parent_is
-
-
-def configure_logging() -> None:
-    """Log to standard error, from the level in the environment variable `IRIS_LOG` on; warnings by default."""
-    level = os.environ.get("IRIS_LOG", "warning").upper()
-    known = level in logging.getLevelNamesMapping()
-    logging.basicConfig(format="iris-session: %(message)s", level=level if known else logging.WARNING)
+from iris_session.system.log import configure_logging
+from iris_session.system.process import die_with_parent, is_parent, wait_for_parent_exit
 
 
 def main() -> int:
@@ -39,7 +31,7 @@ def main() -> int:
     def on_signal(number: int, _frame: FrameType | None) -> None:
         if number != signal.SIGHUP:
             front.end(ENDED)
-        elif not parent_is(start.parent_pid):
+        elif not is_parent(start.parent_pid):
             front.end(ORPHANED)
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -53,7 +45,7 @@ def main() -> int:
         front.run()
     finally:
         front.close()
-        if (front.cut_off or front.ended == ORPHANED) and parent_ends(start.parent_pid):
+        if (front.cut_off or front.ended == ORPHANED) and wait_for_parent_exit(start.parent_pid):
             # The parent was killed, so the folder of the link is removed here.
             shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
     return 0

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.asset_service import AssetService
 from iris_session.front.connections import FrontConnection
 from iris_session.front.context import FrontContext
@@ -53,7 +53,9 @@ class _ConnectionStats:
 class StatusService:
     """Measure connections and answer `GetStatus`. A `Service`: `tick` updates the rates."""
 
-    def __init__(self, context: FrontContext, media: MediaService, assets: AssetService, alignment: Anchoring) -> None:
+    def __init__(
+        self, context: FrontContext, media: MediaService, assets: AssetService, alignment: AlignmentService
+    ) -> None:
         self._config = context.config
         self._connections = context.connections
         self._outbox = context.outbox
@@ -168,7 +170,7 @@ class StatusService:
             capture_to_receive=quantiles(stats.delays_ns),
             drops=self._drops.by_connection.get(connection.number, 0),
             reported=report is not None,
-            alignment_report=self._alignment.report(connection.number, row.alignment_report, now_ns),
+            alignment_report=self._alignment.complete_report(connection.number, row.alignment_report, now_ns),
             **measured,
             **self._media.report_participant(connection.number),
         )

@@ -28,7 +28,7 @@ from iris_session.protocol.server_messages import Event, SceneChanged
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.protocol.steps import Decision
 from iris_session.security import KeyPair
-from iris_session.system.priority import NICER
+from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.e2e.conftest import unavailable
 from tests.front.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.front.harness import FrontSession, RawClient
@@ -306,7 +306,7 @@ def _fetched(sockets: AssetSockets, address: str) -> bytes | None:
 def test_a_fault_costs_what_was_under_way_and_is_told_once(
     alone: tuple[AssetServer, AssetSockets, str],
     monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     server, sockets, address = alone
     assert _fetched(sockets, address) == b"asset"
@@ -319,15 +319,15 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
     assert _fetched(sockets, address) == b"asset"
     assert server.read_counters().reasons["assets_fault"] == 2
-    assert capfd.readouterr().err.count("a fault in the thread of assets, which goes on: ZeroDivisionError") == 1
+    assert caplog.text.count("thread of assets, which continues: ZeroDivisionError") == 1
 
 
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
-    if ours + NICER > 19:
+    if ours + LOW_PRIORITY_NICE > 19:
         unavailable("these tests run at the lowest priority already")
     found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
-    assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
+    assert found[ours + LOW_PRIORITY_NICE] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
     python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
     assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
 
