@@ -44,7 +44,7 @@ FORBIDDEN = {
 #: Imports between rooms that are still to be untied.
 TRANSITIONAL = {
     ("alignment", "front"), ("assets", "client"), ("assets", "scene"), ("netsim", "session"), ("protocol", "anchors"),
-    ("security", "link"), ("session", "client"), ("assets", "link"),
+    ("session", "client"), ("assets", "link"),
 }  # fmt: skip
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")

@@ -23,9 +23,9 @@ from iris_session.protocol.security import Pair, Paired
 from iris_session.protocol.server_messages import Refused
 from iris_session.protocol.token_bucket import Drops, TokenBucket
 from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
-from iris_session.security.file_worker import PATIENCE_S
 from iris_session.security.join_codes import Attempt
 from iris_session.security.keyring import Keyring, stranger_key
+from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
 #: Of everybody together.
 PER_SECOND: Final = 10.0
@@ -250,7 +250,7 @@ class PairingDesk:
 def _attempt(home: KeyHome, key: KeyPair, waiting: _Waiting) -> Attempt:
     pair = waiting.pair
     name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
-    return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, PATIENCE_S)
+    return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, LOCK_TIMEOUT_S)
 
 
 def _network(address: str) -> str:

@@ -23,9 +23,9 @@ from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
-from iris_session.security.file_worker import PATIENCE_S
 from iris_session.security.keyring import Keyring, roles_behind
 from iris_session.security.resume_tokens import ResumeTokens
+from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
 LOOK_NS: Final = 100 * MILLISECOND
 #: Between the fault and the end of the TCP connection, so that the fault arrives.
@@ -195,6 +195,6 @@ class Revocation:
 
 def _change(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
     for mark in marks:
-        clients.revoke(mark, PATIENCE_S)
+        clients.revoke(mark, LOCK_TIMEOUT_S)
     if seen:
-        clients.seen(seen, PATIENCE_S)
+        clients.seen(seen, LOCK_TIMEOUT_S)

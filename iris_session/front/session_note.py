@@ -9,13 +9,13 @@ from functools import partial
 
 from iris_session.link.config import FrontConfig, Ports
 from iris_session.security import KeyHome, KeysBusyError, KeysError, SessionNote
-from iris_session.security.file_worker import PATIENCE_S, FileWorker
+from iris_session.system.file_worker import LOCK_TIMEOUT_S, FileWorker
 
 
 class NoteKeeper:
     """A `Service`: has the note written in its first turn, removes it in the end."""
 
-    def __init__(self, home: KeyHome, files: FileWorker, config: FrontConfig, ports: Ports) -> None:
+    def __init__(self, home: KeyHome, files: FileWorker[KeysError], config: FrontConfig, ports: Ports) -> None:
         self._notes = home.sessions
         self._files = files
         self._note = SessionNote(
@@ -26,7 +26,7 @@ class NoteKeeper:
     def turn(self, now_ns: int) -> None:
         """Tries until nobody else changes the file."""
         if not self._asked:
-            self._asked = self._files.submit(partial(self._notes.add, self._note, PATIENCE_S), self._done)
+            self._asked = self._files.submit(partial(self._notes.add, self._note, LOCK_TIMEOUT_S), self._done)
 
     def close(self) -> None:
         """The front's loop has ended: nobody waits for it any more."""

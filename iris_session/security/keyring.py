@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
-from iris_session.link.config import FrontConfig, FrontError
 from iris_session.protocol.names import Role
 from iris_session.protocol.token_bucket import Drops
 from iris_session.security import (
@@ -23,7 +22,7 @@ from iris_session.security import (
     raw_key,
 )
 from iris_session.security.allow_list import utc_now
-from iris_session.security.file_worker import FileWorker
+from iris_session.system.file_worker import FileWorker
 
 #: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
 STRANGER: Final = "pair:"
@@ -70,7 +69,7 @@ class Keyring:
         self.seen: dict[str, str] = {}
         self.revoking: dict[str, None] = {}
         self.watching: set[str] = set()
-        self.files = FileWorker()
+        self.files = FileWorker(KeysError)
 
     def turn(self, now_ns: int) -> None:
         """Tells those who had files changed."""
@@ -130,22 +129,27 @@ class Keyring:
         self._keys = keys
 
 
-def open_keyring(config: FrontConfig, drops: Drops) -> Keyring:
-    """The keyring of a session. Off loopback everything is encrypted. Raises `FrontError`."""
-    if not (config.curve or config.curve_secret_file or not config.loopback):
-        return Keyring(drops=drops)
-    home = KeyHome(config.key_home)
-    try:
-        key = load_secret(config.curve_secret_file) if config.curve_secret_file else home.server_key()
-        if not config.curve_clients_dir:
-            return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
-        folder = Path(config.curve_clients_dir)
-        if not folder.is_dir():
-            raise FrontError(f"{folder} is no folder with the public keys (*.key) of the clients that may connect")
-        certificates = _Certificates(folder, drops)
-        return Keyring(key, None, certificates.read, certificates.signature, drops)
-    except KeysError as error:
-        raise FrontError(str(error)) from error
+def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops) -> Keyring:
+    """Return the keyring of an encrypted session.
+
+    Args:
+        key_home: Folder of the server's key and the allow-list; empty for that of the user.
+        secret_file: Certificate of the server (`*.key_secret`) instead of the one in the key home, or empty.
+        clients_dir: Folder of public certificates (`*.key`) instead of the allow-list, or empty.
+        drops: Counts files that cannot be read.
+
+    Raises:
+        KeysError: A key or the allow-list cannot be used.
+    """
+    home = KeyHome(key_home)
+    key = load_secret(secret_file) if secret_file else home.server_key()
+    if not clients_dir:
+        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
+    folder = Path(clients_dir)
+    if not folder.is_dir():
+        raise KeysError(f"{folder} is not a folder: it has to hold the public keys (*.key) of the allowed clients")
+    certificates = _Certificates(folder, drops)
+    return Keyring(key, None, certificates.read, certificates.signature, drops)
 
 
 class _Certificates:

@@ -12,12 +12,20 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from iris_session.link.sockets import ZAP_CONTROL, ZAP_STATE, readable
 from iris_session.protocol.token_bucket import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import STRANGER, Keyring
 
 ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
+#: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
+#: when a key is revoked that came in there.
+ZAP_CONTROL: Final = b"iris-control"
+ZAP_STATE: Final = b"iris-state"
+ZAP_MEDIA: Final = b"iris-media"
+ZAP_ASSETS: Final = b"iris-assets"
+#: As plain integers: operations on the enumerations take longer than asking the socket.
+_EVENTS: Final = int(zmq.EVENTS)
+_POLLIN: Final = int(zmq.POLLIN)
 _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, mechanism, client key
 
 
@@ -28,7 +36,7 @@ def asks_with_curve(request: list[bytes]) -> bool:
 
 def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
     """Answers every ZAP request that waits. `user_id_of(request)`: empty for who is not to be let in."""
-    while readable(socket):
+    while _has_message(socket):
         frames = socket.recv_multipart()
         split = frames.index(b"") + 1
         route, request = frames[:split], frames[split:]
@@ -39,6 +47,10 @@ def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], st
         else:
             reply = [b"1.0", request_id, b"400", b"key not on the list", b"", b""]
         socket.send_multipart(route + reply)
+
+
+def _has_message(socket: zmq.Socket[bytes]) -> bool:
+    return bool(socket.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
 class Authenticator:
@@ -65,7 +77,7 @@ class Authenticator:
 
     def answer(self) -> None:
         """Answers everything that waits."""
-        if readable(self.socket):
+        if _has_message(self.socket):
             self._keyring.look()
             answer_zap(self.socket, self._user_id)
 

@@ -15,7 +15,7 @@ from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ClientTable, Peer, Route
 from iris_session.front.pairing import AGAIN_S, BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
 from iris_session.front.revocation import LOOK_NS, Revocation
-from iris_session.link.config import SECOND, FrontConfig
+from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
@@ -247,8 +247,7 @@ def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_give
     server = KeyHome(tmp_path / "home")
     server.server_key()
     drops = Drops()
-    config = FrontConfig(curve_secret_file=str(server.path / "server.key_secret"), curve_clients_dir=str(folder))
-    keyring = open_keyring(config, drops)
+    keyring = open_keyring("", str(server.path / "server.key_secret"), str(folder), drops)
     path = folder / "ann.key"
 
     def write(text: str) -> None:

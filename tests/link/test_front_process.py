@@ -95,7 +95,7 @@ def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("secret_file", "folder", "text"),
     [
-        ("server.key_secret", "missing", "no folder with the public keys"),
+        ("server.key_secret", "missing", "is not a folder"),
         ("nothing", ".", "cannot be used"),
         ("server.key", ".", "holds no secret key"),
     ],

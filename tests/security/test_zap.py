@@ -8,11 +8,10 @@ from typing import Any, cast
 import pytest
 import zmq
 
-from iris_session.link.sockets import ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE
 from iris_session.protocol.token_bucket import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import Keyring
-from iris_session.security.zap import Authenticator
+from iris_session.security.zap import ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE, Authenticator
 
 KEY = bytes(range(32))
 
