@@ -263,7 +263,7 @@ def _unless_stopped(session: Session) -> None:
 def _begin_profiles(arena: Arena) -> None:
     """The moments of a profile count from the beginning of the window."""
     assert arena.proxy is not None
-    arena.proxy.post("start")
+    arena.proxy.send("start")
 
 
 class _Script:

@@ -152,7 +152,7 @@ def _resume(arena: Arena, stretch: Stretch, link: str, resumed: dict[Stretch, in
 
 def _link(arena: Arena, command: str, link: str) -> None:
     assert arena.proxy is not None
-    arena.proxy.post(f"{command} @{link}")
+    arena.proxy.send(f"{command} @{link}")
 
 
 def _bars(results: dict[str, Any]) -> list[Any]:

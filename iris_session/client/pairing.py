@@ -19,7 +19,7 @@ from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.security import Pair, Paired
 from iris_session.protocol.server_messages import ProtocolFault, Refused
-from iris_session.security import KeyPair, raw_key
+from iris_session.security import KeyPair, decode_key
 
 ANSWER_S: Final = 5.0
 #: Where many pair at once it says so, where its disk is slow it says nothing for a while: the same is asked again, for
@@ -46,7 +46,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
     The session must prove that it knows the code: only then its key is that of whom gave the code out. Raises
     `RefusedError` (code wrong, used or expired), `TrustError` (it does not know the code), `NotConnectedError`.
     """
-    server_public = raw_key(server_key)
+    server_public = decode_key(server_key)
     try:
         secret = pairing.stretch(code, server_public)
     except ValueError as error:

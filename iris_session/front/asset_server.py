@@ -25,8 +25,8 @@ from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
-from iris_session.security import KeyPair, fingerprint
-from iris_session.security.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
+from iris_session.security import KeyPair, compute_fingerprint
+from iris_session.security.zap import ZAP_ENDPOINT, answer_zap_requests, is_curve_request
 from iris_session.system.priority import made_below
 
 IDLE_MS: Final = 50
@@ -163,7 +163,7 @@ class AssetServer:
             poller.poll(self._patience_ms())
             self._look_at_table()
             if self._sockets.zap is not None:
-                answer_zap(self._sockets.zap, self._user_id)
+                answer_zap_requests(self._sockets.zap, self._user_id)
             self._come_and_gone()
             self._count(self._doors.turn(self._now_ns()))
             self._take_requests()
@@ -189,7 +189,7 @@ class AssetServer:
             self._doors.close_one(descriptor, "")
 
     def _user_id(self, request: list[bytes]) -> str:
-        mark = fingerprint(request[6]) if asks_with_curve(request) else ""
+        mark = compute_fingerprint(request[6]) if is_curve_request(request) else ""
         if mark in self._taken.marks:
             return mark
         self._count(["assets_unknown_key"])

@@ -118,7 +118,9 @@ class AssetDesk:
 
     def _tell(self, listeners: dict[int, str]) -> None:
         keyring = self._keyring
-        marks = frozenset() if keyring.key is None else frozenset(m for m in keyring.marks if not self._revoked(m))
+        marks = (
+            frozenset() if keyring.key is None else frozenset(m for m in keyring.fingerprints if not self._revoked(m))
+        )
         table = Table(listeners, marks, self._stores)
         if table != self._told:
             self._told = table

@@ -39,8 +39,8 @@ from iris_session.protocol.security import Pair
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
 from iris_session.protocol.token_bucket import Drops, TokenBucket
-from iris_session.security import fingerprint, raw_key
-from iris_session.security.keyring import stranger_key
+from iris_session.security import compute_fingerprint, decode_key
+from iris_session.security.keyring import parse_pairing_key
 
 #: Faults to strangers, per second: they have no connection to count on.
 _STRANGER_FAULTS: Final = 20
@@ -134,7 +134,7 @@ class Intake:
             self._not_taken(peer, None, now_ns)
             self._pairing.take(route, peer, message, now_ns)
             return
-        if stranger_key(peer.user_id):
+        if parse_pairing_key(peer.user_id):
             self._stranger(route, peer, message, now_ns)
             return
         connection = self._clients.by_route.get(route)
@@ -170,7 +170,7 @@ class Intake:
         """A key that is not on the list said something else than `Pair`."""
         self._drops.count("unpaired")
         self._not_taken(peer, None, now_ns)
-        mark, name = fingerprint(raw_key(stranger_key(peer.user_id))), getattr(message, "name", "")
+        mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
         self._audit.note(
             AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=tag_of(type(message))

@@ -23,7 +23,7 @@ from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
-from iris_session.security.keyring import Keyring, roles_behind
+from iris_session.security.keyring import Keyring, select_gateway_roles
 from iris_session.security.resume_tokens import ResumeTokens
 from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
@@ -71,7 +71,7 @@ class Revocation:
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """A director's word: ends the key here, and takes it off the list."""
-        self._keyring.revoking[key_id] = None
+        self._keyring.pending_revocations[key_id] = None
         self._end(key_id, now_ns, "a director revoked this key")
 
     def remove(self, connection: Connection, text: str, now_ns: int, reason: str = "revoked") -> None:
@@ -88,20 +88,20 @@ class Revocation:
         if now_ns >= self._next_look_ns:
             self._next_look_ns = now_ns + LOOK_NS
             self._write(now_ns)
-            self._keyring.look()
-        if self._keyring.gone:
-            gone_keys, self._keyring.gone = self._keyring.gone, {}
+            self._keyring.reload_if_changed()
+        if self._keyring.removed:
+            gone_keys, self._keyring.removed = self._keyring.removed, {}
             for mark, old in gone_keys.items():
-                now = self._keyring.find(mark)
-                if now is None and self._tokens.revoked(mark):
+                now = self._keyring.find_key(mark)
+                if now is None and self._tokens.is_revoked(mark):
                     continue  # a director did it: all is done
                 if now is None:
                     self._audit.note(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
                     self._end(mark, now_ns, REVOKED)
                 else:
                     self._narrow(mark, now.roles, now_ns)
-        while self._keyring.come:
-            self._tokens.forgive(self._keyring.come.popitem()[0])
+        while self._keyring.added:
+            self._tokens.reinstate_key(self._keyring.added.popitem()[0])
         if self._state_due_ns:
             self._reopen(now_ns)
 
@@ -116,11 +116,11 @@ class Revocation:
                 self.remove(one, GATEWAY_REVOKED, now_ns)
             self.remove(connection, text, now_ns)
             self._lose(connection, "revoked")  # and those behind it
-        for participant in self._tokens.revoke(key_id):
+        for participant in self._tokens.revoke_key(key_id):
             self._expel(participant, "key revoked", now_ns)
-        if key_id in self._keyring.watching and not self._state_due_ns:
+        if key_id in self._keyring.state_subscribers and not self._state_due_ns:
             self._publisher.use_socket(None)
-            self._keyring.watching.clear()
+            self._keyring.state_subscribers.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
     def _narrow(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
@@ -131,7 +131,7 @@ class Revocation:
             if roles and connection.hello.role not in roles:
                 lost = [*behind, connection]
             else:
-                left = roles_behind(roles)
+                left = select_gateway_roles(roles)
                 lost = [one for one in behind if left and one.hello.role not in left]
             for one in lost:
                 self._end_role(one, now_ns)
@@ -145,7 +145,7 @@ class Revocation:
         if not connection.gateway:
             close_tcp(connection.peer.descriptor, connection.address)
         if participant:
-            self._tokens.left(participant)
+            self._tokens.remove_participant(participant)
             self._expel(participant, ROLE_TAKEN, now_ns)
 
     def _of(self, key_id: str) -> list[Connection]:
@@ -168,26 +168,26 @@ class Revocation:
         """Has the list changed. What it says is decided already: nobody waits for the file."""
         keyring = self._keyring
         if keyring.home is None:
-            keyring.revoking.clear()
+            keyring.pending_revocations.clear()
             return
-        due = bool(keyring.seen) and now_ns >= self._next_seen_ns
-        if self._writing or not (keyring.revoking or due):
+        due = bool(keyring.last_seen) and now_ns >= self._next_seen_ns
+        if self._writing or not (keyring.pending_revocations or due):
             return
-        marks, seen = tuple(keyring.revoking), keyring.seen if due else {}
+        marks, seen = tuple(keyring.pending_revocations), keyring.last_seen if due else {}
         job = partial(_change, keyring.home.clients, marks, seen)
         self._writing = keyring.files.submit(job, partial(self._written, marks, seen))
         if self._writing and due:
             self._next_seen_ns = now_ns + SEEN_NS
-            keyring.seen = {}
+            keyring.last_seen = {}
 
     def _written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
         self._writing = False
         keyring = self._keyring
         if outcome is None:
             for mark in marks:
-                keyring.revoking.pop(mark, None)
+                keyring.pending_revocations.pop(mark, None)
             return
-        keyring.seen = {**seen, **keyring.seen}
+        keyring.last_seen = {**seen, **keyring.last_seen}
         if not isinstance(outcome, KeysBusyError) and str(outcome) != self._said:
             self._said = str(outcome)  # the key stays out of this session; its file is tried again
             print(f"iris-session: the allow-list cannot be changed: {outcome}", file=sys.stderr, flush=True)
@@ -195,6 +195,6 @@ class Revocation:
 
 def _change(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
     for mark in marks:
-        clients.revoke(mark, LOCK_TIMEOUT_S)
+        clients.revoke_key(mark, LOCK_TIMEOUT_S)
     if seen:
-        clients.seen(seen, LOCK_TIMEOUT_S)
+        clients.record_last_seen(seen, LOCK_TIMEOUT_S)

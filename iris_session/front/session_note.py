@@ -8,7 +8,7 @@ import sys
 from functools import partial
 
 from iris_session.link.config import FrontConfig, Ports
-from iris_session.security import KeyHome, KeysBusyError, KeysError, SessionNote
+from iris_session.security import KeyHome, KeysBusyError, KeysError, RegisteredSession
 from iris_session.system.file_worker import LOCK_TIMEOUT_S, FileWorker
 
 
@@ -18,7 +18,7 @@ class NoteKeeper:
     def __init__(self, home: KeyHome, files: FileWorker[KeysError], config: FrontConfig, ports: Ports) -> None:
         self._notes = home.sessions
         self._files = files
-        self._note = SessionNote(
+        self._note = RegisteredSession(
             config.session_id, config.session_name, os.getpid(), ports.reachable, ports.control, ports.key_fingerprint
         )
         self._asked = False
@@ -33,7 +33,7 @@ class NoteKeeper:
         if not self._asked:
             return
         with contextlib.suppress(KeysError):
-            self._notes.remove(self._note.session_id, self._note.pid, patience_s=0.2)
+            self._notes.remove(self._note.session_id, self._note.pid, timeout_s=0.2)
 
     def _done(self, outcome: KeysError | None, _now_ns: int) -> None:
         if isinstance(outcome, KeysBusyError):

@@ -8,9 +8,14 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.names import Role
-from iris_session.security.curve import fingerprint, raw_key
-from iris_session.security.files import PATIENCE_S, KeysBusyError, KeysError, PrivateFolder
-from iris_session.security.lines import line_of
+from iris_session.security.curve import compute_fingerprint, decode_key
+from iris_session.security.private_folder import (
+    LOCK_TIMEOUT_S,
+    KeysBusyError,
+    KeysError,
+    PrivateFolder,
+    find_entry_line,
+)
 
 FILE: Final = "clients.json"
 MAX_KEYS: Final = 1024
@@ -30,15 +35,15 @@ class AllowedKey(msgspec.Struct, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint(raw_key(self.key))
+        return compute_fingerprint(decode_key(self.key))
 
 
-def utc_now() -> str:
+def format_utc_now() -> str:
     """Now, as it stands in the files."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
-def checked_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
+def validate_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
     """`roles` without doubles. Raises `KeysError` for one that there is not."""
     for role in roles:
         if role not in Role.ALL:
@@ -66,54 +71,54 @@ class AllowList:
             )
         keys: dict[str, AllowedKey] = {}
         for index, entry in enumerate(entries):
-            wrong = _wrong(entry, keys)
+            wrong = _find_fault(entry, keys)
             if wrong:
                 text = (self._folder.read(FILE) or b"").decode(errors="replace")
-                where = f"{self._folder.path / FILE} is damaged (line {line_of(text, index)}"
+                where = f"{self._folder.path / FILE} is damaged (line {find_entry_line(text, index)}"
                 raise KeysError(f"{where}: {wrong}): repair it, or move it away")
             keys[entry.fingerprint] = entry
         return keys
 
-    def allow(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
+    def allow_key(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
         """Puts `key` (Z85) on the list, or renames it and sets its roles. Raises `KeysError` for a taken name."""
-        with self._folder.locked():
-            return self.put(name, key, roles, rename=False)
+        with self._folder.lock():
+            return self.put_locked(name, key, roles, rename=False)
 
-    def put(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
+    def put_locked(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
         """As `allow`, for who holds the lock. `rename`: a taken name gets a number, `ann-2`."""
-        entry, entries = self.with_key(name, key, roles, rename=rename)
-        self.replace(entries)
+        entry, entries = self.plan_entry(name, key, roles, rename=rename)
+        self.replace_all(entries)
         return entry
 
-    def replace(self, entries: list[AllowedKey]) -> None:
+    def replace_all(self, entries: list[AllowedKey]) -> None:
         """Writes the whole list, for who holds the lock."""
         self._folder.write_json(FILE, entries)
 
-    def with_key(
+    def plan_entry(
         self, name: str, key: str, roles: tuple[str, ...], *, rename: bool
     ) -> tuple[AllowedKey, list[AllowedKey]]:
         """The entry that `put` would make, and the list with it. Nothing is written."""
         if not _is_name(name):
             raise KeysError(f"{name!r} is no name for a key: 1 to {MAX_NAME} printable characters")
         entries = self.read()
-        mark = fingerprint(raw_key(key))
+        mark = compute_fingerprint(decode_key(key))
         names = {entry.name for other, entry in entries.items() if other != mark}
         if name in names:
             if not rename:
                 raise KeysError(f"the name {name!r} is taken by another key: revoke that one, or choose another name")
-            name = _numbered(name, names)
+            name = _add_number(name, names)
         if mark not in entries and len(entries) >= MAX_KEYS:
             raise KeysError(f"the allow-list is full ({MAX_KEYS} keys): revoke some")
         old = entries.get(mark)
         entry = AllowedKey(
-            name, key, checked_roles(roles), old.added if old else utc_now(), old.last_seen if old else ""
+            name, key, validate_roles(roles), old.added if old else format_utc_now(), old.last_seen if old else ""
         )
         entries[mark] = entry
         return entry, list(entries.values())
 
-    def revoke(self, name_or_fingerprint: str, patience_s: float = PATIENCE_S) -> AllowedKey | None:
+    def revoke_key(self, name_or_fingerprint: str, timeout_s: float = LOCK_TIMEOUT_S) -> AllowedKey | None:
         """Takes one key off the list; `None` when it was not on it. Sessions that run notice within half a second."""
-        with self._folder.locked(patience_s):
+        with self._folder.lock(timeout_s):
             entries = self.read()
             named = (mark for mark, entry in entries.items() if entry.name == name_or_fingerprint)
             # A fingerprint first: somebody may have been listed under a name that looks like one.
@@ -124,11 +129,11 @@ class AllowList:
                 return entry
         return None
 
-    def seen(self, fingerprints: dict[str, str], patience_s: float = PATIENCE_S) -> None:
+    def record_last_seen(self, utc_by_fingerprint: dict[str, str], timeout_s: float = LOCK_TIMEOUT_S) -> None:
         """Notes when keys were last here: UTC by fingerprint. Keys that are off the list are passed over."""
-        with self._folder.locked(patience_s):
+        with self._folder.lock(timeout_s):
             before, entries = self.signature, self.read()
-            noted = {mark: utc for mark, utc in fingerprints.items() if mark in entries}
+            noted = {mark: utc for mark, utc in utc_by_fingerprint.items() if mark in entries}
             for mark, utc in noted.items():
                 entries[mark] = msgspec.structs.replace(entries[mark], last_seen=utc)
             if self.signature != before:  # an editor knows no lock: what it took off the list must stay off
@@ -137,11 +142,11 @@ class AllowList:
                 self._folder.write_json(FILE, list(entries.values()), durable=False)
 
 
-def _wrong(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
+def _find_fault(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
     """What is wrong with an entry that somebody may have written by hand, empty for nothing."""
     try:
         mark = entry.fingerprint
-        checked_roles(entry.roles)
+        validate_roles(entry.roles)
     except KeysError as error:
         return str(error)
     if not _is_name(entry.name):
@@ -153,6 +158,6 @@ def _is_name(name: str) -> bool:
     return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
-def _numbered(name: str, taken: set[str]) -> str:
+def _add_number(name: str, taken: set[str]) -> str:
     numbers = (f"{name[: MAX_NAME - 5]}-{n}" for n in range(2, MAX_KEYS + 2))
     return next(numbered for numbered in numbers if numbered not in taken)

@@ -16,24 +16,24 @@ from iris_session.security import (
     KeyHome,
     KeyPair,
     KeysError,
-    fingerprint,
+    compute_fingerprint,
+    decode_key,
     load_public,
     load_secret,
-    raw_key,
 )
-from iris_session.security.allow_list import utc_now
+from iris_session.security.allow_list import format_utc_now
 from iris_session.system.file_worker import FileWorker
 
 #: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
-STRANGER: Final = "pair:"
+PAIRING_PREFIX: Final = "pair:"
 
 
-def stranger_key(user_id: str) -> str:
+def parse_pairing_key(user_id: str) -> str:
     """The key (Z85) of a connection that may only pair, empty for any other."""
-    return user_id.removeprefix(STRANGER) if user_id.startswith(STRANGER) else ""
+    return user_id.removeprefix(PAIRING_PREFIX) if user_id.startswith(PAIRING_PREFIX) else ""
 
 
-def roles_behind(roles: tuple[str, ...]) -> tuple[str, ...]:
+def select_gateway_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
     """What people may join as behind a gateway whose key has `roles` (empty: any): the others of them; where there is
     no other, what a new key may."""
     return tuple(role for role in roles if role != Role.GATEWAY) or (DEFAULT_ROLES if roles else ())
@@ -61,14 +61,14 @@ class Keyring:
         self._read = read
         self._signature = signature
         self._drops = drops or Drops()
-        self._seen = signature()
-        self._said: object = None  # what was wrong with the list last
+        self._read_signature = signature()
+        self._reported: object = None  # what was wrong with the list last
         self._keys = read()
-        self.gone: dict[str, AllowedKey] = {}
-        self.come: dict[str, AllowedKey] = {}
-        self.seen: dict[str, str] = {}
-        self.revoking: dict[str, None] = {}
-        self.watching: set[str] = set()
+        self.removed: dict[str, AllowedKey] = {}
+        self.added: dict[str, AllowedKey] = {}
+        self.last_seen: dict[str, str] = {}
+        self.pending_revocations: dict[str, None] = {}
+        self.state_subscribers: set[str] = set()
         self.files = FileWorker(KeysError)
 
     def turn(self, now_ns: int) -> None:
@@ -80,52 +80,52 @@ class Keyring:
         self.files.close()
 
     @property
-    def marks(self) -> Collection[str]:
+    def fingerprints(self) -> Collection[str]:
         """Fingerprints of all allowed keys."""
         return self._keys.keys()
 
-    def find(self, mark: str) -> AllowedKey | None:
+    def find_key(self, mark: str) -> AllowedKey | None:
         """The allowed key with that fingerprint."""
         return self._keys.get(mark)
 
-    def welcomed(self, mark: str) -> None:
+    def record_join(self, mark: str) -> None:
         """A key has joined."""
         if self.home is not None and mark in self._keys:
-            self.seen[mark] = utc_now()
+            self.last_seen[mark] = format_utc_now()
 
-    def paired(self, mark: str) -> bool:
+    def confirm_pairing(self, mark: str) -> bool:
         """A key was put on the list by the session itself. True: it still is, and may join whatever it was before; also
         where the file cannot be read just now: it is known a moment later."""
-        self.look()  # the file decides: somebody may have taken the key off again since
+        self.reload_if_changed()  # the file decides: somebody may have taken the key off again since
         entry = self._keys.get(mark)
         if entry is not None:
-            self.come[mark] = entry
-        return entry is not None or self._signature() != self._seen
+            self.added[mark] = entry
+        return entry is not None or self._signature() != self._read_signature
 
-    def look(self) -> None:
+    def reload_if_changed(self) -> None:
         """Reads the list again if its file has changed. One that is damaged changes nothing, and is said.
 
         One that the system does not let us read just now (no descriptor free, a network disk) is tried again.
         """
         signature = self._signature()
-        if signature == self._seen:
+        if signature == self._read_signature:
             return
         try:
             keys = self._read()
         except KeysError as error:
             if not isinstance(error.__cause__, OSError):
-                self._seen = signature
-            if (signature, str(error)) != self._said:
-                self._said = signature, str(error)
+                self._read_signature = signature
+            if (signature, str(error)) != self._reported:
+                self._reported = signature, str(error)
                 self._drops.count("allow_list_unreadable")
                 print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
             return
-        self._seen, self._said = signature, None
+        self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
             if new is None or new.roles != old.roles:
-                self.gone[mark] = old
-        self.come.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
+                self.removed[mark] = old
+        self.added.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
         self._keys = keys
 
 
@@ -142,23 +142,23 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
         KeysError: A key or the allow-list cannot be used.
     """
     home = KeyHome(key_home)
-    key = load_secret(secret_file) if secret_file else home.server_key()
+    key = load_secret(secret_file) if secret_file else home.load_server_key()
     if not clients_dir:
         return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
     folder = Path(clients_dir)
     if not folder.is_dir():
         raise KeysError(f"{folder} is not a folder: it has to hold the public keys (*.key) of the allowed clients")
-    certificates = _Certificates(folder, drops)
+    certificates = _CertificateFolder(folder, drops)
     return Keyring(key, None, certificates.read, certificates.signature, drops)
 
 
-class _Certificates:
+class _CertificateFolder:
     """The public keys of a folder. A certificate that is damaged lets nobody in, keeps nobody else out, and is said."""
 
     def __init__(self, folder: Path, drops: Drops) -> None:
         self._folder = folder
         self._drops = drops
-        self._said: dict[str, str] = {}  # what is wrong, by file
+        self._reported: dict[str, str] = {}  # what is wrong, by file
 
     def read(self) -> dict[str, AllowedKey]:
         """Every `*.key` certificate by fingerprint. Raises `KeysError`."""
@@ -176,21 +176,21 @@ class _Certificates:
             except KeysError as error:
                 wrong[path.name] = str(error)
                 continue
-            keys[fingerprint(raw_key(public))] = AllowedKey(path.stem[:64], public)
+            keys[compute_fingerprint(decode_key(public))] = AllowedKey(path.stem[:64], public)
         for name, text in wrong.items():
-            if self._said.get(name) != text:
+            if self._reported.get(name) != text:
                 self._drops.count("certificate_unusable")
                 print(f"iris-session: nobody is let in by {name}: {text}", file=sys.stderr, flush=True)
-        self._said = wrong
+        self._reported = wrong
         return keys
 
     def signature(self) -> object:
         """Changes with every file that comes, goes or is written, whatever time it is given."""
         try:
-            return tuple(sorted((entry.name, *_identity(entry.stat())) for entry in self._folder.iterdir()))
+            return tuple(sorted((entry.name, *_get_signature(entry.stat())) for entry in self._folder.iterdir()))
         except OSError:
             return None
 
 
-def _identity(status: os.stat_result) -> tuple[int, ...]:
+def _get_signature(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_ctime_ns, status.st_size, status.st_mode

@@ -13,7 +13,7 @@ import os
 import msgspec
 
 
-class _Record(msgspec.Struct, array_like=True):
+class _TokenRecord(msgspec.Struct, array_like=True):
     digest: bytes
     key_id: str
     participant_id: str
@@ -22,18 +22,18 @@ class _Record(msgspec.Struct, array_like=True):
 
 class _Handback(msgspec.Struct, array_like=True):
     next_connection: int
-    records: list[_Record]
+    records: list[_TokenRecord]
     revoked: list[str] = []
 
 
 _decoder = msgspec.msgpack.Decoder(_Handback)
 
 
-def _digest(token: bytes) -> bytes:
+def _hash_token(token: bytes) -> bytes:
     return hashlib.blake2b(token, digest_size=16, person=b"iris-resume").digest()
 
 
-def handback_above(last_connection: int, blob: bytes = b"") -> bytes:
+def encode_handback(last_connection: int, blob: bytes = b"") -> bytes:
     """`blob` (empty: no tokens) for a front whose connection numbers begin above `last_connection`.
 
     Raises `msgspec.DecodeError` for bytes that are no such memory.
@@ -57,14 +57,14 @@ class ResumeTokens:
         self._revoked = dict.fromkeys(handback.revoked)
         self.changed = False
 
-    def new_connection(self) -> int:
+    def allocate_connection(self) -> int:
         """A connection number that no front of this session has used, from 1."""
         number = self._next_connection
         self._next_connection += 1
         self.changed = True
         return number
 
-    def issue(self, key_id: str, participant_id: str, came_with: bytes = b"", behind: str = "") -> bytes:
+    def issue(self, key_id: str, participant_id: str, previous: bytes = b"", behind: str = "") -> bytes:
         """A fresh token for `participant_id`, which has at most two: the one it `came_with`, and this. `behind`: key of
         the gateway that speaks for it.
 
@@ -72,33 +72,33 @@ class ResumeTokens:
         who are gone for good have none (`left`).
         """
         token = os.urandom(16)
-        digest = _digest(token)
-        keep = _digest(came_with)
+        digest = _hash_token(token)
+        keep = _hash_token(previous)
         for record in [one for one in self._records.values() if one.participant_id == participant_id]:
             if record.digest != keep:
                 del self._records[record.digest]
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
         self.changed = True
-        self._records[digest] = _Record(digest, key_id, participant_id, behind)
+        self._records[digest] = _TokenRecord(digest, key_id, participant_id, behind)
         return token
 
-    def find(self, token: bytes, key_id: str) -> str | None:
+    def find_participant(self, token: bytes, key_id: str) -> str | None:
         """The participant that `token` stands for, when it is bound to `key_id`. Does not use the token up."""
-        record = self._records.get(_digest(token))
+        record = self._records.get(_hash_token(token))
         return record.participant_id if record is not None and record.key_id == key_id else None
 
-    def retire(self, token: bytes) -> None:
+    def use_up(self, token: bytes) -> None:
         """Uses the token up."""
-        self.changed = self._records.pop(_digest(token), None) is not None or self.changed
+        self.changed = self._records.pop(_hash_token(token), None) is not None or self.changed
 
-    def left(self, participant_id: str) -> None:
+    def remove_participant(self, participant_id: str) -> None:
         """Uses up every token of a participant."""
         for record in [one for one in self._records.values() if one.participant_id == participant_id]:
             del self._records[record.digest]
             self.changed = True
 
-    def revoke(self, key_id: str) -> list[str]:
+    def revoke_key(self, key_id: str) -> list[str]:
         """Uses up every token of a key, and of those behind it if it is a gateway's. The participants that they stand
         for, each once."""
         theirs = [record for record in self._records.values() if key_id in (record.key_id, record.behind)]
@@ -111,16 +111,16 @@ class ResumeTokens:
         self.changed = True
         return list(dict.fromkeys(record.participant_id for record in theirs))
 
-    def forgive(self, key_id: str) -> None:
+    def reinstate_key(self, key_id: str) -> None:
         """The key was let in anew."""
         self.changed = self.changed or key_id in self._revoked
         self._revoked.pop(key_id, None)
 
-    def revoked(self, key_id: str) -> bool:
+    def is_revoked(self, key_id: str) -> bool:
         """Whether this key was revoked in this session, and not let in anew since."""
         return key_id in self._revoked
 
-    def blob(self) -> bytes:
+    def encode(self) -> bytes:
         self.changed = False
         return msgspec.msgpack.encode(
             _Handback(self._next_connection, list(self._records.values()), list(self._revoked))

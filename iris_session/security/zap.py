@@ -13,8 +13,8 @@ import zmq
 from zmq.utils import z85
 
 from iris_session.protocol.token_bucket import Drops
-from iris_session.security import fingerprint
-from iris_session.security.keyring import STRANGER, Keyring
+from iris_session.security import compute_fingerprint
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring
 
 ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
 #: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
@@ -29,12 +29,12 @@ _POLLIN: Final = int(zmq.POLLIN)
 _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, mechanism, client key
 
 
-def asks_with_curve(request: list[bytes]) -> bool:
+def is_curve_request(request: list[bytes]) -> bool:
     """Whether a ZAP request has all its frames, and the client's key as the last."""
     return len(request) == _REQUEST_FRAMES and request[5] == b"CURVE"
 
 
-def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
+def answer_zap_requests(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
     """Answers every ZAP request that waits. `user_id_of(request)`: empty for who is not to be let in."""
     while _has_message(socket):
         frames = socket.recv_multipart()
@@ -71,28 +71,28 @@ class Authenticator:
         self.socket.bind(ZAP_ENDPOINT)
         self._keyring = keyring
         self._drops = drops
-        self.refused = refused
+        self.on_refused = refused
         #: Whether a key was revoked in this session, also where the list could not be changed.
-        self.banned: Callable[[str], bool] = lambda _mark: False
+        self.is_revoked: Callable[[str], bool] = lambda _mark: False
 
-    def answer(self) -> None:
+    def answer_requests(self) -> None:
         """Answers everything that waits."""
         if _has_message(self.socket):
-            self._keyring.look()
-            answer_zap(self.socket, self._user_id)
+            self._keyring.reload_if_changed()
+            answer_zap_requests(self.socket, self._authenticate)
 
-    def _user_id(self, request: list[bytes]) -> str:
+    def _authenticate(self, request: list[bytes]) -> str:
         """Empty: not to be let in."""
-        if not asks_with_curve(request):
+        if not is_curve_request(request):
             self._drops.count("unknown_key")
             return ""
-        mark = fingerprint(request[6])
-        if self._keyring.find(mark) is not None and (request[2] == ZAP_CONTROL or not self.banned(mark)):
+        mark = compute_fingerprint(request[6])
+        if self._keyring.find_key(mark) is not None and (request[2] == ZAP_CONTROL or not self.is_revoked(mark)):
             if request[2] == ZAP_STATE:
-                self._keyring.watching.add(mark)
+                self._keyring.state_subscribers.add(mark)
             return mark  # a revoked one is told why it may not join, and gets no state
         self._drops.count("unknown_key")
         if self._keyring.home is not None and request[2] == ZAP_CONTROL:
-            return STRANGER + z85.encode(request[6]).decode()
-        self.refused(mark, request[3].decode(errors="replace"))
+            return PAIRING_PREFIX + z85.encode(request[6]).decode()
+        self.on_refused(mark, request[3].decode(errors="replace"))
         return ""

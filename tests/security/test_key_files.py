@@ -34,7 +34,7 @@ def certificate(folder: Path, **lines: str) -> Path:
     return path
 
 
-PAIR, OTHER = KeyPair.new(), KeyPair.new()
+PAIR, OTHER = KeyPair.generate(), KeyPair.generate()
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_what_surrounds_the_keys_in_a_certificate_does_not_matter(tmp_path: Path
 def listed(home: KeyHome) -> Path:
     """The allow-list of ann, bob and cem."""
     for name in ("ann", "bob", "cem"):
-        home.clients.allow(name, KeyPair.new().public, ("operator",))
+        home.clients.allow_key(name, KeyPair.generate().public, ("operator",))
     return home.path / "clients.json"
 
 
@@ -196,13 +196,13 @@ def test_a_note_of_the_session_does_not_undo_an_edit(
     with monkeypatch.context() as patch:
         patch.setattr(home.clients, "read", edited_meanwhile)
         with pytest.raises(KeysBusyError, match="edited just now"):
-            home.clients.seen({marks[0]: "2026-01-01T00:00:00+00:00"})
+            home.clients.record_last_seen({marks[0]: "2026-01-01T00:00:00+00:00"})
     assert read() == {}
 
 
 def test_new_permissions_are_a_change(home: KeyHome) -> None:
     """Who has mended them as they were told to must be heard."""
-    home.clients.allow("ann", PAIR.public)
+    home.clients.allow_key("ann", PAIR.public)
     path = home.path / "clients.json"
     path.chmod(0o644)
     before = home.clients.signature

@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.protocol.token_bucket import Drops
-from iris_session.security import fingerprint
+from iris_session.security import compute_fingerprint
 from iris_session.security.keyring import Keyring
 from iris_session.security.zap import ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE, Authenticator
 
@@ -18,7 +18,7 @@ KEY = bytes(range(32))
 
 @pytest.mark.parametrize(("domain", "watches"), [(ZAP_CONTROL, False), (ZAP_MEDIA, False), (ZAP_STATE, True)])
 def test_only_who_comes_in_to_the_state_socket_watches(domain: bytes, watches: bool) -> None:
-    mark = fingerprint(KEY)
+    mark = compute_fingerprint(KEY)
     keyring: Any = SimpleNamespace(watching=set(), home=None, look=lambda: None, find={mark: "an entry"}.get)
     with zmq.Context() as context:
         authenticator = Authenticator(cast("zmq.Context[zmq.Socket[bytes]]", context), cast(Keyring, keyring), Drops())
@@ -26,7 +26,7 @@ def test_only_who_comes_in_to_the_state_socket_watches(domain: bytes, watches: b
             asker.connect("inproc://zeromq.zap.01")
             asker.send_multipart([b"1.0", b"1", domain, b"10.0.0.1", b"", b"CURVE", KEY])
             assert authenticator.socket.poll(30_000)
-            authenticator.answer()
+            authenticator.answer_requests()
             assert asker.poll(30_000)
             assert asker.recv_multipart()[2:5] == [b"200", b"OK", mark.encode()]
         authenticator.socket.close()

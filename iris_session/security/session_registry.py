@@ -7,12 +7,12 @@ from typing import Final
 
 import msgspec
 
-from iris_session.security.files import PATIENCE_S, PrivateFolder
+from iris_session.security.private_folder import LOCK_TIMEOUT_S, PrivateFolder
 
 FILE: Final = "sessions.json"
 
 
-class SessionNote(msgspec.Struct, frozen=True):
+class RegisteredSession(msgspec.Struct, frozen=True):
     """One session. `hosts`: addresses under which it can be reached, best first. `server`: fingerprint of its key.
     `pid`: of the process that holds the sockets."""
 
@@ -24,30 +24,30 @@ class SessionNote(msgspec.Struct, frozen=True):
     server: str
 
 
-class SessionNotes:
+class SessionRegistry:
     """Reads and changes the notes. Those whose process is gone are passed over, and removed with the next change."""
 
     def __init__(self, folder: PrivateFolder) -> None:
         self._folder = folder
 
-    def read(self) -> list[SessionNote]:
+    def read(self) -> list[RegisteredSession]:
         """Sessions that run now."""
-        return [one for one in self._folder.read_json(FILE, list[SessionNote]) or [] if _runs(one.pid)]
+        return [one for one in self._folder.read_json(FILE, list[RegisteredSession]) or [] if _is_running(one.pid)]
 
-    def add(self, note: SessionNote, patience_s: float = PATIENCE_S) -> None:
+    def add(self, session: RegisteredSession, timeout_s: float = LOCK_TIMEOUT_S) -> None:
         """Notes a session, in place of an older note of it."""
-        with self._folder.locked(patience_s):
-            others = [one for one in self.read() if one.session_id != note.session_id]
-            self._folder.write_json(FILE, [*others, note], durable=False)
+        with self._folder.lock(timeout_s):
+            others = [one for one in self.read() if one.session_id != session.session_id]
+            self._folder.write_json(FILE, [*others, session], durable=False)
 
-    def remove(self, session_id: str, pid: int, patience_s: float = PATIENCE_S) -> None:
+    def remove(self, session_id: str, pid: int, timeout_s: float = LOCK_TIMEOUT_S) -> None:
         """Forgets a session, unless another process has taken it over."""
-        with self._folder.locked(patience_s):
+        with self._folder.lock(timeout_s):
             others = [one for one in self.read() if (one.session_id, one.pid) != (session_id, pid)]
             self._folder.write_json(FILE, others, durable=False)
 
 
-def _runs(pid: int) -> bool:
+def _is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):  # the latter: a number that no process can have

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
 import msgspec
 from filelock import FileLock, Timeout
 
-from iris_session.security.lines import trouble
-
 LOCK: Final = "lock"
 #: How long a command waits for another process to finish its change; a change takes milliseconds.
-PATIENCE_S: Final = 5.0
+LOCK_TIMEOUT_S: Final = 5.0
 #: No file of ours comes near it: a larger one is damaged, or somebody else's.
 MAX_FILE_BYTES: Final = 4_000_000
 T = TypeVar("T")
@@ -37,7 +38,7 @@ class PrivateFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def make(self) -> None:
+    def create(self) -> None:
         """Makes the folder. Raises `KeysError` when it belongs to somebody else or others may enter it."""
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -70,14 +71,14 @@ class PrivateFolder:
         try:
             return msgspec.json.decode(data, type=kind)
         except msgspec.MsgspecError as error:
-            text = trouble(data.decode(errors="replace"), error)
+            text = describe_json_error(data.decode(errors="replace"), error)
         except (UnicodeDecodeError, RecursionError) as error:
             text = str(error)
         raise KeysError(f"{self.path / name} is damaged ({text}): repair it, or move it away")
 
     def write(self, name: str, data: bytes, *, durable: bool = True) -> None:
         """Replaces a file as a whole, mode 0600. `durable`: it survives a power cut."""
-        self.make()
+        self.create()
         path = self.path / name
         try:
             descriptor, temporary = tempfile.mkstemp(prefix=f".{name}-", dir=self.path)  # mode 0600
@@ -89,7 +90,7 @@ class PrivateFolder:
                         os.fsync(file.fileno())
                 os.replace(temporary, path)
                 if durable:
-                    _settle(self.path)
+                    _sync_folder(self.path)
             except BaseException:
                 Path(temporary).unlink(missing_ok=True)
                 raise
@@ -109,10 +110,10 @@ class PrivateFolder:
         return status.st_ino, status.st_ctime_ns, status.st_size, status.st_mode
 
     @contextlib.contextmanager
-    def locked(self, patience_s: float = PATIENCE_S) -> Iterator[None]:
+    def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
         """The right to change files here, against all other processes. Raises `KeysBusyError` after `patience_s`."""
-        self.make()
-        lock = FileLock(self.path / LOCK, timeout=patience_s, mode=0o600)
+        self.create()
+        lock = FileLock(self.path / LOCK, timeout=timeout_s, mode=0o600)
         try:
             lock.acquire(poll_interval=0.01)
         except Timeout:
@@ -125,7 +126,7 @@ class PrivateFolder:
             lock.release()
 
 
-def _settle(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """Makes the names in a folder durable: else a power cut may bring back the file that was replaced."""
     if os.name != "posix":
         return  # folders cannot be opened there
@@ -146,3 +147,41 @@ def check_private(path: Path, status: os.stat_result, remedy: str) -> None:
         raise KeysError(f"{path} belongs to another user: take a file or folder of your own (IRIS_HOME)")
     if stat.S_IMODE(status.st_mode) & 0o077:
         raise KeysError(f"{path} can be used by other users of this machine: {remedy}")
+
+
+# MERGED from iris_session.security.private_folder:
+# In which line of a JSON file something is wrong, for people who edit it by hand. Nothing here reads files.
+
+_INDEX: Final = re.compile(r"\$\[(\d+)\]")
+_BLANK: Final = re.compile(r"[\s\[,]*")
+
+
+def describe_json_error(text: str, error: msgspec.MsgspecError) -> str:
+    """What is wrong with a JSON list that msgspec did not take, and in which line, as one line."""
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as malformed:
+        return f"line {malformed.lineno}: {malformed.msg}"
+    except RecursionError:
+        return "nested too deep"
+    except ValueError as other:  # a number of thousands of digits
+        return str(other)
+    found = _INDEX.search(str(error))
+    if found is None:
+        return str(error)
+    return f"line {find_entry_line(text, int(found[1]))}: {error}"
+
+
+def find_entry_line(text: str, index: int) -> int:
+    """The line, from 1, in which entry `index` of a JSON list begins; of a list that is none, the last that is read."""
+    decoder, at = json.JSONDecoder(), _skip_blank(text, 0)
+    with suppress(ValueError, RecursionError):  # somebody edits the file just now
+        for _ in range(index):
+            _, end = decoder.raw_decode(text, at)
+            at = _skip_blank(text, end)
+    return text.count("\n", 0, at) + 1
+
+
+def _skip_blank(text: str, at: int) -> int:
+    blank = _BLANK.match(text, at)
+    return blank.end() if blank is not None else at

@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Final
 
 from iris_session.security.allow_list import AllowList
-from iris_session.security.curve import KeyPair, pair_in
-from iris_session.security.files import KeysBusyError, KeysError, PrivateFolder
+from iris_session.security.curve import KeyPair, load_or_create_pair
 from iris_session.security.join_codes import JoinCodes
 from iris_session.security.known_servers import KnownServers
-from iris_session.security.session_notes import SessionNotes
+from iris_session.security.private_folder import KeysBusyError, KeysError, PrivateFolder
+from iris_session.security.session_registry import SessionRegistry
 
-__all__ = ["KeyHome", "KeysBusyError", "KeysError", "default_path"]
+__all__ = ["KeyHome", "KeysBusyError", "KeysError", "find_key_home"]
 
 SERVER_KEY: Final = "server.key_secret"
 IDENTITY: Final = "identity.key_secret"
 
 
-def default_path() -> Path:
+def find_key_home() -> Path:
     """The home of this user's keys."""
     home = os.environ.get("IRIS_HOME")
     if home:
@@ -35,20 +35,20 @@ class KeyHome:
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self.folder = PrivateFolder(Path(path) if path else default_path())
+        self.folder = PrivateFolder(Path(path) if path else find_key_home())
         self.clients = AllowList(self.folder)
-        self.codes = JoinCodes(self.folder)
-        self.servers = KnownServers(self.folder)
-        self.sessions = SessionNotes(self.folder)
+        self.join_codes = JoinCodes(self.folder)
+        self.known_servers = KnownServers(self.folder)
+        self.sessions = SessionRegistry(self.folder)
 
     @property
     def path(self) -> Path:
         return self.folder.path
 
-    def server_key(self) -> KeyPair:
+    def load_server_key(self) -> KeyPair:
         """Key pair of the sessions that this user serves, made on first use."""
-        return pair_in(self.folder, SERVER_KEY)
+        return load_or_create_pair(self.folder, SERVER_KEY)
 
-    def identity(self) -> KeyPair:
+    def load_identity(self) -> KeyPair:
         """Key pair with which this user joins sessions, made on first use."""
-        return pair_in(self.folder, IDENTITY)
+        return load_or_create_pair(self.folder, IDENTITY)
