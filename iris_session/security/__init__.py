@@ -1,7 +1,10 @@
-"""The home of keys: CURVE key pairs, the allow-list, join codes, known servers, and notes of running sessions.
+"""Keys and access: CURVE key pairs, the allow-list, join codes, known servers, resume tokens, ZAP authentication.
 
-One folder per user, readable by that user only (`KeyHome`). Processes share it: every change is made under a lock and
-replaces the file as a whole. A file that cannot be read is an error of one line, and is never replaced.
+Files live in one folder per user, readable by that user only (`KeyHome`). Processes share it: every change is made
+under a lock and replaces the file as a whole. A file that cannot be read raises a one-line error and is never replaced.
+
+Not here: the pairing exchange on the wire (`protocol.pairing`, `front.pairing`), revocation in a running session
+(`front.revocation`), the sockets themselves (`link.sockets`).
 """
 
 from iris_session.security.allow_list import DEFAULT_ROLES, AllowedKey, AllowList

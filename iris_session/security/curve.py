@@ -1,4 +1,4 @@
-"""CURVE key pairs: made, read from and written as ZeroMQ certificates, named by fingerprints."""
+"""CURVE key pairs: generated, read from and written as ZeroMQ certificates, identified by fingerprints."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ curve
 
 
 def compute_fingerprint(key: bytes, person: bytes = b"iris-key") -> str:
-    """Name of a key (raw 32 bytes) that tells nothing about it: 128-bit BLAKE2b in base32, lower case."""
+    """Return a public identifier of a key (raw 32 bytes): 128-bit BLAKE2b in base32, lower case."""
     digest = hashlib.blake2b(key, digest_size=16, person=person).digest()
     return base64.b32encode(digest).decode().rstrip("=").lower()
 
 
 def decode_key(text: str) -> bytes:
-    """The 32 raw bytes of a CURVE key in Z85 (40 characters). Raises `KeysError`."""
+    """Return the 32 raw bytes of a CURVE key in Z85 (40 characters). Raises `KeysError`."""
     if len(text) == Z85_CHARACTERS and text.isascii():
         try:
             key = z85.decode(text.encode())
@@ -45,7 +45,7 @@ def decode_key(text: str) -> bytes:
             key = b""
         if len(key) == 32:
             return bytes(key)
-    raise KeysError(f"{text[:50]!r} is not a CURVE key: {Z85_CHARACTERS} characters of Z85, as in a *.key file")
+    raise KeysError(f"{text[:50]!r} is not a CURVE key: expected {Z85_CHARACTERS} Z85 characters, as in a *.key file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class KeyPair:
     secret: str
 
     def __repr__(self) -> str:
-        return f"KeyPair({self.fingerprint})"  # never the secret, in no log and no traceback
+        return f"KeyPair({self.fingerprint})"  # the secret must not reach a log or traceback
 
     @property
     def raw_public(self) -> bytes:
@@ -73,28 +73,28 @@ class KeyPair:
 
 
 def load_public(path: str | os.PathLike[str]) -> str:
-    """The public key (Z85) in a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
+    """Return the public key (Z85) of a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
     return _read_certificate(Path(path))[0]
 
 
 def load_secret(path: str | os.PathLike[str]) -> KeyPair:
-    """The key pair in a `*.key_secret` certificate that its owner alone can read. Raises `KeysError`."""
+    """Return the key pair of a `*.key_secret` certificate that only its owner can read. Raises `KeysError`."""
     path = Path(path)
     public, secret = _read_certificate(path, private=True)
     if not secret:
         raise KeysError(f"{path} holds no secret key: give the *.key_secret file")
     try:
         decode_key(secret)
-    except KeysError:  # whose text would show it
-        raise KeysError(f"the secret key in {path} {_describe_bad_key(secret)}: make the pair anew") from None
+    except KeysError:  # its message would show the key
+        raise KeysError(f"the secret key in {path} {_describe_bad_key(secret)}: generate a new pair") from None
     if zmq.curve_public(secret.encode()) != public.encode():
-        raise KeysError(f"the two keys in {path} do not belong together: take the file as it was made")
+        raise KeysError(f"the two keys in {path} do not belong together: use the file as it was generated")
     return KeyPair(public, secret)
 
 
 def load_or_create_pair(folder: PrivateFolder, name: str) -> KeyPair:
-    """The key pair in a file of a private folder, made on first use."""
-    if folder.read(name) is None:  # also checks who may read it
+    """Return the key pair in a file of a private folder, generated on first use."""
+    if folder.read(name) is None:  # also checks the permissions
         with folder.lock():
             if folder.read(name) is None:
                 pair = KeyPair.generate()
@@ -103,8 +103,11 @@ def load_or_create_pair(folder: PrivateFolder, name: str) -> KeyPair:
 
 
 def _read_certificate(path: Path, *, private: bool = False) -> tuple[str, str]:
-    """Both keys of a certificate, the secret one empty when it has none. `private`: it must be this user's alone if it
-    has one; what is checked is the file that is read, whatever has its name by then."""
+    """Return both keys of a certificate, the secret one empty when it has none.
+
+    `private`: a file with a secret key must be readable by this user alone. The check is of the file that was opened,
+    not of the one that has its name later.
+    """
     try:
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
@@ -113,7 +116,7 @@ def _read_certificate(path: Path, *, private: bool = False) -> tuple[str, str]:
         raise KeysError(f"key file {path} cannot be read: its owner has to run chmod u+r {path}") from None
     except OSError as error:
         raise KeysError(f"key file {path} cannot be used: {error.strerror}") from None
-    keys = dict(reversed(_KEY.findall(text)))  # of two the first
+    keys = dict(reversed(_KEY.findall(text)))  # the first of two
     public, secret = keys.get("public", ""), keys.get("secret", "")
     if private and secret:
         check_private(path, status, f"chmod 600 {path}")
@@ -128,7 +131,7 @@ def _read_certificate(path: Path, *, private: bool = False) -> tuple[str, str]:
 
 
 def _describe_bad_key(key: str) -> str:
-    """What is wrong with a key, without showing it."""
+    """Return what is wrong with a key without showing it."""
     if len(key) != Z85_CHARACTERS:
         return f"has {len(key)} characters, a CURVE key has {Z85_CHARACTERS} of Z85"
     return f"is not {Z85_CHARACTERS} characters of Z85"

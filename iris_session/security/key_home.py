@@ -1,4 +1,4 @@
-"""Where keys live: `$IRIS_HOME`, else `$XDG_CONFIG_HOME/iris-session`, else `~/.config/iris-session`."""
+"""The folder of a user's keys: `$IRIS_HOME`, else `$XDG_CONFIG_HOME/iris-session`, else `~/.config/iris-session`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ IDENTITY: Final = "identity.key_secret"
 
 
 def find_key_home() -> Path:
-    """The home of this user's keys."""
+    """Return the folder of this user's keys."""
     home = os.environ.get("IRIS_HOME")
     if home:
         return Path(home)
@@ -29,9 +29,9 @@ def find_key_home() -> Path:
 
 
 class KeyHome:
-    """The files of one user. `path`: empty or `None` for the default. Nothing is made before it is needed.
+    """The key files of one user. `path`: empty or `None` for the default. Nothing is created before it is needed.
 
-    Every method of it and of its parts raises `KeysError` (one line) for a folder or file that cannot be used.
+    All methods of it and of its parts raise `KeysError` (one line) for a folder or file that cannot be used.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
@@ -46,9 +46,9 @@ class KeyHome:
         return self.folder.path
 
     def load_server_key(self) -> KeyPair:
-        """Key pair of the sessions that this user serves, made on first use."""
+        """Return the key pair of the sessions that this user serves, created on first use."""
         return load_or_create_pair(self.folder, SERVER_KEY)
 
     def load_identity(self) -> KeyPair:
-        """Key pair with which this user joins sessions, made on first use."""
+        """Return the key pair with which this user joins sessions, created on first use."""
         return load_or_create_pair(self.folder, IDENTITY)

@@ -1,4 +1,4 @@
-"""The server's key and the keys that may come in, as the front sees them: read anew whenever their files change."""
+"""The server's key pair and the allowed client keys, reloaded whenever their files change."""
 
 from __future__ import annotations
 
@@ -24,28 +24,32 @@ from iris_session.security import (
 from iris_session.security.allow_list import format_utc_now
 from iris_session.system.file_worker import FileWorker
 
-#: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
+#: User-Id of a connection whose key is not listed: this prefix and the key in Z85. Never equal to a fingerprint.
 PAIRING_PREFIX: Final = "pair:"
 
 
 def parse_pairing_key(user_id: str) -> str:
-    """The key (Z85) of a connection that may only pair, empty for any other."""
+    """Return the key (Z85) of a connection that may only pair, empty for any other."""
     return user_id.removeprefix(PAIRING_PREFIX) if user_id.startswith(PAIRING_PREFIX) else ""
 
 
 def select_gateway_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
-    """What people may join as behind a gateway whose key has `roles` (empty: any): the others of them; where there is
-    no other, what a new key may."""
+    """Return the roles that clients of a gateway may join in, given the `roles` of its key (empty: any).
+
+    These are its other roles, or those of a new key when it has no other.
+    """
     return tuple(role for role in roles if role != Role.GATEWAY) or (DEFAULT_ROLES if roles else ())
 
 
 class Keyring:
-    """A `Service`. `key`: the server's, `None` on plain loopback. `home`: where unknown keys may pair, else `None`;
-    its files are changed by `files` only.
+    """The keys of a session and their changes, all by fingerprint. A `Service` of the front.
 
-    Since somebody emptied them: `gone`: keys that were taken off the list, or got other roles; `come`: keys that were
-    put on it; `seen`: keys that joined, with the time in UTC. `revoking`: keys that a director revoked and that are
-    still in the file. `watching`: keys that were let in to the state socket since it was opened.
+    `key`: key pair of the server, `None` on plain loopback. `home`: the key home where unknown keys may pair, else
+    `None`. `files`: the worker that makes every change of its files.
+
+    Collected until the front takes them: `removed`, keys that were removed from the list or got other roles; `added`,
+    new keys; `last_seen`, UTC at which keys joined. `pending_revocations`: keys that a director revoked and that are
+    still in the file. `state_subscribers`: keys admitted to the state socket since it was opened.
     """
 
     def __init__(
@@ -62,7 +66,7 @@ class Keyring:
         self._signature = signature
         self._drops = drops or Drops()
         self._read_signature = signature()
-        self._reported: object = None  # what was wrong with the list last
+        self._reported: object = None  # the fault of the list that was reported last
         self._keys = read()
         self.removed: dict[str, AllowedKey] = {}
         self.added: dict[str, AllowedKey] = {}
@@ -72,11 +76,11 @@ class Keyring:
         self.files = FileWorker(KeysError)
 
     def turn(self, now_ns: int) -> None:
-        """Tells those who had files changed."""
+        """Report finished changes of files to their callers."""
         self.files.turn(now_ns)
 
     def close(self) -> None:
-        """What was asked for is still written."""
+        """Wait for queued changes of files."""
         self.files.close()
 
     @property
@@ -85,27 +89,29 @@ class Keyring:
         return self._keys.keys()
 
     def find_key(self, mark: str) -> AllowedKey | None:
-        """The allowed key with that fingerprint."""
+        """Return the allowed key with that fingerprint."""
         return self._keys.get(mark)
 
     def record_join(self, mark: str) -> None:
-        """A key has joined."""
+        """Record that a key has joined."""
         if self.home is not None and mark in self._keys:
             self.last_seen[mark] = format_utc_now()
 
     def confirm_pairing(self, mark: str) -> bool:
-        """A key was put on the list by the session itself. True: it still is, and may join whatever it was before; also
-        where the file cannot be read just now: it is known a moment later."""
-        self.reload_if_changed()  # the file decides: somebody may have taken the key off again since
+        """Return whether a key that the session itself added is still listed, and forget that it was revoked.
+
+        Also True while the file cannot be read: a later reload decides.
+        """
+        self.reload_if_changed()  # the file decides: the key may have been removed again since
         entry = self._keys.get(mark)
         if entry is not None:
             self.added[mark] = entry
         return entry is not None or self._signature() != self._read_signature
 
     def reload_if_changed(self) -> None:
-        """Reads the list again if its file has changed. One that is damaged changes nothing, and is said.
+        """Reload the list if its file has changed. A damaged file changes nothing and is reported.
 
-        One that the system does not let us read just now (no descriptor free, a network disk) is tried again.
+        A file that cannot be opened now (no free descriptor, a network disk) is tried again.
         """
         signature = self._signature()
         if signature == self._read_signature:
@@ -118,7 +124,7 @@ class Keyring:
             if (signature, str(error)) != self._reported:
                 self._reported = signature, str(error)
                 self._drops.count("allow_list_unreadable")
-                print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
+                print(f"iris-session: the allow-list is unchanged: {error}", file=sys.stderr, flush=True)
             return
         self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
@@ -153,15 +159,15 @@ def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops
 
 
 class _CertificateFolder:
-    """The public keys of a folder. A certificate that is damaged lets nobody in, keeps nobody else out, and is said."""
+    """A folder of public keys. A damaged certificate admits no key, does not affect others, and is reported once."""
 
     def __init__(self, folder: Path, drops: Drops) -> None:
         self._folder = folder
         self._drops = drops
-        self._reported: dict[str, str] = {}  # what is wrong, by file
+        self._reported: dict[str, str] = {}  # fault, by file name
 
     def read(self) -> dict[str, AllowedKey]:
-        """Every `*.key` certificate by fingerprint. Raises `KeysError`."""
+        """Return the key of every `*.key` certificate by fingerprint. Raises `KeysError`."""
         keys: dict[str, AllowedKey] = {}
         wrong: dict[str, str] = {}
         try:
@@ -180,12 +186,12 @@ class _CertificateFolder:
         for name, text in wrong.items():
             if self._reported.get(name) != text:
                 self._drops.count("certificate_unusable")
-                print(f"iris-session: nobody is let in by {name}: {text}", file=sys.stderr, flush=True)
+                print(f"iris-session: certificate {name} admits no key: {text}", file=sys.stderr, flush=True)
         self._reported = wrong
         return keys
 
     def signature(self) -> object:
-        """Changes with every file that comes, goes or is written, whatever time it is given."""
+        """Return a value that differs after every added, removed or written file, with any modification time."""
         try:
             return tuple(sorted((entry.name, *_get_signature(entry.stat())) for entry in self._folder.iterdir()))
         except OSError:

@@ -1,4 +1,4 @@
-"""`sessions.json`: the encrypted sessions that this user serves now: `iris-session pair` tells people to go there."""
+"""`sessions.json`: the encrypted sessions that this user serves now. `iris-session pair` shows their addresses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FILE: Final = "sessions.json"
 
 
 class RegisteredSession(msgspec.Struct, frozen=True):
-    """One session. `hosts`: addresses under which it can be reached, best first. `server`: fingerprint of its key.
+    """One running session. `hosts`: addresses at which it can be reached, best first. `server`: fingerprint of its key.
     `pid`: of the process that holds the sockets."""
 
     session_id: str
@@ -25,23 +25,23 @@ class RegisteredSession(msgspec.Struct, frozen=True):
 
 
 class SessionRegistry:
-    """Reads and changes the notes. Those whose process is gone are passed over, and removed with the next change."""
+    """Reads and changes the registry. Entries of ended processes are skipped, and removed with the next change."""
 
     def __init__(self, folder: PrivateFolder) -> None:
         self._folder = folder
 
     def read(self) -> list[RegisteredSession]:
-        """Sessions that run now."""
+        """Return the sessions that run now."""
         return [one for one in self._folder.read_json(FILE, list[RegisteredSession]) or [] if _is_running(one.pid)]
 
     def add(self, session: RegisteredSession, timeout_s: float = LOCK_TIMEOUT_S) -> None:
-        """Notes a session, in place of an older note of it."""
+        """Add a session, replacing an older entry of it."""
         with self._folder.lock(timeout_s):
             others = [one for one in self.read() if one.session_id != session.session_id]
             self._folder.write_json(FILE, [*others, session], durable=False)
 
     def remove(self, session_id: str, pid: int, timeout_s: float = LOCK_TIMEOUT_S) -> None:
-        """Forgets a session, unless another process has taken it over."""
+        """Remove a session, unless another process has taken it over."""
         with self._folder.lock(timeout_s):
             others = [one for one in self.read() if (one.session_id, one.pid) != (session_id, pid)]
             self._folder.write_json(FILE, others, durable=False)
@@ -50,7 +50,7 @@ class SessionRegistry:
 def _is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):  # the latter: a number that no process can have
+    except (ProcessLookupError, OverflowError):  # OverflowError: a number that no process can have
         return False
     except OSError:
         return True

@@ -1,7 +1,7 @@
-"""Who may open an encrypted connection: ZeroMQ's authentication protocol (RFC 27), answered in the front's own loop.
+"""ZeroMQ's authentication protocol (ZAP, RFC 27), answered in the front's own loop.
 
-The User-Id that a socket then reports for every message is the fingerprint of the client's key. A key that is not on
-the list gets through on the control socket only, with a User-Id that says so (`keyring.STRANGER`): it may pair.
+The User-Id that a socket then reports for every message is the fingerprint of the client's key. A key that is not
+listed is admitted to the control socket only, with a User-Id that says so (`keyring.PAIRING_PREFIX`): it may pair.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, 
 
 
 def is_curve_request(request: list[bytes]) -> bool:
-    """Whether a ZAP request has all its frames, and the client's key as the last."""
+    """Return True for a complete ZAP request of the CURVE mechanism, whose last frame is the client's key."""
     return len(request) == _REQUEST_FRAMES and request[5] == b"CURVE"
 
 
-def answer_zap_requests(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
-    """Answers every ZAP request that waits. `user_id_of(request)`: empty for who is not to be let in."""
+def answer_zap_requests(socket: zmq.Socket[bytes], authenticate: Callable[[list[bytes]], str]) -> None:
+    """Answer every pending ZAP request. `authenticate(request)` returns the User-Id, empty to refuse."""
     while _has_message(socket):
         frames = socket.recv_multipart()
         split = frames.index(b"") + 1
         route, request = frames[:split], frames[split:]
         request_id = request[1] if len(request) > 1 else b""
-        user_id = user_id_of(request)
+        user_id = authenticate(request)
         if user_id:
             reply = [b"1.0", request_id, b"200", b"OK", user_id.encode(), b""]
         else:
@@ -56,7 +56,7 @@ def _has_message(socket: zmq.Socket[bytes]) -> bool:
 class Authenticator:
     """Answers ZAP requests for one context. Poll `socket` and call `answer` when it is readable.
 
-    `refused`: told the fingerprint and the address of every key that was not let in.
+    `on_refused`: called with the fingerprint and the address of every key that was refused.
     """
 
     def __init__(
@@ -72,17 +72,17 @@ class Authenticator:
         self._keyring = keyring
         self._drops = drops
         self.on_refused = refused
-        #: Whether a key was revoked in this session, also where the list could not be changed.
+        #: Returns True for a key that was revoked in this session, also where the list could not be changed.
         self.is_revoked: Callable[[str], bool] = lambda _mark: False
 
     def answer_requests(self) -> None:
-        """Answers everything that waits."""
+        """Answer every pending request."""
         if _has_message(self.socket):
             self._keyring.reload_if_changed()
             answer_zap_requests(self.socket, self._authenticate)
 
     def _authenticate(self, request: list[bytes]) -> str:
-        """Empty: not to be let in."""
+        """Return the User-Id, empty to refuse."""
         if not is_curve_request(request):
             self._drops.count("unknown_key")
             return ""
@@ -90,7 +90,7 @@ class Authenticator:
         if self._keyring.find_key(mark) is not None and (request[2] == ZAP_CONTROL or not self.is_revoked(mark)):
             if request[2] == ZAP_STATE:
                 self._keyring.state_subscribers.add(mark)
-            return mark  # a revoked one is told why it may not join, and gets no state
+            return mark  # a revoked key is refused at hello, with a reason, and gets no state
         self._drops.count("unknown_key")
         if self._keyring.home is not None and request[2] == ZAP_CONTROL:
             return PAIRING_PREFIX + z85.encode(request[6]).decode()

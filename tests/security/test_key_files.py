@@ -156,8 +156,8 @@ def test_a_line_that_is_no_json_is_named(home: KeyHome, listed: Path, typed: str
     ("changes", "wrong"),
     [
         ({"name": 7}, "Expected `str`, got `int`"),
-        ({"name": ""}, "'' is no name for a key"),
-        ({"name": "a\nb"}, "'a\\nb' is no name for a key"),
+        ({"name": ""}, "'' is not a valid key name"),
+        ({"name": "a\nb"}, "'a\\nb' is not a valid key name"),
         ({"roles": ["king"]}, "unknown role 'king'"),
         ({"roles": "operator"}, "Expected `array`, got `str`"),
         ({"key": "short"}, "'short' is not a CURVE key"),
