@@ -193,7 +193,7 @@ def test_pair_waits_on_while_another_process_holds_the_list(
         asked.append(patience_s)
         return locked(folder, patience_s)
 
-    monkeypatch.setattr(PrivateFolder, "locked", slow)
+    monkeypatch.setattr(PrivateFolder, "lock", slow)
     assert main(["pair", "--minutes", "0.02"]) == 1
     assert next(busy, None) is None
     said = capsys.readouterr()
@@ -212,7 +212,7 @@ def test_pair_waits_and_says_who_came(
 
     def use() -> None:
         if full:
-            monkeypatch.setattr(lab.clients, "replace", full_disk)
+            monkeypatch.setattr(lab.clients, "replace_all", full_disk)
         server = lab.load_server_key()
         while not lab.join_codes.list_open(server.fingerprint):
             time.sleep(0.01)

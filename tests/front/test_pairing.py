@@ -347,7 +347,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(desk.home.join_codes, "of", fails)
+        patch.setattr(desk.home.join_codes, "list_open", fails)
         patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
         for _ in range(3):
             assert not desk.desk.open

@@ -46,7 +46,7 @@ PAIR, OTHER = KeyPair.generate(), KeyPair.generate()
         ({"public": PAIR.public[:-1], "secret": PAIR.secret}, "its public key has 39 characters, a CURVE key has 40"),
         ({"public": "\N{BULLET}" * 40, "secret": PAIR.secret}, "its public key is not 40 characters of Z85"),
         ({"public": PAIR.public, "secret": PAIR.secret + "x"}, "has 41 characters, a CURVE key has 40 of Z85"),
-        ({"public": PAIR.public, "secret": "~" * 40}, "is not 40 characters of Z85: make the pair anew"),
+        ({"public": PAIR.public, "secret": "~" * 40}, "is not 40 characters of Z85: generate a new pair"),
         ({"public": OTHER.public, "secret": PAIR.secret}, "do not belong together"),
     ],
 )
@@ -195,7 +195,7 @@ def test_a_note_of_the_session_does_not_undo_an_edit(
 
     with monkeypatch.context() as patch:
         patch.setattr(home.clients, "read", edited_meanwhile)
-        with pytest.raises(KeysBusyError, match="edited just now"):
+        with pytest.raises(KeysBusyError):
             home.clients.record_last_seen({marks[0]: "2026-01-01T00:00:00+00:00"})
     assert read() == {}
 
