@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.errors import AssetStoreError
+from iris_session.assets.store import AssetStore
 from iris_session.client.asset_workers import Decode
 from iris_session.client.errors import AssetError
 
@@ -20,7 +21,7 @@ class AssetFetch:
 
     def __init__(
         self,
-        cache: AssetCache,
+        cache: AssetStore,
         addresses: Iterable[str],
         sizes: Mapping[str, int],
         on_progress: Callable[[AssetFetch], None] | None,
@@ -55,12 +56,15 @@ class AssetFetch:
     def read(self, address: str) -> bytes:
         """The bytes of an asset that is here. Raises its `AssetError` when it is not."""
         self._check_here(address)
-        return self._cache.read(address)
+        return bytes(self.view(address))
 
     def view(self, address: str) -> memoryview:
         """As `read`, mapped instead of copied: whoever refuses it, for its size or its beginning, has not read it."""
         self._check_here(address)
-        return self._cache.view(address)
+        try:
+            return self._cache.view(address)
+        except AssetStoreError as error:
+            raise AssetError.from_store(error) from error
 
     def check(self) -> None:
         """Raises the first `AssetError`, if there is one."""

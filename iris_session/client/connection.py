@@ -48,8 +48,8 @@ from iris_session.protocol.client_messages import (
     envelope,
 )
 from iris_session.protocol.codec import encode_client
-from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
+    Paired,
     ProtocolFault,
     Refused,
     Welcome,
@@ -207,7 +207,7 @@ class Connection(Receiving):
         if granted is not None and (known is None or granted.lease_version > known.lease_version):
             ours = granted.holder == self.participant_id or self.participant_id in granted.sub_holders
             return granted.lease_version if ours else None
-        return self.mirror.lease_version(target, self.participant_id)
+        return self.mirror.find_lease_version(target, self.participant_id)
 
     def describe(self) -> str:
         """One line for people: why there is no connection now."""

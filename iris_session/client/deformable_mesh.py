@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from iris_session.protocol.names import ArrayName
 from iris_session.protocol.scene import Deformable
-from iris_session.protocol.scene_names import ArrayName
 from iris_session.scene.arrays import require
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES
 
@@ -43,7 +43,7 @@ class DeformableMesh:
 
 
 def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: int) -> DeformableMesh:
-    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetError` or `ValueError`."""
+    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetDecodeError` or `ValueError`."""
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:

@@ -22,11 +22,10 @@ from iris_session.client.deformable_mesh import DeformableMesh, read_mesh
 from iris_session.client.errors import ClientError
 from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.protocol.scene_names import ArrayKind, ArrayName
 from iris_session.scene.arrays import decode_arrays
-from iris_session.scene.errors import AssetError
+from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError
@@ -154,7 +153,7 @@ class Deformables:
                     self._fetch = self._client.fetch_assets(new)
                     return
             self._use(self._made(self._parts, fetch), self._asked)
-        except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
+        except (ClientError, AssetDecodeError, StreamError, KeyError, ValueError) as error:
             self._failed(error)
         self._parts = None
 

@@ -22,7 +22,7 @@ from iris_session.client.status import Phase
 from iris_session.client.waiting import milliseconds
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, Feedback, Reply
-from iris_session.protocol.session_mirror import Missed
+from iris_session.protocol.session_mirror import MissedEvents
 
 DEFAULT_TIMEOUT_S = 5.0
 
@@ -219,7 +219,7 @@ class Driving(SceneView, Media, Assets, Joining):
     def _call_back(self, message: Told) -> None:
         if isinstance(message, Event) and self.on_event is not None:
             self.on_event(message)
-        elif isinstance(message, Missed) and self.on_missed is not None:
+        elif isinstance(message, MissedEvents) and self.on_missed is not None:
             self.on_missed(message.first, message.last)
         elif isinstance(message, Feedback) and self.on_feedback is not None:
             self.on_feedback(message)

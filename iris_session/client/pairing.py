@@ -13,19 +13,18 @@ import zmq
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, TrustError
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import envelope
+from iris_session.protocol.client_messages import Pair, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.server_messages import ProtocolFault, Refused
+from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused
 from iris_session.security import KeyPair, decode_key
 
 ANSWER_S: Final = 5.0
 #: Where many pair at once it says so, where its disk is slow it says nothing for a while: the same is asked again, for
 #: so long. Who has paired gets the same answer again.
 AGAIN_S: Final = 1.0
-PATIENCE_S: Final = 20.0
+LOCK_TIMEOUT_S: Final = 20.0
 MAX_NAME: Final = 64  # as `protocol.common.Name`
 MAX_ANSWER_BYTES: Final = 65_536
 
@@ -74,7 +73,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
 
 def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
     """Asks until there is an answer that stays. Raises as `pair_key`."""
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + LOCK_TIMEOUT_S
     while True:
         asking.send(request)
         try:
@@ -98,7 +97,7 @@ def _answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None
             message = decode_server(asking.recv_multipart(zmq.NOBLOCK)[0]).message
         except zmq.Again:
             if time.monotonic() > until:
-                raise TimeoutError(f"the session at {address} did not answer within {PATIENCE_S:g} s") from None
+                raise TimeoutError(f"the session at {address} did not answer within {LOCK_TIMEOUT_S:g} s") from None
             yield
             continue
         except ProtocolError as error:

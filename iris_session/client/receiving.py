@@ -21,12 +21,12 @@ from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
     ClockPong,
     EStopChanged,
     Event,
     Feedback,
+    Paired,
     ParticipantLeft,
     ProtocolFault,
     Refused,
@@ -34,11 +34,11 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-from iris_session.protocol.session_mirror import Missed, SessionMirror
+from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 #: What is handed to the application, in this order. Replies: denials that nobody waits for.
-Told = Event | Missed | Feedback | ProtocolFault | Reply
+Told = Event | MissedEvents | Feedback | ProtocolFault | Reply
 
 
 class Receiving:
@@ -217,12 +217,12 @@ class Receiving:
 
     def _make_room(self) -> None:
         """Nobody takes what waits: the oldest goes, and one note at the front says which events went with it."""
-        lost: Missed | None = None
+        lost: MissedEvents | None = None
         while len(self.inbox) >= MAX_INBOX - (lost is not None):
             gone = self.inbox.popleft()
-            self.counters.inbox_dropped += not isinstance(gone, Missed)
-            if isinstance(gone, Event | Missed):
-                first, last = gone if isinstance(gone, Missed) else (gone.event_seq, gone.event_seq)
-                lost = Missed(first if lost is None else lost.first, last)
+            self.counters.inbox_dropped += not isinstance(gone, MissedEvents)
+            if isinstance(gone, Event | MissedEvents):
+                first, last = gone if isinstance(gone, MissedEvents) else (gone.event_seq, gone.event_seq)
+                lost = MissedEvents(first if lost is None else lost.first, last)
         if lost is not None:
             self.inbox.appendleft(lost)

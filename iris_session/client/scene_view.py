@@ -70,7 +70,7 @@ class SceneView:
     @property
     def alignment(self) -> Alignment | None:
         """Our own `T_world_tracking` as accepted by the session, `None` before."""
-        return self.connection.mirror.alignment(self.participant_id)
+        return self.connection.mirror.find_alignment(self.participant_id)
 
     def session_now_ns(self) -> int:
         """Session time now [ns], by our estimate; its error is at most `clock_error_ns()`."""
@@ -101,8 +101,11 @@ class SceneView:
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         """`T_world_site` of a robot's end effector in the newest scene."""
-        poses, tip = self._placed, self.connection.mirror.tip(robot)
-        return None if poses is None or tip is None or tip[0] >= len(poses) else compose(pose_at(poses, tip[0]), tip[1])
+        poses, tip = self._placed, self.connection.mirror.find_tip(robot)
+        if poses is None or tip is None or tip[0] >= len(poses):
+            return None
+        index, T_body_site = tip
+        return compose(pose_at(poses, index), (T_body_site.p, T_body_site.q))
 
     @property
     def _placed(self) -> Poses | None:

@@ -1,22 +1,30 @@
-"""Textures as assets: raw pixels compressed by Zstandard (default: decodes fastest), PNG, JPEG, and back."""
+"""Images: pixels as assets (arrays, PNG, JPEG) and back, and image files as pixels (PNG, JPEG, WebP, TGA, BMP, ...)."""
 
 from __future__ import annotations
 
+import io
 import struct
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
-from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, filtered, require
-from iris_session.scene.errors import AssetError
+from iris_session.protocol.assets import MAX_ARRAY_BYTES
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
+from iris_session.scene.arrays import Stored, array_of, decode_arrays, encode_arrays, filtered, require
+from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Pixels = NDArray[np.uint8]
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 #: Rows of a large image that decide which filter suits it.
 _SAMPLE_ROWS: Final = 128
+#: As Pillow calls them. Not all that it reads: it hands EPS to Ghostscript, whatever the file is called.
+FORMATS: Final = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "GIF", "TIFF", "PPM", "DDS")
+_JPEGS: Final = "MPO"  # JPEG with further pictures: cameras make them
+#: Most pixels of one image: larger ones are no texture, or a bomb.
+MAX_PIXELS: Final = 1 << 26
+#: Most pixels of all pictures of a file: 2 GiB in memory. A file of a few MiB can have any number of large ones.
+MAX_FILE_PIXELS: Final = 1 << 29
 
 
 class EncodedImage(NamedTuple):
@@ -38,12 +46,12 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
         ok, data = cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     elif encoding == AssetEncoding.JPEG:
         if pixels.shape[2] not in (1, 3):
-            raise AssetError(f"JPEG holds 1 or 3 channels, not {pixels.shape[2]}: use PNG")
+            raise AssetDecodeError(f"JPEG holds 1 or 3 channels, not {pixels.shape[2]}: use PNG")
         ok, data = cv2.imencode(".jpg", swapped, [cv2.IMWRITE_JPEG_QUALITY, quality])
     else:
-        raise AssetError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
+        raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
     if not ok:
-        raise AssetError(f"an image of {pixels.shape} cannot be written as {encoding}")
+        raise AssetDecodeError(f"an image of {pixels.shape} cannot be written as {encoding}")
     encoded = data.tobytes()
     if encoding == AssetEncoding.PNG:
         return EncodedImage(encoded, encoding)
@@ -52,24 +60,30 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
 
 
 def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes: int = MAX_ARRAY_BYTES) -> Pixels:
-    """Pixels (height, width, channels). Raises `AssetError` for other bytes, or when they would exceed `max_bytes`."""
+    """Return pixels (height, width, channels).
+
+    Raises:
+        AssetDecodeError: The bytes are no such image, or its pixels would exceed `max_bytes`.
+    """
     if encoding == AssetEncoding.ARRAYS:
         arrays = decode_arrays(data, ArrayKind.IMAGE, max_bytes)
         return require(arrays, ArrayName.PIXELS, "u1", (None, None, None))
     if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
-        raise AssetError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
+        raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
     width, height = _stated_size(bytes(data[:65_536]), encoding)
     if width * height * 4 > max_bytes:
-        raise AssetError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
+        raise AssetDecodeError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
     cv2 = _opencv()
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise AssetError(f"damaged {encoding}: {error}") from None
+        raise AssetDecodeError(f"damaged {encoding}: {error}") from None
     if image is None or image.dtype != np.uint8:
-        raise AssetError(f"damaged {encoding}, or one with more than 8 bits a channel")
+        raise AssetDecodeError(f"damaged {encoding}, or one with more than 8 bits a channel")
     if image.shape[:2] != (height, width):
-        raise AssetError(f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}")
+        raise AssetDecodeError(
+            f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}"
+        )
     return _swapped(image if image.ndim == 3 else image[:, :, None])
 
 
@@ -100,12 +114,12 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     """Width and height as the file says, before anything is decoded."""
     if encoding == AssetEncoding.PNG:
         if head[:8] != _PNG or len(head) < 24:
-            raise AssetError("these bytes are no PNG")
+            raise AssetDecodeError("these bytes are no PNG")
         width, height = struct.unpack(">II", head[16:24])
         return width, height
     at = 2
     if head[:2] != b"\xff\xd8":
-        raise AssetError("these bytes are no JPEG")
+        raise AssetDecodeError("these bytes are no JPEG")
     while at + 9 <= len(head) and head[at] == 0xFF:
         marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
         if marker == 0xFF:  # any number of them may stand before a marker
@@ -117,14 +131,14 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
             height, width = struct.unpack(">HH", head[at + 5 : at + 9])
             return width, height
         at += 2 + length
-    raise AssetError("a JPEG without a size in its first 64 KiB")
+    raise AssetDecodeError("a JPEG without a size in its first 64 KiB")
 
 
 def _swapped(pixels: Pixels) -> Pixels:
     """Red and blue exchanged: OpenCV's order to ours, and back."""
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2])
     if order is None:
-        raise AssetError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
+        raise AssetDecodeError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
     return np.ascontiguousarray(pixels[:, :, order])
 
 
@@ -132,5 +146,82 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise AssetError("PNG and JPEG need OpenCV: pip install 'iris-session[scene]'") from None
+        raise AssetDecodeError("PNG and JPEG need OpenCV: pip install 'iris-session[scene]'") from None
     return cv2
+
+
+# --- image files ------------------------------------------------------------------------------------------------------
+
+
+class PixelBudget:
+    """Counts the pixels of all pictures of the file `name`, each as often as it is kept."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._used = 0
+
+    def spend(self, pixels: Pixels) -> Pixels:
+        """`pixels`. Raises `SceneBuildError` when they are more than one file may have, with those before."""
+        self._used += pixels.shape[0] * pixels.shape[1]
+        if self._used > MAX_FILE_PIXELS:
+            raise SceneBuildError(
+                f"the images of {self._name} have more than {MAX_FILE_PIXELS:,} pixels together: shrink them"
+            )
+        return pixels
+
+
+def read_pixels(data: bytes, what: str) -> Pixels:
+    """(height, width, 1, 3 or 4), first row on top. Raises `SceneBuildError` with `what` in it."""
+    image_module = _pillow()
+    try:
+        return pixels_of(image_module.open(io.BytesIO(data), formats=FORMATS), what)
+    except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
+        raise SceneBuildError(f"{what} is no image that can be read: {error}") from None
+
+
+def pixels_of(image: Any, what: str) -> Pixels:
+    """Pixels of a Pillow image, 8 bits a channel; alpha only where something is not opaque. Raises `SceneBuildError`
+    for too many, before they are decoded."""
+    if image.format not in (None, *FORMATS, _JPEGS):  # None: made in memory
+        raise SceneBuildError(f"{what} is a picture in the form {image.format}; {', '.join(FORMATS)} are read")
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise SceneBuildError(f"{what} has {width} x {height} pixels, at most {MAX_PIXELS:,} are read: shrink it")
+    if image.mode.startswith(("I", "F")):
+        values = np.asarray(image, np.float64)
+        top = 65_535.0 if image.mode.startswith("I") else 1.0
+        return np.ascontiguousarray(np.rint(np.clip(values / top, 0, 1) * 255)[:, :, None], np.uint8)
+    if image.mode in ("1", "L"):
+        return np.ascontiguousarray(np.asarray(image.convert("L"), np.uint8)[:, :, None])
+    see_through = "A" in image.mode or "a" in image.mode or "transparency" in image.info
+    return without_alpha(np.ascontiguousarray(np.asarray(image.convert("RGBA" if see_through else "RGB"), np.uint8)))
+
+
+def without_alpha(pixels: Pixels, *, always: bool = False) -> Pixels:
+    """`pixels` with three channels when their alpha says nothing, or is not wanted."""
+    if pixels.shape[2] == 4 and (always or bool((pixels[:, :, 3] == 255).all())):
+        return np.ascontiguousarray(pixels[:, :, :3])
+    return pixels
+
+
+def checked_pixels(pixels: Any, what: str) -> Pixels:
+    """A texture that a caller gave as an array. Raises `SceneBuildError` for what is none."""
+    array = array_of(pixels, what)
+    if array.ndim == 2:
+        array = array[:, :, None]
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (1, 3, 4) or not array.size:
+        raise SceneBuildError(
+            f"{what}: a texture is a path or an array (height, width, 1, 3 or 4) of uint8, "
+            f"not {array.shape} of {array.dtype}"
+        )
+    if array.shape[0] * array.shape[1] > MAX_PIXELS:
+        raise SceneBuildError(f"{what} has {array.shape[1]} x {array.shape[0]} pixels, at most {MAX_PIXELS:,}")
+    return np.array(array)
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError:
+        raise SceneBuildError("textures of files need Pillow: pip install 'iris-session[files]'") from None
+    return Image

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import Role
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security import (
     DEFAULT_ROLES,
     AllowedKey,
@@ -75,9 +75,9 @@ class Keyring:
         self.state_subscribers: set[str] = set()
         self.files = FileWorker(KeysError)
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Report finished changes of files to their callers."""
-        self.files.turn(now_ns)
+        self.files.tick(now_ns)
 
     def close(self) -> None:
         """Wait for queued changes of files."""

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Final, TypeVar
 
 import msgspec
 from filelock import FileLock, Timeout
+
+from iris_session.system.files import write_atomic
 
 LOCK: Final = "lock"
 #: How long a command waits for another process to finish its change; a change takes milliseconds.
@@ -81,19 +82,7 @@ class PrivateFolder:
         self.create()
         path = self.path / name
         try:
-            descriptor, temporary = tempfile.mkstemp(prefix=f".{name}-", dir=self.path)  # mode 0600
-            try:
-                with os.fdopen(descriptor, "wb") as file:
-                    file.write(data)
-                    if durable:
-                        file.flush()
-                        os.fsync(file.fileno())
-                os.replace(temporary, path)
-                if durable:
-                    _sync_folder(self.path)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
+            write_atomic(path, data, durable=durable)
         except OSError as error:
             raise KeysError(f"{path} cannot be written: {error.strerror}") from error
 
@@ -124,19 +113,6 @@ class PrivateFolder:
             yield
         finally:
             lock.release()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable: else a power cut may bring back the file that was replaced."""
-    if os.name != "posix":
-        return  # folders cannot be opened there
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    except OSError:  # some network file systems refuse it; the file itself is written
-        pass
-    finally:
-        os.close(descriptor)
 
 
 def check_private(path: Path, status: os.stat_result, remedy: str) -> None:

@@ -12,7 +12,7 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import compute_fingerprint
 from iris_session.security.keyring import PAIRING_PREFIX, Keyring
 

@@ -1,6 +1,6 @@
 """One thread that changes files, so that a slow disk delays nothing but the jobs that need it.
 
-Results are reported by `turn`, in the thread that calls it: nothing of the caller runs in the worker's thread.
+Results are reported by `tick`, in the thread that calls it: nothing of the caller runs in the worker's thread.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Report = Callable[[int], None]
 class FileWorker(Generic[E]):
     """A thread that runs jobs one after the other, in the order in which they were submitted.
 
-    `expected`: exceptions of a job that are handed to its callback. Any other is raised by `turn`.
+    `expected`: exceptions of a job that are handed to its callback. Any other is raised by `tick`.
     """
 
     def __init__(self, expected: type[E]) -> None:
@@ -35,7 +35,7 @@ class FileWorker(Generic[E]):
         self._thread: threading.Thread | None = None
 
     def submit(self, job: Callable[[], T], on_done: Callable[[T | E, int], None]) -> bool:
-        """Queue `job`. A later `turn` calls `on_done` with its result or expected exception, and the session time.
+        """Queue `job`. A later `tick` calls `on_done` with its result or expected exception, and the session time.
 
         Returns False when the queue is full: try again later.
         """
@@ -59,7 +59,7 @@ class FileWorker(Generic[E]):
             self._thread.start()
         return True
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Call the callbacks of the jobs that finished since the last call."""
         while not self._reports.empty():
             self._reports.get_nowait()(now_ns)

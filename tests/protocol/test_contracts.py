@@ -13,7 +13,7 @@ from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sam
 from iris_session.protocol.codec import decode_server, encode_server
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Applied, Denial, Pose, Target
 from iris_session.protocol.entries import Entry, decode_entries, decode_entry, encode_entries, encode_entry
-from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
+from iris_session.protocol.scene import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
 from iris_session.protocol.specs import RobotSpec
 
@@ -104,7 +104,7 @@ def test_decision_survives_its_digest_bytes() -> None:
             steps.Command("right", "hold", "estop"),
         ),
         objects=(steps.ObjectCommand("board", 1, IDENTITY),),
-        outgoing=(steps.Outgoing(1, Feedback("left", "pose", rejected={"seq": 1})),),
+        outgoing=(steps.OutgoingMessage(1, Feedback("left", "pose", rejected={"seq": 1})),),
         admitted=(steps.Admitted(1, "p1", "operator", False),),
         dropped=(steps.Dropped(2, "bye"),),
         events=(Event(1, 2, 3, Notice("info", "hello")),),

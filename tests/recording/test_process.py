@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.scene_names import ArrayKind
+from iris_session.protocol.names import ArrayKind
 from iris_session.recording import RecorderError, RecorderProcess, Recording, RecordingLock, verify
 from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
 from iris_session.scene import AssetStore, decode_arrays
-from iris_session.scene.mujoco_deformables import flex_mesh
+from iris_session.scene.mujoco_assets import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import (

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 import zmq
 
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import compute_fingerprint
 from iris_session.security.keyring import Keyring
 from iris_session.security.zap import ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE, Authenticator

@@ -25,7 +25,7 @@ def test_jobs_run_in_order_and_report_in_the_thread_that_asks() -> None:
 
     for n in range(3):
         assert files.submit(lambda n=n: n, on_done)
-    turns(files.turn, lambda: len(reports) == 3, now_ns=7)
+    turns(files.tick, lambda: len(reports) == 3, now_ns=7)
     assert reports == [(n, 7, threading.main_thread()) for n in range(3)]
     files.close()
 
@@ -40,11 +40,11 @@ def test_an_expected_exception_is_reported_and_any_other_is_raised() -> None:
         return job
 
     files.submit(failing(DiskError("full")), lambda outcome, _now: reports.append(outcome))
-    turns(files.turn, lambda: bool(reports))
+    turns(files.tick, lambda: bool(reports))
     assert isinstance(reports[0], DiskError)
     files.submit(failing(ZeroDivisionError()), lambda outcome, _now: reports.append(outcome))
     with pytest.raises(ZeroDivisionError):
-        turns(files.turn, lambda: False)
+        turns(files.tick, lambda: False)
     files.close()
 
 
@@ -60,10 +60,10 @@ def test_a_job_that_hangs_blocks_no_caller_and_the_queue_is_bounded() -> None:
     assert begun.wait(30.0)
     accepted = [files.submit(lambda: None, lambda _outcome, _now: reports.append("next")) for _ in range(CAPACITY + 1)]
     assert accepted == [True] * CAPACITY + [False]
-    files.turn(0)
+    files.tick(0)
     assert reports == []
     disk.set()
-    turns(files.turn, lambda: len(reports) == 1 + CAPACITY)
+    turns(files.tick, lambda: len(reports) == 1 + CAPACITY)
     assert reports[0] == "slow"
     files.close()
 
