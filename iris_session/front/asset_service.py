@@ -111,10 +111,10 @@ class AssetService:
 
     def _publish_access(self, listeners: dict[int, str]) -> None:
         keyring = self._keyring
-        marks = (
-            frozenset() if keyring.key is None else frozenset(m for m in keyring.marks if not self._tokens.revoked(m))
-        )
-        access = AssetAccess(listeners, marks, self._folders)
+        keys: frozenset[str] = frozenset()
+        if keyring.key is not None:
+            keys = frozenset(key for key in keyring.fingerprints if not self._tokens.is_revoked(key))
+        access = AssetAccess(listeners, keys, self._folders)
         if access != self._published:
             self._published = access
             self._server.set_access(access)

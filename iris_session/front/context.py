@@ -36,6 +36,7 @@ from iris_session.link.sockets import (
 )
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind
+from iris_session.security import KeysError
 from iris_session.security.keyring import Keyring, open_keyring
 from iris_session.security.resume_tokens import ResumeTokens
 from iris_session.security.zap import Authenticator
@@ -99,7 +100,7 @@ class FrontSockets:
 
     def _open(self, on_key_refused: Callable[[str, str], None]) -> None:
         config = self._config
-        self.keyring = open_keyring(config, self._drops)
+        self.keyring = self._open_keyring()
         key = self.keyring.key
         self.authenticator = Authenticator(self.context, self.keyring, self._drops, on_key_refused) if key else None
         self.listeners: Listeners
@@ -130,6 +131,16 @@ class FrontSockets:
             bound_port(ingest),
             bound_port(self.assets.socket),
         )
+
+    def _open_keyring(self) -> Keyring:
+        """Return the session's keyring, an empty one on plain loopback. Raises `FrontError`."""
+        config = self._config
+        if config.loopback and not (config.curve or config.curve_secret_file):
+            return Keyring(drops=self._drops)
+        try:
+            return open_keyring(config.key_home, config.curve_secret_file, config.curve_clients_dir, self._drops)
+        except KeysError as error:
+            raise FrontError(str(error)) from error
 
     def open_state(self, port: int) -> WatchedSocket:
         """Open a state socket; the one before must be closed. Raises `FrontError` while its port is not free yet."""

@@ -33,8 +33,8 @@ from iris_session.protocol.codec import encode_beacon, encode_introduction
 from iris_session.protocol.discovery import INTRODUCTION_OFFSET, Beacon, Introduction
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.security import KeyHome, KeysBusyError, KeysError, SessionNote
-from iris_session.security.file_worker import PATIENCE_S, FileWorker
+from iris_session.security import KeyHome, KeysBusyError, KeysError, RegisteredSession
+from iris_session.system.file_worker import LOCK_TIMEOUT_S, FileWorker
 
 log = logging.getLogger(__name__)
 
@@ -251,10 +251,10 @@ class SessionRegistration:
     The entry is written with the first tick and removed by `close`.
     """
 
-    def __init__(self, home: KeyHome, files: FileWorker, config: FrontConfig, ports: Ports) -> None:
+    def __init__(self, home: KeyHome, files: FileWorker[KeysError], config: FrontConfig, ports: Ports) -> None:
         self._notes = home.sessions
         self._files = files
-        self._note = SessionNote(
+        self._note = RegisteredSession(
             config.session_id, config.session_name, os.getpid(), ports.reachable, ports.control, ports.key_fingerprint
         )
         self._submitted = False
@@ -262,14 +262,14 @@ class SessionRegistration:
     def tick(self, now_ns: int) -> None:
         """Write the entry; try again while another process changes the file."""
         if not self._submitted:
-            self._submitted = self._files.submit(partial(self._notes.add, self._note, PATIENCE_S), self._on_written)
+            self._submitted = self._files.submit(partial(self._notes.add, self._note, LOCK_TIMEOUT_S), self._on_written)
 
     def close(self) -> None:
         """Remove the entry. The front's loop has ended, so this may wait."""
         if not self._submitted:
             return
         with contextlib.suppress(KeysError):
-            self._notes.remove(self._note.session_id, self._note.pid, patience_s=0.2)
+            self._notes.remove(self._note.session_id, self._note.pid, timeout_s=0.2)
 
     def _on_written(self, outcome: KeysError | None, _now_ns: int) -> None:
         if isinstance(outcome, KeysBusyError):

@@ -84,7 +84,7 @@ class Front:
         self._uplink = Uplink(context, sockets.link)
         self._authenticator = sockets.authenticator
         if self._authenticator is not None:
-            self._authenticator.banned = context.tokens.revoked
+            self._authenticator.is_revoked = context.tokens.is_revoked
         memory = MemoryGuard(
             context.config.limits.memory_bytes,
             lambda: context.guard.evict_for_memory(proxy.release_memory),
@@ -142,7 +142,7 @@ class Front:
         """Run one pass of the loop. Return whether messages of clients are still pending."""
         self._downlink.drain()
         if self._authenticator is not None:
-            self._authenticator.answer()
+            self._authenticator.answer_requests()
         more = True
         for _ in range(ROUNDS):
             self._disconnects.drain_monitor()

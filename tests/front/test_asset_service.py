@@ -107,15 +107,15 @@ def test_they_are_so_many_at_most() -> None:
 
 def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
     listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
-    rig = AssetServiceRig(Keyring(KeyPair.new(), read=lambda: listed))
+    rig = AssetServiceRig(Keyring(KeyPair.generate(), read=lambda: listed))
     rig.join(1, "ann")
     rig.join(2, "gate")
     rig.join(3, "bob", gateway=2)
-    rig.tokens.revoke("eve")
+    rig.tokens.revoke_key("eve")
     rig.service.tick(0)
     assert rig.server.table.marks == {"ann", "gate"}
     assert rig.server.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
-    rig.tokens.revoke("ann")
+    rig.tokens.revoke_key("ann")
     rig.service.tick(PERIOD_NS)
     assert rig.server.table.marks == {"gate"}
 

@@ -14,14 +14,14 @@ from iris_session.front import pairing as pairing_service
 from iris_session.front.connections import Peer, Route
 from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, RETRY_S, PairingService
 from iris_session.front.revocation import CHECK_PERIOD_NS, RevocationService
-from iris_session.link.config import SECOND, FrontConfig
+from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
-from iris_session.security.keyring import STRANGER, Keyring, open_keyring
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring, open_keyring
 from tests.front.fakes import make_context
 from tests.front.slow_disk import slow_disk, turns
 
@@ -48,7 +48,7 @@ class PairingRig:
 
     def __init__(self, folder: Path) -> None:
         self.home = KeyHome(folder)
-        self.server = self.home.server_key()
+        self.server = self.home.load_server_key()
         self.outbox: Any = Outbox()
         clients = self.home.clients
         self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature)
@@ -61,7 +61,7 @@ class PairingRig:
         self.now_ns = 0
 
     def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
-        peer = Peer(descriptor, STRANGER + own.public)
+        peer = Peer(descriptor, PAIRING_PREFIX + own.public)
         self.pairing.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
 
     def proof(self, code: str, own: KeyPair) -> bytes:
@@ -96,50 +96,46 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PairingRig]
     rig.keyring.close()
 
 
-def test_a_slow_disk_does_not_block_the_loop(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own = KeyPair.new()
-    code, _ = rig.home.codes.make(rig.server)
+def test_a_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
     rig.asks(own, rig.proof(code, own))
     with slow_disk(monkeypatch) as disk:
         turns(rig.turn, disk.waits.is_set)
         for _ in range(5):
             rig.turn()
         assert rig.answers(own) == [], "the answer comes after the write"
-        assert rig.keyring.find(own.fingerprint) is None
+        assert rig.keyring.find_key(own.fingerprint) is None
     assert isinstance(rig.answer(own), Paired)
-    assert rig.keyring.find(own.fingerprint) is not None
+    assert rig.keyring.find_key(own.fingerprint) is not None
     assert list(rig.home.clients.read()) == [own.fingerprint]
 
 
 def test_a_director_revokes_at_once_whatever_the_disk_does(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.new()
-    rig.home.clients.allow("ann", own.public)
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
     rig.turn()
     with slow_disk(monkeypatch) as disk:
         rig.revocation.revoke(own.fingerprint, rig.now_ns)
-        assert rig.tokens.revoked(own.fingerprint)
+        assert rig.tokens.is_revoked(own.fingerprint)
         turns(rig.turn, disk.waits.is_set)
         rig.asks(own)
         assert rig.answer(own).message == "this key was revoked just now", "not let in again by the way"
         assert own.fingerprint in rig.home.clients.read()
-    turns(rig.turn, lambda: own.fingerprint not in rig.keyring.revoking)
+    turns(rig.turn, lambda: own.fingerprint not in rig.keyring.pending_revocations)
     assert rig.home.clients.read() == {}
-    assert rig.tokens.revoked(own.fingerprint)
+    assert rig.tokens.is_revoked(own.fingerprint)
 
 
 @pytest.mark.parametrize("when", ["waiting", "writing", "written"])
-def test_a_revocation_while_the_key_pairs_counts(
-    rig: PairingRig, monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    own, first = KeyPair.new(), KeyPair.new()
-    code, _ = rig.home.codes.make(rig.server)
+def test_a_revocation_while_the_key_pairs_counts(rig: PairingRig, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    own, first = KeyPair.generate(), KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
     with slow_disk(monkeypatch) as disk:
         if when == "waiting":  # behind the attempt of somebody else
             with monkeypatch.context() as patch:
                 patch.setattr(os, "fsync", lambda _: None)
-                other, _ = rig.home.codes.make(rig.server)
+                other, _ = rig.home.join_codes.create(rig.server)
             rig.asks(first, rig.proof(other, first), descriptor=2)
             turns(rig.turn, disk.waits.is_set)
         rig.asks(own, rig.proof(code, own))
@@ -151,49 +147,49 @@ def test_a_revocation_while_the_key_pairs_counts(
         rig.revocation.revoke(own.fingerprint, rig.now_ns)
     answer = rig.answer(own)
     assert (answer.code, answer.message) == (RefusalCode.CODE, "this key was revoked just now")
-    turns(rig.turn, lambda: not rig.keyring.revoking)
+    turns(rig.turn, lambda: not rig.keyring.pending_revocations)
     rig.turn()
     assert own.fingerprint not in rig.home.clients.read()
-    assert rig.keyring.find(own.fingerprint) is None
-    assert rig.tokens.revoked(own.fingerprint)
+    assert rig.keyring.find_key(own.fingerprint) is None
+    assert rig.tokens.is_revoked(own.fingerprint)
 
 
 def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(rig: PairingRig) -> None:
-    own = KeyPair.new()
-    code, _ = rig.home.codes.make(rig.server)
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
     rig.asks(own, rig.proof(code, own))
     rig.turn()
     turns(lambda _: None, lambda: bool(rig.home.clients.read()))  # written, and not told yet
-    assert rig.home.clients.revoke("ann") is not None
-    rig.keyring.look()
+    assert rig.home.clients.revoke_key("ann") is not None
+    rig.keyring.reload_if_changed()
     assert rig.answer(own).message == "this key was revoked just now"
-    assert rig.keyring.find(own.fingerprint) is None
+    assert rig.keyring.find_key(own.fingerprint) is None
 
 
 def test_a_list_that_could_not_be_read_just_then_is_read_again(
     rig: PairingRig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Revoked while the system had no descriptor to spare: it counts as soon as there is one."""
-    own = KeyPair.new()
-    rig.home.clients.allow("ann", own.public)
-    rig.keyring.look()
-    rig.home.clients.revoke("ann")
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.keyring.reload_if_changed()
+    rig.home.clients.revoke_key("ann")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", _no_descriptor)
         for _ in range(3):
-            rig.keyring.look()
-    assert rig.keyring.find(own.fingerprint) is not None
+            rig.keyring.reload_if_changed()
+    assert rig.keyring.find_key(own.fingerprint) is not None
     assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
-    rig.keyring.look()
-    assert rig.keyring.find(own.fingerprint) is None
+    rig.keyring.reload_if_changed()
+    assert rig.keyring.find_key(own.fingerprint) is None
 
 
 def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
     rig: PairingRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The code is used up: to be told that one was revoked would be wrong, and of no use."""
-    own = KeyPair.new()
-    code, _ = rig.home.codes.make(rig.server)
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
 
     def unreadable() -> dict[str, AllowedKey]:
         raise KeysError("Too many open files") from OSError(errno.EMFILE, "Too many open files")
@@ -203,29 +199,29 @@ def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
         rig.asks(own, rig.proof(code, own))
         assert isinstance(rig.answer(own), Paired)
     rig.turn()
-    assert rig.keyring.find(own.fingerprint) is not None
+    assert rig.keyring.find_key(own.fingerprint) is not None
 
 
 def test_who_has_paired_and_did_not_hear_it_is_told_again(rig: PairingRig) -> None:
     """The answer came too late, or its connection broke: the code is used up, and the key is on the list."""
-    own = KeyPair.new()
-    code, _ = rig.home.codes.make(rig.server)
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
     proof = rig.proof(code, own)
     rig.asks(own, proof)
     first = rig.answer(own)
     assert isinstance(first, Paired)
-    _, other = rig.home.codes.make(rig.server)
+    _, other = rig.home.join_codes.create(rig.server)
     rig.asks(own, proof)
     assert rig.answers(own) == [first, first], "at once"
-    kept = rig.home.codes.find(other.id)
+    kept = rig.home.join_codes.find_code(other.id)
     assert kept is not None
     assert kept.attempts_left == other.attempts_left, "it is no attempt at another code"
-    rig.asks(KeyPair.new(), proof, descriptor=2)
+    rig.asks(KeyPair.generate(), proof, descriptor=2)
     rig.asks(own, b"x" * 32)
     turns(rig.turn, lambda: len(rig.answers(own)) == 3)
     assert rig.answers(own)[2].code == RefusalCode.CODE
-    rig.home.clients.revoke(own.fingerprint)
-    turns(rig.turn, lambda: rig.keyring.find(own.fingerprint) is None)
+    rig.home.clients.revoke_key(own.fingerprint)
+    turns(rig.turn, lambda: rig.keyring.find_key(own.fingerprint) is None)
     rig.asks(own, proof)
     turns(rig.turn, lambda: len(rig.answers(own)) == 4)
     assert rig.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
@@ -237,60 +233,59 @@ def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_give
     """As by `cp -p` or rsync: a key that is replaced is out at once. A certificate that is damaged is said, once."""
     folder = tmp_path / "clients"
     folder.mkdir()
-    first, second = KeyPair.new(), KeyPair.new()
+    first, second = KeyPair.generate(), KeyPair.generate()
     server = KeyHome(tmp_path / "home")
-    server.server_key()
+    server.load_server_key()
     drops = Drops()
-    config = FrontConfig(curve_secret_file=str(server.path / "server.key_secret"), curve_clients_dir=str(folder))
-    keyring = open_keyring(config, drops)
+    keyring = open_keyring("", str(server.path / "server.key_secret"), str(folder), drops)
     path = folder / "ann.key"
 
     def write(text: str) -> None:
         path.write_text(text)
         os.utime(path, ns=(0, 0))
-        keyring.look()
+        keyring.reload_if_changed()
 
     write(f'public-key = "{first.public}"')
-    assert keyring.find(first.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is not None
     write(f'public-key = "{second.public}"')
-    assert keyring.find(first.fingerprint) is None
-    assert set(keyring.gone) == {first.fingerprint}
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is None
+    assert set(keyring.removed) == {first.fingerprint}
+    assert keyring.find_key(second.fingerprint) is not None
     (folder / "bob.key").write_text("nothing")
     for _ in range(3):
         (folder / "other").touch()
-        keyring.look()
+        keyring.reload_if_changed()
     said = capsys.readouterr().err
-    assert said.count("nobody is let in by bob.key") == 1
+    assert said.count("certificate bob.key") == 1
     assert "it should be a ZeroMQ certificate" in said
     assert drops.by_reason["certificate_unusable"] == 1
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(second.fingerprint) is not None
     keyring.close()
 
 
 def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(rig: PairingRig) -> None:
-    own = KeyPair.new()
-    rig.home.clients.allow("ann", own.public)
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
     rig.turn()
     rig.revocation.revoke(own.fingerprint, rig.now_ns)
-    turns(rig.turn, lambda: not rig.keyring.revoking)
-    code, _ = rig.home.codes.make(rig.server)
+    turns(rig.turn, lambda: not rig.keyring.pending_revocations)
+    code, _ = rig.home.join_codes.create(rig.server)
     rig.asks(own, rig.proof(code, own))
     assert isinstance(rig.answer(own), Paired)
     rig.turn()
-    assert not rig.tokens.revoked(own.fingerprint)
+    assert not rig.tokens.is_revoked(own.fingerprint)
 
 
 def test_who_has_no_attempts_left_takes_nothing_from_others(rig: PairingRig) -> None:
-    eve, ann = KeyPair.new(), KeyPair.new()
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(2):
-        rig.home.codes.make(rig.server)
+        rig.home.join_codes.create(rig.server)
         for _ in range(5):
             before = len(rig.answers(eve))
             rig.asks(eve)
             turns(rig.turn, lambda before=before: len(rig.answers(eve)) > before)
     assert [m.message for m in rig.answers(eve)] == ["this join code is wrong, used or expired"] * 10
-    code, _ = rig.home.codes.make(rig.server)
+    code, _ = rig.home.join_codes.create(rig.server)
     for _ in range(200):
         rig.asks(eve)
     assert rig.drops.by_reason["pair_shut_out"] == 200
@@ -301,7 +296,7 @@ def test_who_has_no_attempts_left_takes_nothing_from_others(rig: PairingRig) -> 
 
 def test_one_address_cannot_use_up_what_all_may_ask(rig: PairingRig) -> None:
     """Not even while there is no code that it could be wrong about."""
-    eve, ann = KeyPair.new(), KeyPair.new()
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(200):
         rig.asks(eve)
     rig.asks(ann, descriptor=2)
@@ -310,8 +305,8 @@ def test_one_address_cannot_use_up_what_all_may_ask(rig: PairingRig) -> None:
 
 
 def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    code, _ = rig.home.codes.make(rig.server)
-    first, *others = [KeyPair.new() for _ in range(MAX_PENDING + 3)]
+    code, _ = rig.home.join_codes.create(rig.server)
+    first, *others = [KeyPair.generate() for _ in range(MAX_PENDING + 3)]
     rig.asks(first, rig.proof(code, first), descriptor=0)
     with slow_disk(monkeypatch) as disk:
         turns(rig.turn, disk.waits.is_set)
@@ -334,7 +329,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
 ) -> None:
     """No descriptor is left for a while, and the file does not change meanwhile."""
     rig, now_s, tries = PairingRig(tmp_path / "home"), 1000.0, 0
-    rig.home.codes.make(rig.server)
+    rig.home.join_codes.create(rig.server)
     with monkeypatch.context() as patch:
 
         def fails(_server: str) -> tuple[JoinCode, ...]:
@@ -342,7 +337,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(rig.home.codes, "of", fails)
+        patch.setattr(rig.home.join_codes, "list_open", fails)
         patch.setattr(pairing_service.time, "monotonic", lambda: now_s)
         for _ in range(3):
             assert not rig.pairing.has_open_code

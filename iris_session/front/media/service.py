@@ -191,8 +191,8 @@ class MediaService:
 
     def _find_source_name(self, mark: str) -> str | None:
         """Return the name of a key that may hand in frames, `None` for any other."""
-        entry = self._keyring.find(mark)
-        if entry is None or self._tokens.revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
+        entry = self._keyring.find_key(mark)
+        if entry is None or self._tokens.is_revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
             return None
         return entry.name
 
