@@ -262,7 +262,14 @@ def bumped(lab: Lab) -> Iterator[Visit]:
         yield from_client(lab)
 
 
-@fault("both robots are held by other participants", "leases", "carl has no robot", "left: ann", "right: bob", state=WARNING)
+@fault(
+    "both robots are held by other participants",
+    "leases",
+    "carl has no robot",
+    "left: ann",
+    "right: bob",
+    state=WARNING,
+)
 def robot_held(lab: Lab) -> Iterator[Visit]:
     here = ("name=ann,behaviour=idle,robot=left", "name=bob,behaviour=idle,robot=right")
     both, wants = r"ann +work[\s\S]*bob +work|bob +work[\s\S]*ann +work", r"carl +\w+ +samples [1-9]"
