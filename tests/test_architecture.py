@@ -41,8 +41,8 @@ FORBIDDEN = {
 }
 #: Imports between rooms that are still to be untied.
 TRANSITIONAL = {
-    ("alignment", "front"), ("netsim", "session"),
-    ("security", "link"), ("session", "client"),
+    ("netsim", "session"),
+    ("session", "client"),
 }  # fmt: skip
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")

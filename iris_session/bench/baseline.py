@@ -21,8 +21,8 @@ import zmq
 from numpy.typing import NDArray
 
 from iris_session.bench.report import BenchError
-from iris_session.session.scheduling import quiet_collector, tick_priority
-from iris_session.system import children
+from iris_session.system.priority import freeze_garbage_collector, tick_priority
+from iris_session.system.process import child_environment, module_command
 
 PERIOD_NS: Final = 2_000_000
 FRAME_NS: Final = round(1e9 / 60.0)
@@ -65,8 +65,8 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
 
 
 def _start_receiver(address: str, sockets: int) -> subprocess.Popen[bytes]:
-    command = children.command("iris_session.bench.baseline", address, str(sockets))
-    return subprocess.Popen(command, stdout=subprocess.PIPE, env=children.environment())
+    command = module_command("iris_session.bench.baseline", address, str(sockets))
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=child_environment())
 
 
 def _read_ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
@@ -80,7 +80,7 @@ def _read_ages(process: subprocess.Popen[bytes]) -> NDArray[np.float64]:
 def _run_loop(socket: zmq.Socket[bytes], seconds: float) -> list[int]:
     """Lateness [ns] of every tick; deadlines are start + k * period, as the session's."""
     lateness: list[int] = []
-    with tick_priority(), quiet_collector():
+    with tick_priority(), freeze_garbage_collector():
         deadline = published = time.monotonic_ns() + PERIOD_NS
         end = deadline + round(seconds * 1e9)
         while deadline < end:

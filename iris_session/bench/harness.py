@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ from iris_session.protocol.entries import Entry
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess
 
 #: The bars are stated for at most four clients in one process.
 CLIENTS_PER_PROCESS: Final = 4
@@ -82,31 +81,22 @@ class ClientProcess:
 
     def __init__(self, job: Job, module: str = CLIENTS) -> None:
         self.job = job
-        self._process = subprocess.Popen(
-            children.command(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=children.environment()
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(msgspec.json.encode(job) + b"\n")
-        self._process.stdin.flush()
-        os.set_blocking(self._process.stdout.fileno(), False)
+        self._process = ChildProcess(module, stdout=PIPE)
+        self._process.write(msgspec.json.encode(job) + b"\n")
 
     def is_ready(self) -> bool:
         """True once its clients have joined. Raises when it died."""
-        assert self._process.stdout is not None
-        if self._process.poll() is not None:
-            raise BenchError(f"a client process ended with status {self._process.returncode} before it was ready")
-        return (self._process.stdout.read(6) or b"").startswith(b"ready")
+        if not self._process.is_running:
+            raise BenchError(f"a client process ended with status {self._process.exit_status} before it was ready")
+        return b"ready" in self._process.read_available_lines()
 
     def set_window(self, begin_ns: int, end_ns: int) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{begin_ns} {end_ns}\n".encode())
-        self._process.stdin.flush()
+        self._process.write(f"{begin_ns} {end_ns}\n".encode())
 
     def read_result(self) -> dict[str, Log]:
         """The logs by client name, once the process has ended."""
         if self._process.wait(60.0) != 0:
-            raise BenchError(f"a client process failed with status {self._process.returncode}")
+            raise BenchError(f"a client process failed with status {self._process.exit_status}")
         with np.load(self.job.log) as columns:
             logs: dict[str, Log] = {}
             for key in columns.files:
@@ -116,16 +106,14 @@ class ClientProcess:
 
     @property
     def running(self) -> bool:
-        return self._process.poll() is None
+        return self._process.is_running
 
     def send_signal(self, number: int) -> None:
         """Stops or continues the process, for example."""
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        if self.running:
-            self._process.kill()
-        self._process.wait()
+        self._process.close()
 
 
 @dataclass
@@ -263,7 +251,7 @@ def _raise_if_stopped(session: Session) -> None:
 def _start_profiles(arena: BenchRun) -> None:
     """The moments of a profile count from the beginning of the window."""
     assert arena.proxy is not None
-    arena.proxy.post("start")
+    arena.proxy.send("start")
 
 
 class _Schedule:

@@ -25,7 +25,7 @@ from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
 from iris_session.bench.join_scene import PreparedScene, make_join_model
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.session.session import Session
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess, child_environment, module_command
 
 #: From the beginning of the window: what the others are used to is measured first.
 BEGIN_S: Final = 4.0
@@ -112,8 +112,8 @@ def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
 
 
 def _prepare_scene(model: Path, store: Path) -> PreparedScene:
-    command = children.command("iris_session.bench.join_scene", str(model), str(store))
-    done = subprocess.run(command, stdout=subprocess.PIPE, env=children.environment(), check=False)
+    command = module_command("iris_session.bench.join_scene", str(model), str(store))
+    done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False)
     if done.returncode:
         raise BenchError(f"the scene could not be made ready: status {done.returncode}")
     return msgspec.json.decode(done.stdout, type=PreparedScene)
@@ -138,27 +138,21 @@ class _Joiner:
 
     def __init__(self, folder: Path, bare_port: int) -> None:
         self._cache, self._bare_port = str(folder / "cache"), bare_port
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
         if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+            self._process.close()
 
     def prepare(self, session: Session) -> None:
         """Starts the process. Once, in the warm-up."""
         if self._process is not None:
             return
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
-        self._process = subprocess.Popen(
-            children.command("iris_session.bench.join_clients"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=children.environment(),
-        )
+        self._process = ChildProcess("iris_session.bench.join_clients", stdout=PIPE)
         self._write_line(msgspec.json.encode(job))
 
     def start_join(self) -> None:
@@ -167,15 +161,11 @@ class _Joiner:
 
     def _write_line(self, line: bytes) -> None:
         assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + b"\n")
-        self._process.stdin.flush()
+        self._process.write(line + b"\n")
 
     def read_result(self) -> tuple[JoinResult, JoinResult, CopyInterval, float]:
         """The first time, the second time, when memory was copied, and the seconds of the bare transfer, made now."""
-        assert self._process is not None
-        assert self._process.stdout is not None
-        self._process.stdout.readline()
+        self._read_line()
         first, second = (msgspec.json.decode(self._read_line(), type=JoinResult) for _ in range(2))
         copied = msgspec.json.decode(self._read_line(), type=CopyInterval)
         self._write_line(b"bare")
@@ -183,11 +173,10 @@ class _Joiner:
 
     def _read_line(self) -> bytes:
         assert self._process is not None
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise BenchError("the client that joined failed; it has said why")
-        return line
+        try:
+            return self._process.read_line()
+        except EOFError:
+            raise BenchError("the client that joined failed; it has said why") from None
 
 
 class _BulkServer:

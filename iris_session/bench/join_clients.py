@@ -20,10 +20,10 @@ import msgspec
 import numpy as np
 import zmq
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.scene import decode_image, decode_mesh
-from iris_session.system.priority import give_way
+from iris_session.system.priority import lower_thread_priority
 
 JOIN_S: Final = 60.0
 #: Memory is copied for so long, after a pause in which the machine has nothing to do with joining any more; by as many
@@ -60,7 +60,7 @@ def join(job: JoinJob) -> JoinResult:
     """One client, from nothing to a whole scene. Raises what the client raises."""
     begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
     with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
-        client.asset_cache = AssetCache(job.cache)
+        client.asset_cache = AssetStore(job.cache)
         scene = client.connection.mirror.scene_hash
         first = client.fetch_assets([scene], decode=lambda _, data: decode_scene(data))
         client.wait_for(lambda _: first.done, JOIN_S)
@@ -101,7 +101,7 @@ def copy_memory(origin_ns: int) -> CopyInterval:
     end_ns = begin_ns + round(COPY_S * 1e9)
 
     def work() -> None:
-        give_way()
+        lower_thread_priority()
         source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
         while time.monotonic_ns() < end_ns:
             np.copyto(target, source)

@@ -390,8 +390,8 @@ def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser])
         "solve",
         help="solve the alignments of a recording again, and the poses of its sheets",
         description="Read every observation of a recording and solve alignments again, with the observations before "
-        "and after each moment. Prints the error of each alignment that was in force, observations that contradict it, and "
-        "sheets that were moved. With two or more sheets it also solves their relative poses, as a file for "
+        "and after each moment. Prints the error of each alignment that was in force, observations that contradict it, "
+        "and sheets that were moved. With two or more sheets it also solves their relative poses, as a file for "
         "`serve --anchors`.",
         epilog="examples:\n"
         "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd\n"

@@ -10,7 +10,6 @@ import json
 import os
 import select
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 import msgspec
 
 from iris_session.cli.common import to_printable
-from iris_session.system import children
+from iris_session.system.process import ChildProcess
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -109,14 +108,8 @@ class LiveView:
     def open(self) -> Iterator[Callable[[], None]]:
         """Start the display, yield `update`, and stop the display after the last line."""
         self._out.flush()
-        child = subprocess.Popen(
-            children.command("iris_session.cli.live", self._title),
-            stdin=subprocess.PIPE,
-            stdout=self._out,
-            env=children.environment(),
-        )
-        assert child.stdin is not None
-        self._pipe = child.stdin.fileno()
+        child = ChildProcess("iris_session.cli.live", [self._title], stdout=self._out)
+        self._pipe = child.stdin_fd
         os.set_blocking(self._pipe, False)
         try:
             yield self.update
@@ -125,14 +118,9 @@ class LiveView:
             until = time.monotonic() + END_S
             ready = select.poll()  # `select.select` takes no descriptor above 1023
             ready.register(self._pipe, select.POLLOUT)
-            while not self._send() and child.poll() is None and time.monotonic() < until:
+            while not self._send() and child.is_running and time.monotonic() < until:
                 ready.poll(100)
-            child.stdin.close()
-            try:
-                child.wait(timeout=END_S)
-            except subprocess.TimeoutExpired:  # a terminal that takes nothing must not keep the session's end
-                child.kill()
-                child.wait()
+            child.close(exit_s=END_S)  # a terminal that reads nothing must not delay the end of the session
 
     def update(self, force: bool = False) -> None:
         """Send status and new events to the display."""

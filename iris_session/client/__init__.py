@@ -4,7 +4,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.store import AssetStore
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.discovery import FoundSession, find_sessions
@@ -29,7 +29,7 @@ from iris_session.client.waiting import ClientGroup, poll_all, wait_any
 from iris_session.protocol.session_mirror import SessionMirror
 
 __all__ = [
-    "AssetCache",
+    "AssetStore",
     "AssetFetch",
     "Client",
     "ClientGroup",

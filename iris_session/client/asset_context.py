@@ -8,7 +8,7 @@ import threading
 
 import zmq
 
-from iris_session.system.priority import made_below
+from iris_session.system.priority import run_at_low_priority
 
 _lock = threading.Lock()
 _context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
@@ -19,7 +19,7 @@ def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
     global _context  # noqa: PLW0603
     with _lock:
         if _context is None or _context[0] != os.getpid():
-            _context = os.getpid(), made_below(_opened)
+            _context = os.getpid(), run_at_low_priority(_opened)
         return _context[1]
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from iris_session.assets.cache import AssetCache
 from iris_session.assets.errors import AssetStoreError
+from iris_session.assets.store import AssetStore
 from iris_session.client.asset_workers import Decode
 from iris_session.client.errors import AssetError
 
@@ -21,7 +21,7 @@ class AssetFetch:
 
     def __init__(
         self,
-        cache: AssetCache,
+        cache: AssetStore,
         addresses: Iterable[str],
         sizes: Mapping[str, int],
         on_progress: Callable[[AssetFetch], None] | None,

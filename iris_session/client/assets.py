@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.store import AssetStore, default_root
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.asset_loading import AssetLoader, Failed
 from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored
@@ -29,10 +29,10 @@ class Assets:
     connection: Connection
     _sockets: ClientSockets
     _lock: threading.RLock
-    asset_cache: AssetCache
+    asset_cache: AssetStore
 
     def _init_assets(self) -> None:
-        self.asset_cache = AssetCache()
+        self.asset_cache = AssetStore(default_root("client-assets"))
         self._loader = AssetLoader()
         self._workers: AssetWorkers | None = None
         self._fetches: list[AssetFetch] = []

@@ -46,7 +46,7 @@ def check_host(folder: Path, control_port: int = CONTROL_PORT) -> list[Finding]:
 
 def check_scheduling() -> Finding:
     """Check whether the tick loop may run with real-time priority."""
-    from iris_session.session.scheduling import tick_priority
+    from iris_session.system.priority import tick_priority
 
     with tick_priority() as reached:
         pass
@@ -115,7 +115,7 @@ def check_key_home() -> Finding:
         advice = f"chmod -R go= {folder}"
         return failed("key_home", f"others may read {', '.join(loose)} in {folder}", "these are secrets", advice)
     try:
-        clients, codes = home.clients.read(), home.codes.read()
+        clients, codes = home.clients.read(), home.join_codes.read()
     except KeysError as error:
         return failed("key_home", str(error), "", "repair or remove that file; removing it deletes its entries")
     return ok("key_home", f"{folder}: {len(clients)} keys on the list, {len(codes)} join codes")

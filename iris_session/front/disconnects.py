@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard
@@ -38,7 +38,7 @@ class DisconnectHandler:
         coalescer: Coalescer,
         drops: Drops,
         status: StatusService,
-        anchoring: Anchoring,
+        alignment: AlignmentService,
         session_ns: Callable[[], int],
         guard: ConnectionGuard,
     ) -> None:
@@ -50,7 +50,7 @@ class DisconnectHandler:
         self._coalescer = coalescer
         self._drops = drops
         self._status = status
-        self._anchoring = anchoring
+        self._alignment = alignment
         self._session_ns = session_ns
         self._closed: list[tuple[int, int]] = []  # descriptors of closed TCP connections, each with its deadline
 
@@ -120,5 +120,5 @@ class DisconnectHandler:
         self._clients.remove(connection)
         if reason in TCP_STAYS_OPEN:
             self._clients.keep_for_estop(connection)
-        self._anchoring.forget(connection.number)
+        self._alignment.remove_connection(connection.number)
         self._drops.remove(connection.number)

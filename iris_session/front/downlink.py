@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, encode_message
 from iris_session.front.revocation import RevocationService
@@ -24,7 +24,7 @@ from iris_session.protocol.server_messages import (
     ServerMessage,
     Snapshot,
 )
-from iris_session.protocol.steps import Outgoing
+from iris_session.protocol.steps import OutgoingMessage
 
 _MAX_MESSAGES = 64  # messages taken at once
 #: Why a director ends a participation: nobody joins again by itself after that.
@@ -50,7 +50,7 @@ class Downlink:
         session_ns: Callable[[], int],
         forget: Callable[[FrontConnection, str], None],
         revocation: RevocationService,
-        anchoring: Anchoring,
+        alignment: AlignmentService,
         on_scene: Callable[[], None],
     ) -> None:
         self._socket = socket
@@ -62,7 +62,7 @@ class Downlink:
         self._session_ns = session_ns
         self._forget = forget
         self._revocation = revocation
-        self._anchoring = anchoring
+        self._alignment = alignment
         self._on_scene = on_scene
         self.heard_ns = 0
         self.acknowledged = 0
@@ -125,7 +125,7 @@ class Downlink:
                 self._send_outgoing(outgoing)
         for event in decided.events:
             self.broadcast(event)
-            self._anchoring.heard(event.body)
+            self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
                 self._admission.expire_tokens(event.body.participant)
         for outgoing in snapshots:
@@ -143,14 +143,14 @@ class Downlink:
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, self.heard_ns)
 
-    def _send_outgoing(self, outgoing: Outgoing) -> None:
+    def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
         connection = self._clients.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
             # What only the front knows: the scene, and the poses of the newest state frame.
-            self._anchoring.shown(message.participants)
+            self._alignment.process_snapshot(message.participants)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(

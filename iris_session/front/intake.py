@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
@@ -38,8 +38,8 @@ from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
-from iris_session.security import fingerprint, raw_key
-from iris_session.security.keyring import stranger_key
+from iris_session.security import compute_fingerprint, decode_key
+from iris_session.security.keyring import parse_pairing_key
 
 #: Faults to strangers, per second: they have no connection to count on.
 _UNKNOWN_PEER_FAULTS: Final = 20
@@ -86,7 +86,7 @@ class Intake:
         pairing: PairingService,
         audit: AuditTrail,
         guard: ConnectionGuard,
-        anchoring: Anchoring,
+        alignment: AlignmentService,
     ) -> None:
         self._config = config
         self._clients = clients
@@ -100,7 +100,7 @@ class Intake:
         self._pairing = pairing
         self._audit = audit
         self._guard = guard
-        self._anchoring = anchoring
+        self._alignment = alignment
         self._unknown_peer_faults = TokenBucket(_UNKNOWN_PEER_FAULTS, _UNKNOWN_PEER_FAULTS)
         #: Connections replaced by a new hello or peer on the same route; the loop takes leave of them.
         self.replaced: list[FrontConnection] = []
@@ -133,7 +133,7 @@ class Intake:
             self._count_rejection(peer, None, now_ns)
             self._pairing.handle_pair(route, peer, message, now_ns)
             return
-        if stranger_key(peer.user_id):
+        if parse_pairing_key(peer.user_id):
             self._reject_unpaired(route, peer, message, now_ns)
             return
         connection = self._clients.by_route.get(route)
@@ -171,7 +171,7 @@ class Intake:
         """A key that is not on the list said something else than `Pair`."""
         self._drops.count("unpaired")
         self._count_rejection(peer, None, now_ns)
-        mark, name = fingerprint(raw_key(stranger_key(peer.user_id))), getattr(message, "name", "")
+        mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
         self._audit.record(
             AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=tag_of(type(message))
@@ -223,7 +223,7 @@ class Intake:
             return
         elif isinstance(message, Observation):
             self._raw.send(connection.number, now_ns, message)
-            self._anchoring.observed(connection, message, now_ns)
+            self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
@@ -254,7 +254,7 @@ class Intake:
         """What is done with every sample as it came, before samples are coalesced."""
         self._raw.send(connection.number, now_ns, sample)
         self._status.record_sample(connection.number, sample, now_ns)
-        self._anchoring.sampled(connection, sample, now_ns)
+        self._alignment.process_sample(connection, sample, now_ns)
 
     def _count_rejection(
         self, peer: Peer, connection: FrontConnection | None, now_ns: int, what: str = BEFORE_HELLO

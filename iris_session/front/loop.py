@@ -11,7 +11,7 @@ import time
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.announce import SessionFacts, make_discovery_services
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
@@ -40,7 +40,7 @@ from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security.resume_tokens import ResumeTokens
-from iris_session.system.parent import parent_is
+from iris_session.system.process import is_parent
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
 ROUND = 8
@@ -98,8 +98,15 @@ class Front:
         self._status = StatusService(config, self._clients, self._outbox, self._drops, self._telling)
         self._media = self._make_media()
         self._status.media_row = self._media.report_participant
-        anchoring = Anchoring(config, self._clients, self._coalescer.offer, self._drops)
-        self._status.alignment_report = anchoring.report
+        alignment = AlignmentService(
+            self._coalescer.offer,
+            self._drops,
+            anchors=config.anchors,
+            anchor_sizes=config.anchor_sizes,
+            proposal_period_ns=config.proposal_period_ns,
+            max_connections=config.limits.connections,
+        )
+        self._status.alignment_report = alignment.complete_report
         memory = MemoryGuard(config.limits.memory_bytes, lambda: guard.evict_for_memory(self._give_way), self._shed)
         self._services += [self._keyring, self._status, self._media, guard, memory]
         self._intake = Intake(
@@ -115,7 +122,7 @@ class Front:
             self._pairing,
             self._audit,
             guard,
-            anchoring,
+            alignment,
         )
         departures = self._departures = DisconnectHandler(
             sockets.control.monitor,
@@ -125,7 +132,7 @@ class Front:
             self._coalescer,
             self._drops,
             self._status,
-            anchoring,
+            alignment,
             self.now_ns,
             guard,
         )
@@ -155,7 +162,7 @@ class Front:
             self.now_ns,
             departures.remove,
             revocation,
-            anchoring,
+            alignment,
             self._assets.sync_clients,
         )
         self.ended = ""
@@ -163,7 +170,7 @@ class Front:
         self.cut_off = False
         self._authenticator = sockets.authenticator
         if self._authenticator is not None:
-            self._authenticator.banned = self._tokens.revoked
+            self._authenticator.is_revoked = self._tokens.is_revoked
         self._uplink = Uplink(
             self._link,
             config.limits.unacknowledged,
@@ -174,7 +181,7 @@ class Front:
             self._drops,
             self._publisher,
         )
-        self._services += [*self._announced(), anchoring]
+        self._services += [*self._announced(), alignment]
         self._next_housekeeping_ns = self._next_collect_ns = 0
 
     def _announced(self) -> list[Service]:
@@ -206,7 +213,7 @@ class Front:
             self._keyring,
             self._drops,
             self._status.find_report,
-            self._tokens.revoked,
+            self._tokens.is_revoked,
             lambda: self._publisher.frames,
             adapt=self._config.adapt_media,
         )
@@ -215,7 +222,7 @@ class Front:
         sockets, encrypted, limits = self._sockets.assets, self._keyring.key is not None, self._config.limits
         guard = ChannelGuard(sockets.monitor, limits, limits.subscribers, REQUEST_BYTES, curve=encrypted, name="assets")
         server = AssetServer(sockets, guard, self.now_ns)
-        return AssetService(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.revoked)
+        return AssetService(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.is_revoked)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
@@ -256,7 +263,7 @@ class Front:
         """One pass of the loop. True when clients still have something to say."""
         self._downlink.drain()
         if self._authenticator is not None:
-            self._authenticator.answer()
+            self._authenticator.answer_requests()
         more = True
         for _ in range(ROUNDS):
             self._departures.drain_monitor()
@@ -326,7 +333,7 @@ class Front:
             self.end(ENDED)
         elif readable(self._sockets.link_monitor):
             self.cut_off = True
-            self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
+            self.end(ENDED if is_parent(self._start.parent_pid) else ORPHANED)
 
     def _check_stall(self, now_ns: int) -> None:
         """Called after the link was drained, so a front that was kept from running does not blame the authority."""
@@ -338,7 +345,7 @@ class Front:
         elif self._uplink.stalled and not stalled:
             self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
         self._uplink.stalled = stalled
-        if not parent_is(self._start.parent_pid):
+        if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
 
     def _telling(self) -> Telling:

@@ -16,20 +16,18 @@ import contextlib
 import gc
 import json
 import os
-import select
 import selectors
 import signal
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Final, Self
 
 from iris_session.netsim.profiles import Profile, ProfileError, load_profile
-from iris_session.netsim.proxy import Link
-from iris_session.system import children
+from iris_session.netsim.proxy import ImpairedLink
+from iris_session.system.process import PIPE, ChildProcess
 
-ANSWER_S: Final = 10.0
+ANSWER_TIMEOUT_S: Final = 10.0
 #: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
 REALTIME_PRIORITY: Final = 2
 
@@ -52,23 +50,14 @@ class ImpairmentProcess:
         self, links: Mapping[str, str], ports: Sequence[int], *, target: str = "127.0.0.1", seed: int = 0,
         udp: Sequence[int] = (),
     ) -> None:  # fmt: skip
-        command = children.command(__name__, "--target", target, "--seed", str(seed), "--until-eof")
-        command += ["--ports", ",".join(map(str, ports))]
+        command = ["--target", target, "--seed", str(seed), "--until-eof", "--ports", ",".join(map(str, ports))]
         command += ["--udp", ",".join(map(str, udp))] if udp else []
         for address, profile in links.items():
             command += ["--link", f"{address}={profile}"]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=children.environment(),
-            start_new_session=True,
-        )
-        self._rest = b""
+        self._process = ChildProcess(__name__, command, stdout=PIPE, stderr=PIPE, own_session=True)
         self._unanswered = 1
         try:
-            self._answer("start")
+            self._read_answer("start")
         except BaseException:
             self.close()
             raise
@@ -77,33 +66,24 @@ class ImpairmentProcess:
     def pid(self) -> int:
         return self._process.pid
 
-    def do(self, command: str) -> dict[str, Any]:
+    def execute(self, command: str) -> dict[str, Any]:
         """One command, and its answer once it is done."""
-        self.post(command)
+        self.send(command)
         while self._unanswered > 1:
-            self._answer("an earlier command")
-        return self._answer(command)
+            self._read_answer("an earlier command")
+        return self._read_answer(command)
 
-    def post(self, command: str) -> None:
+    def send(self, command: str) -> None:
         """One command, without waiting for it."""
-        assert self._process.stdin is not None
         self._unanswered += 1
         try:
-            self._process.stdin.write(command.encode() + b"\n")
-            self._process.stdin.flush()
+            self._process.write(command.encode() + b"\n")
         except OSError as error:
-            raise ImpairmentError(f"the proxy has ended with status {self._process.poll()}") from error
+            raise ImpairmentError(f"the proxy has ended with status {self._process.exit_status}") from error
 
     def close(self) -> None:
         """Ends the process; may be called twice."""
-        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
-            assert pipe is not None
-            pipe.close()
-        try:
-            self._process.wait(2.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.close(exit_s=2.0)
 
     def __enter__(self) -> Self:
         return self
@@ -113,21 +93,14 @@ class ImpairmentProcess:
     ) -> None:
         self.close()
 
-    def _answer(self, command: str) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        fd = self._process.stdout.fileno()
-        ready = select.poll()  # `select.select` takes no descriptor above 1023
-        ready.register(fd, select.POLLIN)
-        while b"\n" not in self._rest:
-            if not ready.poll(ANSWER_S * 1e3):
-                raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s")
-            data = os.read(fd, 65536)
-            if not data:
-                said = self._process.stderr.read().decode(errors="replace").strip().splitlines()
-                raise ImpairmentError(said[-1] if said else f"the proxy ended at {command!r}")
-            self._rest += data
-        line, _, self._rest = self._rest.partition(b"\n")
+    def _read_answer(self, command: str) -> dict[str, Any]:
+        try:
+            line = self._process.read_line(ANSWER_TIMEOUT_S)
+        except TimeoutError:
+            raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_TIMEOUT_S:g} s") from None
+        except EOFError:
+            messages = self._process.read_stderr().strip().splitlines()
+            raise ImpairmentError(messages[-1] if messages else f"the proxy ended at {command!r}") from None
         self._unanswered -= 1
         answer: dict[str, Any] = json.loads(line)
         if not answer["ok"]:
@@ -135,7 +108,7 @@ class ImpairmentProcess:
         return answer
 
 
-def obey(links: Sequence[Link], line: str) -> dict[str, Any]:
+def run_command(links: Sequence[ImpairedLink], line: str) -> dict[str, Any]:
     """Does one command of standard input; see the module docstring. Raises `ProfileError` for what it does not know."""
     words = line.split()
     command = words[0] if words else ""
@@ -145,19 +118,19 @@ def obey(links: Sequence[Link], line: str) -> dict[str, Any]:
     if len(chosen) < len(named):
         raise ProfileError(f"no link {' '.join(named)}: there are {', '.join(link.address for link in links)}")
     if command == "stats":
-        return {"links": [link.stats() for link in chosen]}
+        return {"links": [link.collect_stats() for link in chosen]}
     for link in chosen:
         if command in ("stall", "resume"):
-            link.held = command == "stall"
-            link.changed()
+            link.stalled_by_command = command == "stall"
+            link.update_stalls()
         elif command in ("cut", "reset"):
-            link.break_all(reset=command == "reset")
+            link.close_connections(reset=command == "reset")
         elif command == "roam" and len(rest) == 1:
             link.roam(rest[0])
         elif command == "start":
-            link.begin(link.profile)
+            link.start_profile(link.profile)
         elif command == "profile" and len(rest) == 1:
-            link.begin(load_profile(rest[0]))
+            link.start_profile(load_profile(rest[0]))
         else:
             raise ProfileError(
                 f"{line!r} is no command: stall, resume, cut, reset, roam ADDRESS, profile NAME, start, stats, quit"
@@ -171,7 +144,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
     done = asyncio.Event()
     made = []
     for number, (address, profile) in enumerate(links):
-        link = Link(address, options.target, profile, options.seed + number)
+        link = ImpairedLink(address, options.target, profile, options.seed + number)
         try:
             link.listen(options.ports, options.udp)
         except OSError as error:
@@ -195,7 +168,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
                 done.set()
                 return
             try:
-                answer = {"ok": True, **obey(made, line.decode(errors="replace"))}
+                answer = {"ok": True, **run_command(made, line.decode(errors="replace"))}
             except ProfileError as error:
                 answer = {"ok": False, "error": str(error)}
             print(json.dumps(answer), flush=True)
@@ -208,7 +181,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
     await done.wait()
 
 
-def port_list(text: str) -> list[int]:
+def parse_ports(text: str) -> list[int]:
     """Type of options that take ports: `7720-7725`, `7721,7722`, nothing."""
     ports: list[int] = []
     for part in filter(None, text.split(",")):
@@ -219,13 +192,13 @@ def port_list(text: str) -> list[int]:
     return ports
 
 
-def parser(prog: str | None = None, description: str | None = __doc__) -> argparse.ArgumentParser:
+def build_parser(prog: str | None = None, description: str | None = __doc__) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     made.add_argument("--target", default="127.0.0.1", metavar="ADDR", help="where the session is (%(default)s)")
-    made.add_argument("--ports", type=port_list, default=port_list("7720-7726"), help="TCP (default: 7720-7726)")
-    made.add_argument("--udp", type=port_list, default=[], metavar="PORTS", help="UDP ports (default: none)")
+    made.add_argument("--ports", type=parse_ports, default=parse_ports("7720-7726"), help="TCP (default: 7720-7726)")
+    made.add_argument("--udp", type=parse_ports, default=[], metavar="PORTS", help="UDP ports (default: none)")
     made.add_argument(
         "--link", action="append", metavar="ADDR[=PROFILE]", help="address of a link, repeatable (127.0.0.2)"
     )
@@ -237,7 +210,7 @@ def parser(prog: str | None = None, description: str | None = __doc__) -> argpar
 
 def main(argv: Sequence[str] | None = None, prog: str | None = None, description: str | None = __doc__) -> int:
     """Exit status 0 after an orderly end, 2 for unusable input."""
-    options = parser(prog, description).parse_args(argv)
+    options = build_parser(prog, description).parse_args(argv)
     try:
         parts = [text.partition("=") for text in options.link or ["127.0.0.2"]]
         links = [(address, load_profile(profile or options.profile)) for address, _, profile in parts]

@@ -143,7 +143,7 @@ class SharedScenes:
                 self._hold(store, shown.info.assets)
                 if shown.patches:
                     address = shown.info.scene_hash
-                    self._looks.append(_Look(address, store.used_at(address), time.monotonic()))
+                    self._looks.append(_Look(address, store.last_used_ns(address), time.monotonic()))
                 self._forget_looks(store)
             while len(self._holds) > 2:
                 self._holds.pop(0).release()

@@ -13,9 +13,9 @@ import pytest
 import zmq
 
 from iris_session.client import (
-    AssetCache,
     AssetError,
     AssetFetch,
+    AssetStore,
     Client,
     InvalidMessageError,
     NotConnectedError,
@@ -71,7 +71,7 @@ def join(live: LiveSession, tmp_path: Path) -> Iterator[Callable[..., Client]]:
 
     def make(name: str = "ann", cache: str = "cache") -> Client:
         client = Client(live.address, name=name, role="observer", alignment="not_needed")
-        client.asset_cache = AssetCache(tmp_path / cache)
+        client.asset_cache = AssetStore(tmp_path / cache)
         clients.append(client)
         return client.connect(DEADLINE_S)
 
@@ -176,7 +176,7 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
     with pytest.raises(InvalidMessageError, match="no address"):
         client.fetch_assets(["../../etc/passwd"])
     path.write_bytes(store.data[damaged])
-    folder = client.asset_cache.folder
+    folder = client.asset_cache.root
     assert client.wait_for(lambda _: not list(folder.glob("??/*.part")), DEADLINE_S), "of those nothing is kept open"
     client.close()
     with pytest.raises(NotConnectedError):
@@ -200,11 +200,11 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
 ) -> None:
     client = join()
     (tmp_path / "file").write_bytes(b"")
-    client.asset_cache = AssetCache(tmp_path / "file")
+    client.asset_cache = AssetStore(tmp_path / "file")
     fetch = client.fetch_assets(store.addresses[:2])
     until_done(client, fetch)
     assert {error.reason for error in fetch.failed.values()} == {"cache"}
-    client.asset_cache = AssetCache(tmp_path / "folder")
+    client.asset_cache = AssetStore(tmp_path / "folder")
     fetch = client.fetch_assets(store.addresses[:2])
     until_done(client, fetch)
     fetch.check()
@@ -272,7 +272,7 @@ def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
 ) -> None:
     client = join()
     fetch = client.fetch_assets(store.addresses)
-    client.asset_cache = AssetCache(tmp_path / "another")
+    client.asset_cache = AssetStore(tmp_path / "another")
     with pytest.raises(AssetError, match="exchanged"):
         client.fetch_assets(store.addresses[:1])
     until_done(client, fetch)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import Client
 from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, keys
 from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
@@ -64,7 +64,7 @@ def joined(tmp_path: Path) -> Iterator[list[Client]]:
 
 def watch(live: LiveSession, joined: list[Client], cache: Path) -> tuple[Client, Deformables]:
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.asset_cache = AssetCache(cache)
+    client.asset_cache = AssetStore(cache)
     joined.append(client)
     return client.connect(DEADLINE_S), Deformables(client)
 
@@ -365,7 +365,7 @@ def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
 
 def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after_a_pause(tmp_path: Path) -> None:
     client = Client("127.0.0.1:1", role="observer", name="screen")
-    client.asset_cache = AssetCache(tmp_path)
+    client.asset_cache = AssetStore(tmp_path)
     shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
     shapes._use([], one)
     shapes._follow(one, ("a", 1))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from iris_session import Client, SceneBuilder, ScenePublisher, Session, SessionConfig
-from iris_session.client import AssetCache
+from iris_session.client import AssetStore
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.demo.scenes import n_arms_scene, scene_path
@@ -84,7 +84,7 @@ def opened() -> Iterator[list[Client]]:
 
 def joined(session: Session | ScenePublisher, opened: list[Client], cache: Path) -> Client:
     client = Client(session.address, role="observer", name=cache.name, alignment="not_needed")
-    client.asset_cache = AssetCache(cache)
+    client.asset_cache = AssetStore(cache)
     opened.append(client)
     return client.connect(DEADLINE_S)
 

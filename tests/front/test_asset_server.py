@@ -15,7 +15,7 @@ import psutil
 import pytest
 import zmq
 
-from iris_session.assets.mapped_files import AssetFiles
+from iris_session.assets.store import ServedAssets
 from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
 from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
@@ -28,7 +28,7 @@ from iris_session.protocol.server_messages import Event, SceneChanged
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.protocol.steps import Decision
 from iris_session.security import KeyPair
-from iris_session.system.priority import NICER
+from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.e2e.conftest import unavailable
 from tests.front.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.front.harness import FrontSession, RawClient
@@ -250,12 +250,12 @@ def test_only_the_own_key_fetches_and_a_revoked_one_does_not(lab: Lab, tmp_path:
     bob, other = lab.allowed("bob")
     anns = shop.welcome(shop.fetcher(client, lab.curve(ann)))
     assert anns.answer(anns.ask(shop.addresses[0])) == shop.data[0][:MIB]
-    eve = shop.fetcher(client, lab.curve(KeyPair.new()))
+    eve = shop.fetcher(client, lab.curve(KeyPair.generate()))
     eve.ask(shop.addresses[1])
     posing = shop.fetcher(client, lab.curve(bob))
     assert posing.answer(posing.ask(shop.addresses[1])) == AssetRefusal.NOT_ALLOWED
     shop.session.pump(lambda: shop.drops("assets_unknown_key") > 0, "eve's key is refused")
-    lab.home.clients.revoke(ann.fingerprint)
+    lab.home.clients.revoke_key(ann.fingerprint)
     lab.audits("key_revoked")
     bobs = shop.welcome(shop.fetcher(other, lab.curve(bob)))
     before = anns.take()
@@ -315,7 +315,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         def fail(*_: object) -> None:
             raise ZeroDivisionError("planted")
 
-        broken.setattr(AssetFiles, "chunk", fail)
+        broken.setattr(ServedAssets, "chunk", fail)
         assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
     assert _fetched(sockets, address) == b"asset"
     assert server.read_counters().reasons["assets_fault"] == 2
@@ -324,10 +324,10 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
 
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
-    if ours + NICER > 19:
+    if ours + LOW_PRIORITY_NICE > 19:
         unavailable("these tests run at the lowest priority already")
     found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
-    assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
+    assert found[ours + LOW_PRIORITY_NICE] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
     python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
     assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
 

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
 from iris_session.front.connection_guard import ConnectionGuard
 from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, Peer, Route
 from iris_session.front.disconnects import LAST_WORDS_NS, DisconnectHandler
-from iris_session.link.config import FrontConfig, FrontLimits
+from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.entries import Lost
@@ -46,7 +46,7 @@ class Door:
             self.coalescer,
             self.drops,
             self,  # type: ignore[arg-type]
-            Anchoring(FrontConfig(), self.clients, self.coalescer.offer, self.drops),
+            AlignmentService(self.coalescer.offer, self.drops),
             lambda: self.now_ns,
             ConnectionGuard(self.clients, self.drops, AuditTrail(self.coalescer.offer), FrontLimits()),
         )

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.connections import ConnectionTable
 from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
-from iris_session.link.config import FrontConfig, SceneInfo
+from iris_session.link.config import SceneInfo
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
 
@@ -42,7 +42,7 @@ class Far:
             lambda: 77,
             lambda connection: None,
             unused,  # type: ignore[arg-type]
-            Anchoring(FrontConfig(), ConnectionTable(), lambda entry: True, self.drops),
+            AlignmentService(lambda entry: True, self.drops),
             lambda: self.heard_of.append(self.publisher.scene.scene_hash),
         )
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
@@ -75,7 +75,7 @@ class Desk:
             pairing,
             audit,
             guard,
-            Anchoring(config, self.clients, self.coalescer.offer, self.drops),
+            AlignmentService(self.coalescer.offer, self.drops, anchors=config.anchors),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
