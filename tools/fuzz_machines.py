@@ -20,11 +20,11 @@ import zmq
 from fuzz_decoders import client_messages, rigid_frames, server_messages
 from fuzz_inputs import Corpus, encoded
 
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.limits import MAX_INBOX
+from iris_session.client.core.state_stream import StateStream
+from iris_session.client.core.status import Phase
 from iris_session.client.identity import Identity
-from iris_session.client.limits import MAX_INBOX
-from iris_session.client.state_stream import StateStream
-from iris_session.client.status import Phase
 from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, envelope
 from iris_session.protocol.codec import CLIENT_TYPES, decode_client, decode_server, encode_client, encode_server

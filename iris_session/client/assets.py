@@ -9,12 +9,12 @@ from typing import Final
 
 from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_fetch import AssetFetch
-from iris_session.client.asset_loading import AssetLoader, Failed
 from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored
-from iris_session.client.connection import Connection
+from iris_session.client.core.asset_loader import AssetLoader, Failed
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.status import Phase
 from iris_session.client.errors import AssetError, InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
-from iris_session.client.status import Phase
 from iris_session.protocol.assets import AssetRequest, is_address
 from iris_session.protocol.codec import decode_asset_chunk, decode_asset_refused, encode_asset_request
 from iris_session.protocol.errors import ProtocolError

@@ -12,19 +12,19 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from iris_session.client.connection import Connection
+from iris_session.client.arguments import checked_bytes, names_of
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.state_stream import SceneState
+from iris_session.client.core.status import Phase
 from iris_session.client.driving import DEFAULT_TIMEOUT_S, Driving
 from iris_session.client.errors import NotConnectedError
 from iris_session.client.identity import Identity
 from iris_session.client.joining import wanted
-from iris_session.client.looking import Looking
 from iris_session.client.reporting import ArrivalMeter, Reporting
 from iris_session.client.requests import Requests
 from iris_session.client.sampling import Sampling
+from iris_session.client.sheet_observer import Looking
 from iris_session.client.sockets import ClientSockets, CurveKeys
-from iris_session.client.state_stream import SceneState
-from iris_session.client.status import Phase
-from iris_session.client.values import checked_bytes, names_of
 from iris_session.protocol.client_messages import ClientMessage, EStop, Hello
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import AlignmentKind, Role

@@ -17,7 +17,7 @@ from typing import Final, Self
 
 from iris_session.client.address import host_port, is_host
 from iris_session.client.errors import ClientError
-from iris_session.client.resolving import resolve
+from iris_session.client.host_lookup import resolve
 from iris_session.protocol.codec import INTRODUCTION_PREFIX, decode_beacon, decode_introduction
 from iris_session.protocol.discovery import DISCOVERY_PORT, INTRODUCTION_OFFSET, Beacon, Introduction
 from iris_session.protocol.errors import ProtocolError, VersionError

@@ -11,15 +11,15 @@ from typing import Self
 import zmq
 
 from iris_session.client.assets import Assets
+from iris_session.client.core.receiving import Told
+from iris_session.client.core.state_stream import SceneState
+from iris_session.client.core.status import Phase
 from iris_session.client.errors import ClientError, NotConnectedError
+from iris_session.client.group import milliseconds
 from iris_session.client.joining import Joining
 from iris_session.client.media import Media
-from iris_session.client.receiving import Told
 from iris_session.client.reporting import ArrivalMeter
-from iris_session.client.scene_view import SceneView
-from iris_session.client.state_stream import SceneState
-from iris_session.client.status import Phase
-from iris_session.client.waiting import milliseconds
+from iris_session.client.scene import SceneView
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Event, Feedback, Reply
 from iris_session.protocol.session_mirror import Missed

@@ -6,11 +6,11 @@ import time
 from typing import Final
 
 from iris_session.client.address import DEFAULT_CONTROL_PORT, Address
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.status import Phase
+from iris_session.client.endpoint_resolver import STEP_NS, Meeting, Met, Wanted
 from iris_session.client.errors import ClientError, RefusedError, SessionNameError
-from iris_session.client.meeting import STEP_NS, Meeting, Met, Wanted
 from iris_session.client.sockets import ClientSockets, CurveKeys
-from iris_session.client.status import Phase
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.pairing import normal_code
 from iris_session.protocol.server_messages import Welcome

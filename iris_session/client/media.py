@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import Connection
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.client.reporting import PERIOD_NS
 from iris_session.client.sockets import ClientSockets

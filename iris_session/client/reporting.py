@@ -8,10 +8,10 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Final, Self
 
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.state_stream import SceneState
+from iris_session.client.core.status import Phase
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError
-from iris_session.client.state_stream import SceneState
-from iris_session.client.status import Phase
 from iris_session.protocol.status import ClientReport, GetStatus, Quantiles, StatusReport, quantiles
 
 PERIOD_NS: Final = 1_000_000_000

@@ -9,9 +9,9 @@ from typing import Any, Self
 
 import msgspec
 
-from iris_session.client.connection import Connection
+from iris_session.client.arguments import Numbers, PoseLike, names_of, numbers, pose_of, text_of
+from iris_session.client.core.connection import Connection
 from iris_session.client.errors import DeniedError, InvalidMessageError, NotConnectedError, RequestTimeoutError
-from iris_session.client.values import Numbers, PoseLike, names_of, numbers, pose_of, text_of
 from iris_session.protocol.client_messages import (
     Acquire,
     Align,

@@ -7,9 +7,9 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, Final
 
-from iris_session.client.connection import Connection
+from iris_session.client.arguments import PoseLike, names_of, numbers, plain, pose_of
+from iris_session.client.core.connection import Connection
 from iris_session.client.errors import InvalidMessageError
-from iris_session.client.values import PoseLike, names_of, numbers, plain, pose_of
 from iris_session.protocol.client_messages import ClientMessage, Sample, Samples
 from iris_session.protocol.common import Alignment, Target
 from iris_session.protocol.names import SampleKind, TargetKind

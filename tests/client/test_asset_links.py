@@ -13,7 +13,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.client import AssetCache, Client, asset_loading
+from iris_session.client import AssetCache, Client
+from iris_session.client.core import asset_loader as asset_loading
 from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
 from tests.client.test_assets import Liar, chunk

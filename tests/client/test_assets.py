@@ -12,16 +12,9 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.client import (
-    AssetCache,
-    AssetError,
-    AssetFetch,
-    Client,
-    InvalidMessageError,
-    NotConnectedError,
-    asset_loading,
-)
-from iris_session.client.waiting import ClientGroup
+from iris_session.client import AssetCache, AssetError, AssetFetch, Client, InvalidMessageError, NotConnectedError
+from iris_session.client.core import asset_loader as asset_loading
+from iris_session.client.group import ClientGroup
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRequest
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.names import AssetRefusal

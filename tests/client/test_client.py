@@ -24,7 +24,7 @@ from iris_session.client import (
     poll_all,
 )
 from iris_session.client.address import Address
-from iris_session.client.status import Phase
+from iris_session.client.core.status import Phase
 from iris_session.protocol.client_messages import Acquire, EStop, Sample
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.names import DenialReason, Device, HoldReason

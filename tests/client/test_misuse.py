@@ -12,8 +12,8 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
+from iris_session.client.arguments import checked_bytes, names_of, numbers, pose_of, text_of
 from iris_session.client.fetched_scene import fetch_scene
-from iris_session.client.values import checked_bytes, names_of, numbers, pose_of, text_of
 from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
 from iris_session.protocol.codec import decode_client
 from iris_session.protocol.common import Denial, Pose

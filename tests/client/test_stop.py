@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from iris_session.client.core.status import Phase
 from iris_session.client.errors import NotConnectedError
-from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import Acquire, ClearEStop, ClockPing, EStop, Hello, Release
 from iris_session.protocol.server_messages import ClockPong, EStopChanged, Event
-from tests.client.test_connection import MS, SAMPLE, SECOND, Wire
+from tests.client.core.test_connection import MS, SAMPLE, SECOND, Wire
 
 STOP = EStop("now")
 

@@ -18,7 +18,7 @@ import pytest
 
 from anchors.pose import distance
 from iris_session.client import Client, DeniedError
-from iris_session.client.status import Phase
+from iris_session.client.core.status import Phase
 from iris_session.protocol.names import DenialReason
 from iris_session.protocol.server_messages import EngagementChanged, ParticipantJoined, ParticipantLeft
 from tests.e2e.conftest import Hand, Server, Stage, none_left, relatives, verify, wait

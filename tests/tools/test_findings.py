@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.client.address import Address
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import Connection
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
 from iris_session.front.state_publisher import StatePublisher

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from iris_session.client.status import ConnectionCounters
+from iris_session.client.core.status import ConnectionCounters
 from iris_session.protocol.client_messages import Bye, ClientMessage, EStop, Hello, Release, Sample, Samples
 
 MAX_OUTGOING: Final = 256

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import zmq
 
-from iris_session.client.status import Phase
+from iris_session.client.core.status import Phase
 
 if TYPE_CHECKING:
     from iris_session.client.client import Client

@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from iris_session.client.asset_loading import (
+from iris_session.client.core.asset_loader import (
     AT_ONCE,
     CHUNK_BYTES,
     FAST_NS,

@@ -8,8 +8,8 @@ import time
 from typing import Any
 
 from anchors.pose import PoseTuple, compose
-from iris_session.client.connection import Connection
-from iris_session.client.state_stream import Poses, SceneState
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.state_stream import Poses, SceneState
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.server_messages import PresenceItem
 from iris_session.protocol.session_mirror import SessionMirror

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.pose import quat_angle, quat_from_rotvec
-from iris_session.client.interpolation import PoseBuffer, interpolate
+from iris_session.client.core.interpolation import PoseBuffer, interpolate
 
 MS = 1_000_000
 

@@ -9,13 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.clock import SETTLED
-from iris_session.client.connection import Connection
+from iris_session.client.core.clock import SETTLED
+from iris_session.client.core.connection import Connection
+from iris_session.client.core.limits import (
+    BACKOFF_MAX_NS,
+    HELLO_TIMEOUT_MAX_NS,
+    HELLO_TIMEOUT_NS,
+    MAX_INBOX,
+    MAX_PENDING,
+)
+from iris_session.client.core.outbox import MAX_OUTGOING
+from iris_session.client.core.status import Phase
 from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
 from iris_session.client.identity import Identity
-from iris_session.client.limits import BACKOFF_MAX_NS, HELLO_TIMEOUT_MAX_NS, HELLO_TIMEOUT_NS, MAX_INBOX, MAX_PENDING
-from iris_session.client.outgoing import MAX_OUTGOING
-from iris_session.client.status import Phase
 from iris_session.protocol.client_messages import (
     Acquire,
     Bye,

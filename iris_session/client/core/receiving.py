@@ -9,14 +9,14 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Sequence
 
-from iris_session.client.answers import Answers
-from iris_session.client.clock import ClockSync
+from iris_session.client.core.clock import ClockSync
+from iris_session.client.core.inbox import Answers
+from iris_session.client.core.limits import MAX_INBOX, NOT_TAKEN, TRANSIENT, end_for_good, heartbeat_period
+from iris_session.client.core.outbox import PendingStop
+from iris_session.client.core.state_stream import StateStream, poses_from_bytes
+from iris_session.client.core.status import ConnectionCounters, Phase
 from iris_session.client.errors import ClientError, RefusedError, VersionError
 from iris_session.client.identity import Identity
-from iris_session.client.limits import MAX_INBOX, NOT_TAKEN, TRANSIENT, end_for_good, heartbeat_period
-from iris_session.client.outgoing import PendingStop
-from iris_session.client.state_stream import StateStream, poses_from_bytes
-from iris_session.client.status import ConnectionCounters, Phase
 from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.errors import ProtocolError

@@ -16,11 +16,10 @@ from typing import Any
 
 import msgspec
 
-from iris_session.client.answers import Answers
-from iris_session.client.clock import ClockSync
-from iris_session.client.errors import ClientError, NotConnectedError, RefusedError
-from iris_session.client.identity import Identity
-from iris_session.client.limits import (
+from iris_session.client.arguments import checked_bytes
+from iris_session.client.core.clock import ClockSync
+from iris_session.client.core.inbox import Answers
+from iris_session.client.core.limits import (
     BACKOFF_MAX_NS,
     BACKOFF_MIN_NS,
     HELLO_TIMEOUT_MAX_NS,
@@ -29,11 +28,12 @@ from iris_session.client.limits import (
     SNAPSHOT_RETRY_NS,
     STEADY_NS,
 )
-from iris_session.client.outgoing import Outgoing, PendingStop
-from iris_session.client.receiving import Receiving, Told
-from iris_session.client.state_stream import StateStream
-from iris_session.client.status import ConnectionCounters, Phase
-from iris_session.client.values import checked_bytes
+from iris_session.client.core.outbox import Outgoing, PendingStop
+from iris_session.client.core.receiving import Receiving, Told
+from iris_session.client.core.state_stream import StateStream
+from iris_session.client.core.status import ConnectionCounters, Phase
+from iris_session.client.errors import ClientError, NotConnectedError, RefusedError
+from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import (
     Bye,
     ClearEStop,

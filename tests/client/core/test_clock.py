@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.clock import BURST, JUMP, LARGE_NS, SLEW, SLEW_LARGE, ClockSync
+from iris_session.client.core.clock import BURST, JUMP, LARGE_NS, SLEW, SLEW_LARGE, ClockSync
 
 SECOND = 1_000_000_000
 OFFSET = 5 * SECOND  # session time - local time

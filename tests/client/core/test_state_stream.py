@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iris_session.client.state_stream import PRESENCE_WAITING, SceneState, StateStream
+from iris_session.client.core.state_stream import PRESENCE_WAITING, SceneState, StateStream
 from iris_session.protocol.codec import encode_presence, encode_state_header
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.server_messages import (

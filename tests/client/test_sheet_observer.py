@@ -18,7 +18,7 @@ from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rot
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 from iris_session.client import Client, ClientError, InvalidMessageError
-from iris_session.client.looking import CAMERA_SIGMA, Viewpoints, in_tracking
+from iris_session.client.sheet_observer import CAMERA_SIGMA, Viewpoints, in_tracking
 from iris_session.protocol.client_messages import Align, ClientMessage, MoveAnchor, Observation
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import Reply

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from iris_session.client.limits import MAX_GRANTED, MAX_PENDING
-from iris_session.client.status import ConnectionCounters
+from iris_session.client.core.limits import MAX_GRANTED, MAX_PENDING
+from iris_session.client.core.status import ConnectionCounters
 from iris_session.protocol.common import Lease
 from iris_session.protocol.server_messages import Reply
 

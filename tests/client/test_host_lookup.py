@@ -10,8 +10,8 @@ from collections.abc import Generator, Iterator
 
 import pytest
 
-from iris_session.client import resolving
-from iris_session.client.resolving import MAX_LOOKUPS, resolve
+from iris_session.client import host_lookup as resolving
+from iris_session.client.host_lookup import MAX_LOOKUPS, resolve
 
 PATIENCE_S = 30.0
 

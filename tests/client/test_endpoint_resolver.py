@@ -13,12 +13,12 @@ import pytest
 import zmq
 
 from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
-from iris_session.client import meeting as meeting_module
+from iris_session.client import endpoint_resolver as meeting_module
 from iris_session.client import pairing as pairing_module
 from iris_session.client.address import Address, pairing_uri
 from iris_session.client.discovery import ask_introduction
+from iris_session.client.endpoint_resolver import settle
 from iris_session.client.joining import wanted
-from iris_session.client.meeting import settle
 from iris_session.client.pairing import pair_key
 from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_rotate
-from iris_session.client.connection import Connection
+from iris_session.client.arguments import PoseLike, pose_of
+from iris_session.client.core.connection import Connection
 from iris_session.client.errors import ClientError, InvalidMessageError
-from iris_session.client.values import PoseLike, pose_of
 from iris_session.protocol.client_messages import ClientMessage, Observation
 from iris_session.protocol.common import Pose
 
