@@ -16,7 +16,7 @@ from fuzz_decoders import Decoder
 from fuzz_inputs import Corpus, encoded
 from fuzz_machines import FrontControl
 
-from iris_session.client.core.asset_loader import WINDOW_BYTES, WINDOW_REQUESTS, Ask, AssetLoader
+from iris_session.client.core.asset_loader import WINDOW_BYTES, WINDOW_REQUESTS, ChunkRequest, AssetLoader
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.errors import ProtocolError
@@ -55,7 +55,7 @@ class LoaderMachine:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self._loader = AssetLoader()
-        self._asks: list[Ask] = []
+        self._asks: list[ChunkRequest] = []
         self._unstored = 0
         self._now_ns = 0
 
@@ -76,16 +76,16 @@ class LoaderMachine:
             taken = self._answer(data)
         except ProtocolError:
             taken = False
-        loader.want(rng.choice("abcdefgh"))
-        for address in list(loader.to_look()):
-            loader.missing(address, rng.choice((0, 0, 7)))
+        loader.add(rng.choice("abcdefgh"))
+        for address in list(loader.next_lookups()):
+            loader.on_missing(address, rng.choice((0, 0, 7)))
         if rng.random() < 0.01:
-            rng.choice((loader.cut_off, lambda: loader.broke_off(self._now_ns)))()
+            rng.choice((loader.on_link_closed, lambda: loader.on_link_lost(self._now_ns)))()
             self._asks.clear()
-        asks = list(loader.requests(self._now_ns))
+        asks = list(loader.next_requests(self._now_ns))
         self._asks += asks
         if rng.random() < 0.5:
-            loader.stored(self._unstored)
+            loader.on_stored(self._unstored)
             self._unstored = 0
         assert sum(ask.length for ask in self._asks) + self._unstored <= WINDOW_BYTES + WINDOW_BYTES // 2
         assert len(self._asks) <= WINDOW_REQUESTS
@@ -98,17 +98,17 @@ class LoaderMachine:
         except ProtocolError:
             chunk = codec.decode_asset_chunk(data, 0)
             size = min(rng.choice((0, 5, 524_288)), max(0, chunk.total - chunk.offset))
-            outcome = loader.chunk(chunk, size, self._now_ns)
+            outcome = loader.process_chunk(chunk, size, self._now_ns)
             self._answered(chunk.request_id, fits=outcome is not False)
             if outcome is True:
                 self._unstored += size
-                if loader.whole(chunk.address):
-                    loader.again(chunk.address) if rng.random() < 0.5 else loader.drop(chunk.address)
+                if loader.is_complete(chunk.address):
+                    loader.restart_asset(chunk.address) if rng.random() < 0.5 else loader.remove(chunk.address)
             return outcome is True
-        outcome_ = loader.refused(refused, self._now_ns)
+        outcome_ = loader.process_refusal(refused, self._now_ns)
         self._answered(refused.request_id, fits=True)
         if isinstance(outcome_, str) and outcome_:
-            loader.missing(outcome_, 0)
+            loader.on_missing(outcome_, 0)
         return outcome_ == ""
 
     def _answered(self, number: int, *, fits: bool) -> None:

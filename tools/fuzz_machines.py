@@ -20,10 +20,10 @@ import zmq
 from fuzz_decoders import client_messages, rigid_frames, server_messages
 from fuzz_inputs import Corpus, encoded
 
-from iris_session.client.core.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.limits import MAX_INBOX
 from iris_session.client.core.state_stream import StateStream
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
 from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import ClientEnvelope, ClockPing, EStop, Hello, Marker, Sample, envelope
@@ -59,11 +59,11 @@ class ClientConnection:
     def make(self) -> bytes:
         if not self._left:
             self._left = self._rng.choice((20, 300))
-            self.connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+            self.connection = ClientConnection(Hello("operator", "Ann"), Identity(b"s" * 16))
             self.connection.open(self._now_ns)
         self._left -= 1
         rng, connection = self._rng, self.connection
-        if connection.phase is Phase.JOINING and rng.random() < 0.3:
+        if connection.phase is ConnectionPhase.JOINING and rng.random() < 0.3:
             welcome = Welcome(
                 "s", "lab", "live", "p1", 7, "operator", b"t" * 16, False, 0, 500 * MS, 2 * MS, 16 * MS, Endpoints(1, 2)
             )

@@ -100,14 +100,14 @@ def expect_session(arguments: argparse.Namespace) -> None:
     """Raises `CommandError` within `CONNECT_S` where nothing listens at the address that was given: a client would wait
     for it to begin. A session by its name has no address yet."""
     from iris_session.client.address import Address
-    from iris_session.client.host_lookup import resolve
-    from iris_session.client.joining import LOCAL
+    from iris_session.client.host_lookup import resolve_host
+    from iris_session.client.joining import LOCAL_ADDRESS
 
     if arguments.session:
         return
-    address = Address.parse(arguments.address or LOCAL)
+    address = Address.parse(arguments.address or LOCAL_ADDRESS)
     until_s = time.monotonic() + CONNECT_S
-    looking = resolve(address.host, until_s)
+    looking = resolve_host(address.host, until_s)
     try:
         while True:
             try:

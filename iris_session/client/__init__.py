@@ -7,7 +7,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_fetch import AssetFetch
 from iris_session.client.client import Client
-from iris_session.client.core.interpolation import PoseBuffer, Shown
+from iris_session.client.core.interpolation import PoseBuffer, ShownPoses
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.discovery import FoundSession, find_sessions
 from iris_session.client.errors import (
@@ -39,7 +39,7 @@ __all__ = [
     "PoseBuffer",
     "SceneState",
     "SessionMirror",
-    "Shown",
+    "ShownPoses",
     "find_sessions",
     "poll_all",
     "wait_any",

@@ -27,7 +27,7 @@ POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
 _PLACE: Final = re.compile(r" - at `\$\[3\]\.?([^`]*)`$")
 
 
-def checked_bytes(message: ClientMessage, connection_epoch: int = 0) -> bytes:
+def encode_checked(message: ClientMessage, connection_epoch: int = 0) -> bytes:
     """The encoded envelope of `message`, decoded once as the session will do. Raises `InvalidMessageError`."""
     kind = type(message).__name__
     try:
@@ -39,11 +39,11 @@ def checked_bytes(message: ClientMessage, connection_epoch: int = 0) -> bytes:
         where = f"{place[1]}: " if place and place[1] else ""
         raise InvalidMessageError(f"{kind} cannot be sent: {where}{_PLACE.sub('', text)}") from None
     except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidMessageError(f"{kind} cannot be sent: {_unencodable(message) or error}") from None
+        raise InvalidMessageError(f"{kind} cannot be sent: {_find_unencodable(message) or error}") from None
     return data
 
 
-def _unencodable(message: ClientMessage) -> str:
+def _find_unencodable(message: ClientMessage) -> str:
     """The first field that MessagePack cannot carry."""
     for name, value in msgspec.structs.asdict(message).items():
         try:
@@ -53,7 +53,7 @@ def _unencodable(message: ClientMessage) -> str:
     return ""
 
 
-def text_of(value: object) -> str:
+def to_text(value: object) -> str:
     """Any value as a `Text`: what stops robots must not fail for want of a good reason."""
     try:
         text = str(value)
@@ -62,7 +62,7 @@ def text_of(value: object) -> str:
     return text.encode("utf-8", "replace").decode("utf-8")[:MAX_TEXT]
 
 
-def names_of(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
+def to_names(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
     """Names as a tuple; a bare string is one name."""
     if isinstance(names, str):
         return (names,)
@@ -73,41 +73,41 @@ def names_of(field: str, names: str | Iterable[str]) -> tuple[str, ...]:
     return found
 
 
-def numbers(field: str, values: Iterable[float], length: int | None = None) -> tuple[float, ...]:
+def to_numbers(field: str, values: Iterable[float], length: int | None = None) -> tuple[float, ...]:
     """Numbers, or an array (n,), as floats."""
     try:
-        found = tuple(v if type(v) is float else _number(v) for v in values)
+        found = tuple(v if type(v) is float else _to_float(v) for v in values)
     except (TypeError, ValueError):
         found = None
     if found is None or (length is not None and len(found) != length):
         wanted = "numbers" if length is None else f"{length} numbers"
-        raise InvalidMessageError(f"{field}: expected {wanted}, got {_shown(values)}")
+        raise InvalidMessageError(f"{field}: expected {wanted}, got {_short_repr(values)}")
     return found
 
 
-def _number(value: Any) -> float:
+def _to_float(value: Any) -> float:
     if isinstance(value, str | bytes) or np.ndim(value):
         raise TypeError
     return float(value)
 
 
-def pose_of(field: str, pose: PoseLike) -> Pose:
+def to_pose(field: str, pose: PoseLike) -> Pose:
     """`((x, y, z), (w, x, y, z))` of tuples, lists or arrays, or a `Pose`."""
     if isinstance(pose, Pose):
         return pose
     try:
         p, q = pose
-        return Pose(numbers(field, p, 3), numbers(field, q, 4))  # type: ignore[arg-type]  # lengths are checked
+        return Pose(to_numbers(field, p, 3), to_numbers(field, q, 4))  # type: ignore[arg-type]  # lengths are checked
     except (TypeError, ValueError):  # InvalidMessageError is one too
-        raise InvalidMessageError(f"{field}: expected {POSE_FORM}, got {_shown(pose)}") from None
+        raise InvalidMessageError(f"{field}: expected {POSE_FORM}, got {_short_repr(pose)}") from None
 
 
-def plain(value: Any) -> Any:
+def to_python_scalar(value: Any) -> Any:
     """A NumPy scalar as the number or truth value that it is."""
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _shown(value: Any) -> str:
+def _short_repr(value: Any) -> str:
     size = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
     if not size and isinstance(value, list | tuple):
         size = f" of length {len(value)}"

@@ -32,7 +32,7 @@ class AssetFetch:
         self.pending = dict.fromkeys(self.addresses)
         self.failed: dict[str, AssetError] = {}
         self.decoded: dict[str, Any] = {}
-        self.put_off = ""
+        self.refusal = ""
         self.bytes_received = 0
         self.cached = 0
         self._cache = cache
@@ -75,13 +75,13 @@ class AssetFetch:
 
     # --- for the client ----------------------------------------------------------------------------------------------
 
-    def has(self, address: str, size: int, total: int, received: int = 0) -> None:
+    def on_bytes(self, address: str, size: int, total: int, received: int = 0) -> None:
         """So many bytes of an asset are here."""
         if address in self.pending:
             self._done[address], self._sizes[address] = size, total
             self.bytes_received += received
 
-    def found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
+    def on_found(self, address: str, size: int, decoded: Sequence[tuple[Decode, Any]], *, fetched: bool) -> None:
         """An asset is here; what functions made of it. Still pending, if ours was not among them."""
         if address not in self.pending:
             return

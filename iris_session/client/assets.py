@@ -9,10 +9,10 @@ from typing import Final
 
 from iris_session.assets.cache import AssetCache
 from iris_session.client.asset_fetch import AssetFetch
-from iris_session.client.asset_workers import AssetWorkers, Broken, Decode, Found, Missing, Result, Stored
-from iris_session.client.core.asset_loader import AssetLoader, Failed
-from iris_session.client.core.connection import Connection
-from iris_session.client.core.status import Phase
+from iris_session.client.asset_workers import AssetWorkers, AssetFailed, Decode, AssetFound, AssetMissing, Result, BytesStored
+from iris_session.client.core.asset_loader import AssetLoader, FailedAsset
+from iris_session.client.core.connection import ClientConnection
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import AssetError, InvalidMessageError, NotConnectedError
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.assets import AssetRequest, is_address
@@ -26,22 +26,22 @@ _CHUNK_FRAMES: Final = 2
 class Assets:
     """Part of `Client`. `asset_cache`: where assets are kept; set another one before the first is fetched."""
 
-    connection: Connection
+    connection: ClientConnection
     _sockets: ClientSockets
     _lock: threading.RLock
-    asset_cache: AssetCache
+    assets_DOT_cache: AssetCache
 
     def _init_assets(self) -> None:
-        self.asset_cache = AssetCache()
+        self.assets_DOT_cache = AssetCache()
         self._loader = AssetLoader()
         self._workers: AssetWorkers | None = None
         self._fetches: list[AssetFetch] = []
         self._asset_generation = -1
         self._news: list[AssetFetch] = []
         #: Messages on the assets channel that do not fit the protocol, or that nobody here asked for.
-        self.assets_malformed = 0
+        self.assets_DOT_malformed = 0
 
-    def fetch_assets(
+    def assets_DOT_fetch(
         self,
         addresses: Sequence[str] | Mapping[str, int],
         on_progress: Callable[[AssetFetch], None] | None = None,
@@ -64,24 +64,24 @@ class Assets:
                 raise InvalidMessageError(f"{address[:80]!r} is no address of an asset: 64 digits 0-9, a-f")
         sizes = addresses if isinstance(addresses, Mapping) else {}
         with self._lock:
-            if self.connection.phase is Phase.CLOSED:
+            if self.connection.phase is ConnectionPhase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            if self._workers is None or self._workers.cache is not self.asset_cache:
+            if self._workers is None or self._workers.cache is not self.assets_DOT_cache:
                 if any(fetch.pending for fetch in self._fetches):
                     raise AssetError(
                         "", "cache", "asset_cache was exchanged while assets were on their way into another"
                     )
                 self._end_workers()
-                self._workers = AssetWorkers(self.asset_cache, self._sockets.wake)
-                self._sockets.wake_anybody()
-            fetch = AssetFetch(self.asset_cache, addresses, sizes, on_progress, decode)
+                self._workers = AssetWorkers(self.assets_DOT_cache, self._sockets.wake)
+                self._sockets.enable_wake_registration()
+            fetch = AssetFetch(self.assets_DOT_cache, addresses, sizes, on_progress, decode)
             self._fetches.append(fetch)
             for address in fetch.addresses:
-                self._loader.want(address, sizes.get(address, -1))
+                self._loader.add(address, sizes.get(address, -1))
             self._sockets.wake()
             return fetch
 
-    def cancel_assets(self, fetch: AssetFetch) -> None:
+    def assets_DOT_cancel(self, fetch: AssetFetch) -> None:
         """What `fetch` still waits for is not wanted any more: it has `failed`, as `cancelled`. What has come of it
         stays in the cache, to be gone on with. Does nothing when it is done."""
         with self._lock:
@@ -89,9 +89,9 @@ class Assets:
                 error = AssetError(address, "cancelled", f"asset {address} was not waited for")
                 fetch.fail(address, error)
                 if not any(address in other.pending for other in self._fetches):
-                    self._loader.drop(address)
+                    self._loader.remove(address)
                     if self._workers is not None:
-                        self._workers.leave(address)
+                        self._workers.release(address)
             self._sockets.wake()
 
     @property
@@ -109,12 +109,12 @@ class Assets:
             self._asset_generation = self.connection.generation
             self._drop_asset_link()
         progressed = False
-        for result in workers.results():
+        for result in workers.poll_results():
             self._take_result(result)
             progressed = True
-        for address in loader.to_look():
-            workers.look(address, self._decodes_of(address))
-        if loader.needs_link and self.connection.joined:
+        for address in loader.next_lookups():
+            workers.look_up(address, self._decodes_of(address))
+        if loader.needs_link and self.connection.is_joined:
             progressed |= self._exchange(workers)
         elif not loader.needs_link:
             self._sockets.close_assets()
@@ -132,24 +132,24 @@ class Assets:
                 self._fail(address, error)
             return True
         now_ns = time.monotonic_ns()
-        if self._loader.pauses(now_ns) and not self._sockets.has_assets:
+        if self._loader.is_paused(now_ns) and not self._sockets.has_assets:
             return False
         self._sockets.open_assets(welcome.endpoints.assets)
-        ended = self._sockets.assets_ended()  # before the last that it has brought is taken
+        ended = self._sockets.poll_assets_disconnect()  # before the last that it has brought is taken
         messages = self._sockets.drain_assets()
         for frames in messages:
             try:
                 self._take_message(workers, frames, now_ns)
             except ProtocolError:
-                self.assets_malformed += 1
+                self.assets_DOT_malformed += 1
         if ended:
             self._sockets.close_assets()
-            self._loader.broke_off(now_ns)
+            self._loader.on_link_lost(now_ns)
             return True
-        if self._loader.overdue(now_ns):
+        if self._loader.is_overdue(now_ns):
             self._drop_asset_link()
             return True
-        for ask in self._loader.requests(now_ns):
+        for ask in self._loader.next_requests(now_ns):
             request = AssetRequest(PROTOCOL_VERSION, welcome.connection_epoch, *ask)
             if not self._sockets.send_assets(encode_asset_request(request)):
                 self._drop_asset_link()  # it takes nothing, though little was asked for: it is not there
@@ -159,54 +159,54 @@ class Assets:
     def _take_message(self, workers: AssetWorkers, frames: list[memoryview], now_ns: int) -> None:
         loader = self._loader
         if len(frames) != _CHUNK_FRAMES:
-            outcome = loader.refused(decode_asset_refused(frames[0]), now_ns)
+            outcome = loader.process_refusal(decode_asset_refused(frames[0]), now_ns)
             for fetch in self._fetches:
-                fetch.put_off = loader.put_off
-            if isinstance(outcome, Failed):
+                fetch.refusal = loader.refusal
+            if isinstance(outcome, FailedAsset):
                 self._fail(outcome.address, AssetError(*outcome))
             elif outcome:
                 workers.restart(outcome)
             return
         head, data = frames
         chunk = decode_asset_chunk(head, len(data))
-        taken = loader.chunk(chunk, len(data), now_ns)
-        if isinstance(taken, Failed):
+        taken = loader.process_chunk(chunk, len(data), now_ns)
+        if isinstance(taken, FailedAsset):
             self._fail(taken.address, AssetError(*taken))
             return
         if not taken:
-            self.assets_malformed += taken is False
+            self.assets_DOT_malformed += taken is False
             return
         workers.write(chunk.address, data)
         for fetch in self._fetches:
-            fetch.put_off = ""
-            fetch.has(chunk.address, chunk.offset + len(data), chunk.total, len(data))
+            fetch.refusal = ""
+            fetch.on_bytes(chunk.address, chunk.offset + len(data), chunk.total, len(data))
         self._tell(chunk.address)
-        if loader.whole(chunk.address):
+        if loader.is_complete(chunk.address):
             workers.finish(chunk.address, self._decodes_of(chunk.address))
 
     def _take_result(self, result: Result) -> None:
         loader = self._loader
-        if isinstance(result, Stored):
-            loader.stored(result.size)
-        elif isinstance(result, Found):
-            loader.drop(result.address)
+        if isinstance(result, BytesStored):
+            loader.on_stored(result.size)
+        elif isinstance(result, AssetFound):
+            loader.remove(result.address)
             self._tell(result.address)
             for fetch in self._fetches:
-                fetch.found(result.address, result.size, result.decoded, fetched=result.fetched)
+                fetch.on_found(result.address, result.size, result.decoded, fetched=result.fetched)
             if any(result.address in fetch.pending for fetch in self._fetches):
-                loader.want(result.address, result.size)  # somebody came meanwhile who wants it decoded otherwise
-        elif isinstance(result, Missing):
-            loader.missing(result.address, result.offset)
-        elif isinstance(result, Broken):
+                loader.add(result.address, result.size)  # somebody came meanwhile who wants it decoded otherwise
+        elif isinstance(result, AssetMissing):
+            loader.on_missing(result.address, result.offset)
+        elif isinstance(result, AssetFailed):
             self._fail(result.address, result.error)
-        elif not loader.again(result.address):
+        elif not loader.restart_asset(result.address):
             text = f"the session sent other bytes than those of asset {result.address}, twice"
             self._fail(result.address, AssetError(result.address, "hash", text))
 
     def _fail(self, address: str, error: AssetError) -> None:
-        self._loader.drop(address)
+        self._loader.remove(address)
         if self._workers is not None:
-            self._workers.leave(address)
+            self._workers.release(address)
         self._tell(address)
         for fetch in self._fetches:
             fetch.fail(address, error)
@@ -224,7 +224,7 @@ class Assets:
 
     def _drop_asset_link(self) -> None:
         self._sockets.close_assets()
-        self._loader.cut_off()
+        self._loader.on_link_closed()
 
     def _call_back_assets(self) -> None:
         """Without the lock."""

@@ -12,14 +12,14 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Self
 
-from iris_session.client.arguments import checked_bytes, names_of
-from iris_session.client.core.connection import Connection
+from iris_session.client.arguments import encode_checked, to_names
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.driving import DEFAULT_TIMEOUT_S, Driving
 from iris_session.client.errors import NotConnectedError
 from iris_session.client.identity import Identity
-from iris_session.client.joining import wanted
+from iris_session.client.joining import parse_connect_request
 from iris_session.client.reporting import ArrivalMeter, Reporting
 from iris_session.client.requests import Requests
 from iris_session.client.sampling import Sampling
@@ -75,7 +75,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
         on_feedback: Callable[[Feedback], None] | None = None,
         on_denial: Callable[[Denial], None] | None = None,
     ) -> None:
-        self._wanted = wanted(address, session, curve, join_code)
+        self._wanted = parse_connect_request(address, session, curve, join_code)
         #: `HOST:PORT`, as soon as it is known.
         self.address = str(self._wanted.address or f"session {session!r}")
         if alignment is None:
@@ -88,13 +88,13 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
             role=role,
             name=name or role,
             software=software,
-            devices=names_of("devices", devices),
+            devices=to_names("devices", devices),
             # The session keeps our alignment over a lost connection only while this `run` lasts.
             capabilities=(*capabilities, f"run:{secrets.token_hex(8)}"),
             alignment=alignment,
         )
-        checked_bytes(hello)
-        self.connection = Connection(hello, identity)
+        encode_checked(hello)
+        self.connection = ClientConnection(hello, identity)
         self.on_state = on_state
         self.on_event = on_event
         self.on_missed = on_missed
@@ -132,9 +132,9 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
     def open(self) -> None:
         """Begins to join, without waiting: `poll` goes on with it until `ready`."""
         with self._lock:
-            if self.connection.phase is Phase.CLOSED:
+            if self.connection.phase is ConnectionPhase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
-            if self.connection.phase in (Phase.IDLE, Phase.REFUSED) and self._meeting is None:
+            if self.connection.phase in (ConnectionPhase.IDLE, ConnectionPhase.REFUSED) and self._meeting is None:
                 self._begin_meeting()
                 self._step_meeting()
 
@@ -148,7 +148,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
             thread.join()
         workers = None
         with self._lock:
-            if self.connection.phase is not Phase.CLOSED:
+            if self.connection.phase is not ConnectionPhase.CLOSED:
                 self._end_meeting()
                 workers = self._end_assets()
                 self.connection.close()
@@ -183,7 +183,7 @@ class Client(Driving, Requests, Looking, Sampling, Reporting):
     @property
     def ready(self) -> bool:
         """Joined, with snapshot and clock. False while reconnecting, and after the thread of `start` ended."""
-        return self.connection.phase is Phase.READY and self._crash is None
+        return self.connection.phase is ConnectionPhase.READY and self._crash is None
 
     @property
     def name(self) -> str:

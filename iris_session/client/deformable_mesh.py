@@ -37,7 +37,7 @@ class DeformableMesh:
     rows: NDArray[np.int32]
     look: Deformable
 
-    def looking(self, look: Deformable) -> DeformableMesh:
+    def with_look(self, look: Deformable) -> DeformableMesh:
         """The same with another look."""
         return self if look == self.look else replace(self, look=look)
 

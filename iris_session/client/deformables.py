@@ -53,7 +53,7 @@ class _Mesh:
         self.seq = -1
         self.fault = ""
 
-    def placed(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
+    def place_vertices(self, p_world: NDArray[np.float32]) -> NDArray[np.float32]:
         """By number in the model; what is inside of a solid is not a number."""
         if not self.numbered:
             return p_world
@@ -96,9 +96,9 @@ class Deformables:
     def fault(self) -> str:
         return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
-    def tend(self) -> list[str]:
+    def update(self) -> list[str]:
         """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
-        now = self._client.scene_now  # the thread of `start` may be about to hear of another
+        now = self._client.scene.version  # the thread of `start` may be about to hear of another
         if now is None:  # it has heard of one, and not yet of which
             return []
         if self._client.ready:
@@ -131,14 +131,14 @@ class Deformables:
 
     def _begin(self) -> None:
         if is_address(self._asked):
-            self._fetch = self._client.fetch_assets([self._asked])
+            self._fetch = self._client.assets.fetch([self._asked])
         else:
             self._use([], self._asked)
             self._fault = "this session shares no specification of its scene"
 
     def _cancel(self) -> None:
         if self._fetch is not None:
-            self._client.cancel_assets(self._fetch)
+            self._client.assets.cancel(self._fetch)
         self._fetch = self._parts = None
 
     def _take(self, fetch: AssetFetch) -> None:
@@ -149,9 +149,9 @@ class Deformables:
             if self._parts is None:
                 self._parts = decode_scene(fetch.view(self._asked)).deformables
                 here = {_identity(mesh.key, mesh) for mesh in self._meshes}
-                named = zip(keys(self._parts), self._parts, strict=True)
+                named = zip(deformable_keys(self._parts), self._parts, strict=True)
                 if new := [part.address for key, part in named if _identity(key, part) not in here]:
-                    self._fetch = self._client.fetch_assets(new)
+                    self._fetch = self._client.assets.fetch(new)
                     return
             self._use(self._made(self._parts, fetch), self._asked)
         except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
@@ -162,7 +162,7 @@ class Deformables:
         """The meshes of a scene: of those that are here already, the very same."""
         here = {_identity(mesh.key, mesh): mesh for mesh in self._meshes}
         found = []
-        for key, part in zip(keys(parts), parts, strict=True):
+        for key, part in zip(deformable_keys(parts), parts, strict=True):
             mesh = here.get(_identity(key, part))
             found.append(_Mesh(key, part, fetch.view(part.address)) if mesh is None else mesh)
         for mesh, part in zip(found, parts, strict=True):  # nothing of it has failed
@@ -174,13 +174,13 @@ class Deformables:
         kept = [mesh for mesh in self._meshes if mesh in meshes]
         gone = [mesh for mesh in self._meshes if mesh not in meshes]
         for stream in {mesh.stream for mesh in gone} - {mesh.stream for mesh in kept}:
-            self._client.drop_media(stream)
+            self._client.media.unsubscribe(stream)
         for mesh in gone:
             self.vertices.pop(mesh.key, None)
             self.capture_ns.pop(mesh.key, None)
         for mesh in meshes:
             if mesh not in kept:
-                mesh.feed = self._client.media(mesh.stream)
+                mesh.feed = self._client.media.subscribe(mesh.stream)
         self._meshes, self.scene_hash = meshes, scene_hash
         self._parked, self._fault = False, ""
 
@@ -202,7 +202,7 @@ class Deformables:
             return False
         mesh.seq = frame.header.seq
         try:
-            self.vertices[mesh.key] = mesh.placed(mesh.decoder.decode(frame.data))
+            self.vertices[mesh.key] = mesh.place_vertices(mesh.decoder.decode(frame.data))
         except StreamError as error:
             mesh.fault = str(error)
             return False
@@ -216,7 +216,7 @@ def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
     return key, part.stream, part.address
 
 
-def keys(parts: Sequence[Deformable]) -> list[str]:
+def deformable_keys(parts: Sequence[Deformable]) -> list[str]:
     """What tells deformables apart: the name of each, where it has one that no other has; else its stream."""
     names = [part.name for part in parts]
     found: list[str] = []

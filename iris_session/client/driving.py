@@ -11,11 +11,11 @@ from typing import Self
 import zmq
 
 from iris_session.client.assets import Assets
-from iris_session.client.core.receiving import Told
+from iris_session.client.core.receiving import InboxMessage
 from iris_session.client.core.state_stream import SceneState
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import ClientError, NotConnectedError
-from iris_session.client.group import milliseconds
+from iris_session.client.group import to_milliseconds
 from iris_session.client.joining import Joining
 from iris_session.client.media import Media
 from iris_session.client.reporting import ArrivalMeter
@@ -60,7 +60,7 @@ class Driving(SceneView, Media, Assets, Joining):
         looked = self._looked and timeout_s > 0.0
         while True:
             progressed = not looked and self._pump()
-            self._looked = progressed and self.connection.joined and self._loads_assets
+            self._looked = progressed and self.connection.is_joined and self._loads_assets
             looked = False
             now = time.monotonic_ns()
             if progressed or now >= deadline:
@@ -102,7 +102,7 @@ class Driving(SceneView, Media, Assets, Joining):
 
         Returns the one that state comes by: `poll_state` is enough when only that wakes.
         """
-        if self.connection.phase is Phase.CLOSED:
+        if self.connection.phase is ConnectionPhase.CLOSED:
             return None
         return self._sockets.register(poller, sending=self.connection.peek_outgoing() is not None)
 
@@ -146,7 +146,7 @@ class Driving(SceneView, Media, Assets, Joining):
     def _pump(self) -> bool:
         """One round without waiting: state first, then control, timers, sending, callbacks."""
         with self._lock:
-            if self.connection.phase is Phase.CLOSED:
+            if self.connection.phase is ConnectionPhase.CLOSED:
                 raise NotConnectedError(self.connection.describe())
             phase = self.connection.phase
             if self._workers is not None:
@@ -154,26 +154,26 @@ class Driving(SceneView, Media, Assets, Joining):
             self._step_meeting()
         progressed = self.poll_state()
         with self._lock:
-            gone = self._sockets.disconnected() and self._generation == self.connection.generation
+            gone = self._sockets.poll_disconnect() and self._generation == self.connection.generation
             progressed |= self._drain_control()  # the last words of a session before its end
             if gone and self._generation == self.connection.generation:
-                self.connection.lost(time.monotonic_ns())
+                self.connection.handle_disconnect(time.monotonic_ns())
             self._look_who_answered()
             self.connection.tick(time.monotonic_ns())
-            report = self._arrivals.take(self.connection, time.monotonic_ns())
+            report = self._arrivals.poll_report(self.connection, time.monotonic_ns())
             if report is not None:
                 self.connection.send(self._with_media(report, time.monotonic_ns()))
             self._flush()
             progressed |= self._tend_media()
             progressed |= self._tend_assets()
-            if self.connection.phase is Phase.REFUSED:
-                self._sockets.hang_up()
+            if self.connection.phase is ConnectionPhase.REFUSED:
+                self._sockets.disconnect()
             progressed |= self.connection.phase is not phase
             inbox = [self.connection.inbox.popleft() for _ in range(len(self.connection.inbox))]
             for message in inbox:
                 if isinstance(message, Feedback):
                     self.feedback[message.robot] = message
-            if self.feedback and not self.connection.joined:
+            if self.feedback and not self.connection.is_joined:
                 self.feedback = {}  # nobody tells what the robots do now
         for message in inbox:
             self._call_back(message)
@@ -185,13 +185,13 @@ class Driving(SceneView, Media, Assets, Joining):
         local_ns = time.monotonic_ns()
         state = self.connection.stream.drain(messages, self.connection.clock.session_ns(local_ns), local_ns)
         local_ns = time.monotonic_ns()
-        if state is not None and not self.connection.stream.still_fresh(local_ns):
+        if state is not None and not self.connection.stream.check_fresh(local_ns):
             state = None
         if state is not None:
             now_ns = self.connection.clock.session_ns(local_ns)  # decoding is part of the age
             state = SceneState(state.header, state.poses, now_ns, now_ns - state.header.session_time)
             self._state = state
-            self._arrivals.delivered(state)
+            self._arrivals.record(state)
         return state, bool(messages)
 
     def _drain_control(self) -> bool:
@@ -199,7 +199,7 @@ class Driving(SceneView, Media, Assets, Joining):
         now_ns = time.monotonic_ns()  # after receiving: a pong stamped too early would understate its round trip
         for frames in messages:
             self.connection.receive(frames, now_ns)
-        if self.connection.joined and self.connection.welcome is not None:
+        if self.connection.is_joined and self.connection.welcome is not None:
             if self.connection.welcome.session_id != self._session_id:
                 self._session_id, self._state = self.connection.welcome.session_id, None
             self._sockets.open_state(self.connection.welcome.endpoints.state, self._generation)
@@ -216,7 +216,7 @@ class Driving(SceneView, Media, Assets, Joining):
                 return
             self.connection.pop_outgoing(sent=sent)
 
-    def _call_back(self, message: Told) -> None:
+    def _call_back(self, message: InboxMessage) -> None:
         if isinstance(message, Event) and self.on_event is not None:
             self.on_event(message)
         elif isinstance(message, Missed) and self.on_missed is not None:
@@ -230,7 +230,7 @@ class Driving(SceneView, Media, Assets, Joining):
         poller = zmq.Poller()
         self.register(poller)
         self._sockets.register_wake(poller)
-        poller.poll(milliseconds(timeout_ns))
+        poller.poll(to_milliseconds(timeout_ns))
         self._sockets.clear_wake()
 
     def _run(self) -> None:

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import LISTEN_S, BeaconListener, FoundSession, ask_introduction, plausible
+from iris_session.client.discovery import LISTEN_S, BeaconListener, FoundSession, request_introduction, is_plausible
 from iris_session.client.errors import NotConnectedError, SessionNameError, TrustError
-from iris_session.client.known_servers import Trust
-from iris_session.client.pairing import key_name, pair_key
+from iris_session.client.known_servers import ServerTrust
+from iris_session.client.pairing import default_key_name, pair_key
 from iris_session.client.sockets import CurveKeys
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
@@ -33,7 +33,7 @@ STEP_NS: Final = 5_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ConnectRequest:
     """What was given: `address` (without name), or the name `session`. `join_code`: to pair with where needed."""
 
     address: Address | None
@@ -43,7 +43,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Met:
+class Endpoint:
     """Where to say hello, and with which keys. `session_id`: as it introduced itself; empty: it did not.
 
     `store`: the key is trusted at first sight and is to be stored when the session lets us in.
@@ -55,27 +55,27 @@ class Met:
     session: str = ""
     store: bool = False
 
-    def keep(self) -> None:
+    def store_key(self) -> None:
         """Stores the session's key. Raises `TrustError` when another one was stored meanwhile."""
         if self.store and self.curve is not None:
-            Trust(KeyHome(), self.address).store(self.session, self.curve.server_public.decode())
+            ServerTrust(KeyHome(), self.address).store(self.session, self.curve.server_public.decode())
 
 
-class Meeting:
+class EndpointResolver:
     """Goes on until it works, fails for good, or nobody asks any more. `note`: why it still waits."""
 
-    def __init__(self, wanted: Wanted, *, repair: bool = False) -> None:
+    def __init__(self, wanted: ConnectRequest, *, repair: bool = False) -> None:
         self.note = ""
         self._wanted = wanted
         self._repair = repair  # the session has said that our key is not on its list: pair although its key is known
         self._steps = self._meet()
 
-    def step(self) -> Met | None:
+    def step(self) -> Endpoint | None:
         """Goes on without waiting; `None` while there is no result. Raises `ClientError` when there will be none."""
         try:
             next(self._steps)
         except StopIteration as done:
-            met: Met = done.value
+            met: Endpoint = done.value
             return met
         except KeysError as error:
             raise TrustError(str(error)) from error
@@ -85,10 +85,10 @@ class Meeting:
         """Gives up; frees what is open."""
         self._steps.close()
 
-    def _meet(self) -> Generator[None, None, Met]:
+    def _meet(self) -> Generator[None, None, Endpoint]:
         wanted = self._wanted
         if wanted.curve is not None and wanted.address is not None:
-            return Met(wanted.address, wanted.curve)
+            return Endpoint(wanted.address, wanted.curve)
         while True:
             address, found = wanted.address, None
             if address is None:
@@ -105,7 +105,7 @@ class Meeting:
         with BeaconListener() as listener:
             heard_at: float | None = None
             while True:
-                sessions = listener.sessions()
+                sessions = listener.poll_sessions()
                 named = [one for one in sessions if one.name == name]
                 if named and heard_at is None:
                     heard_at = time.monotonic()
@@ -124,7 +124,7 @@ class Meeting:
     def _introduction(self, address: Address) -> Generator[None, None, Introduction | None]:
         patience_s = LOOPBACK_INTRODUCTION_S if is_loopback(address.host) else INTRODUCTION_S
         try:
-            introduction = yield from ask_introduction(address.host, address.port, patience_s)
+            introduction = yield from request_introduction(address.host, address.port, patience_s)
         except ProtocolError as error:
             self.note = f"what introduces itself at {address} cannot be understood: {error}"
             return None
@@ -138,18 +138,18 @@ class Meeting:
         if introduction.beacon.control != address.port:
             self.note = f"the session below {address} is another one, on port {introduction.beacon.control}"
             return None  # a forwarded port, or the neighbour of one
-        if not plausible(introduction.beacon):
+        if not is_plausible(introduction.beacon):
             self.note = f"what introduces itself at {address} is no session"
             return None
         return introduction
 
     def _trusted(
         self, address: Address, found: FoundSession | None, introduction: Introduction | None
-    ) -> Generator[None, None, Met | None]:
+    ) -> Generator[None, None, Endpoint | None]:
         """Decides on the key, and pairs where that is wanted; `None`: nothing can be decided yet."""
         home, code = KeyHome(), self._wanted.join_code or address.join_code
-        trust = Trust(home, address, found.name if found is not None else "")
-        key = trust.key(None if introduction is None else introduction.server_key, loopback=is_loopback(address.host))
+        trust = ServerTrust(home, address, found.name if found is not None else "")
+        key = trust.select_key(None if introduction is None else introduction.server_key, loopback=is_loopback(address.host))
         session_id = "" if introduction is None else introduction.beacon.session_id
         name = address.session if introduction is None else introduction.beacon.session_name
         if found is not None and session_id not in ("", found.session_id):
@@ -157,21 +157,21 @@ class Meeting:
                 f"what answers at {address} is not the session {found.name!r} heard there: try again"
             )
         if not key:
-            return None if key is None else Met(address, None, session_id, name)
+            return None if key is None else Endpoint(address, None, session_id, name)
         own = home.identity()
-        if code and (self._repair or not trust.familiar(key)):
+        if code and (self._repair or not trust.is_known(key)):
             self.note = f"pairing with the session at {address}"
-            yield from pair_key(address, key, own, code, key_name())
+            yield from pair_key(address, key, own, code, default_key_name())
             trust.store(name, key)
         else:
             trust.check_name(key)
         curve = CurveKeys(key.encode(), own.public.encode(), own.secret.encode())
-        return Met(address, curve, session_id, name, store=not trust.stored)
+        return Endpoint(address, curve, session_id, name, store=not trust.stored)
 
 
-def settle(wanted: Wanted, timeout_s: float) -> Met:
+def resolve_blocking(wanted: ConnectRequest, timeout_s: float) -> Endpoint:
     """The whole meeting, waiting. Raises `ClientError`; `NotConnectedError` when it took longer than `timeout_s`."""
-    meeting = Meeting(wanted)
+    meeting = EndpointResolver(wanted)
     until = time.monotonic() + timeout_s
     try:
         while (met := meeting.step()) is None:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 import zmq
 
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 
 if TYPE_CHECKING:
     from iris_session.client.client import Client
 
 
-def milliseconds(nanoseconds: int) -> int:
+def to_milliseconds(nanoseconds: int) -> int:
     """Rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
     return max(0, -(-nanoseconds // 1_000_000))
 
@@ -62,13 +62,13 @@ class ClientGroup:
     def _wait(self, timeout_s: float) -> tuple[list[Client], list[Client]]:
         """Clients for whom state came, and those for whom anything else came or whose timer is due."""
         now = time.monotonic_ns()
-        clients = [client for client in self.clients if client.connection.phase is not Phase.CLOSED]
+        clients = [client for client in self.clients if client.connection.phase is not ConnectionPhase.CLOSED]
         due = [client.connection.next_deadline_ns(now) for client in clients]
         deadline = min((now + int(timeout_s * 1e9), *due))
         registered = [client.registration for client in self.clients]
         if registered != self._registered:
             self._register(registered)
-        woken = [self._owners[_key(sock)] for sock, _ in self._poller.poll(milliseconds(deadline - now))]
+        woken = [self._owners[_poller_key(sock)] for sock, _ in self._poller.poll(to_milliseconds(deadline - now))]
         now = time.monotonic_ns()
         rest = [c for c, due_ns in zip(clients, due, strict=True) if due_ns <= now]
         rest += [c for c, only_state in woken if not only_state and c not in rest]
@@ -82,10 +82,10 @@ class ClientGroup:
             first = len(self._poller.sockets)
             state = client.register(self._poller)
             for sock, _ in self._poller.sockets[first:]:
-                self._owners[_key(sock)] = client, sock is state
+                self._owners[_poller_key(sock)] = client, sock is state
 
 
-def _key(sock: zmq.Socket[bytes] | int) -> int:
+def _poller_key(sock: zmq.Socket[bytes] | int) -> int:
     """What a poller calls a socket: itself one of ZeroMQ, by its descriptor any other."""
     return sock if isinstance(sock, int) else id(sock)
 

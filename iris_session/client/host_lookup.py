@@ -46,14 +46,14 @@ _lock = threading.Lock()
 _lookups: dict[str, _Lookup] = {}
 
 
-def resolve(host: str, until_s: float) -> Generator[None, None, str]:
+def resolve_host(host: str, until_s: float) -> Generator[None, None, str]:
     """Steps towards the network address of `host`; yields wherever it would wait, until `until_s` (`time.monotonic()`).
 
     A name means IPv4, as on the sockets that say hello. Raises `OSError`: no such name, no answer.
     """
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))
-    lookup = _ask(host, socket.AF_INET6 if ":" in host else socket.AF_INET)
+    lookup = _start_lookup(host, socket.AF_INET6 if ":" in host else socket.AF_INET)
     while lookup.answer is None:
         if time.monotonic() > until_s:
             raise TimeoutError(errno.ETIMEDOUT, f"the name {host} is still looked up")
@@ -63,7 +63,7 @@ def resolve(host: str, until_s: float) -> Generator[None, None, str]:
     return lookup.answer
 
 
-def _ask(host: str, family: socket.AddressFamily) -> _Lookup:
+def _start_lookup(host: str, family: socket.AddressFamily) -> _Lookup:
     with _lock:
         now_s = time.monotonic()
         for name, one in list(_lookups.items()):

@@ -10,7 +10,7 @@ from iris_session.client.errors import TrustError
 from iris_session.security import KeyHome, KeysError, KnownServer, fingerprint, raw_key
 
 
-class Trust:
+class ServerTrust:
     """What this user knows of the session at `address`, called `session` (empty: not asked for by name)."""
 
     def __init__(self, home: KeyHome, address: Address, session: str = "") -> None:
@@ -24,11 +24,11 @@ class Trust:
         """The key (Z85) stored for the address, empty for none."""
         return next((one.key for one in self._known if one.address == str(self._address)), "")
 
-    def familiar(self, key: str) -> bool:
+    def is_known(self, key: str) -> bool:
         """Whether this key is known, by whatever address: the machine has moved, or has several."""
         return any(one.key == key for one in self._known)
 
-    def key(self, offered: str | None, *, loopback: bool) -> str | None:
+    def select_key(self, offered: str | None, *, loopback: bool) -> str | None:
         """The key to use when the session offers `offered` (empty: it does not encrypt; `None`: it says nothing).
 
         Empty: without encryption, which is for loopback only. `None`: nothing can be known yet. Raises `TrustError`.
@@ -50,9 +50,9 @@ class Trust:
     def check_name(self, key: str) -> None:
         """A name that is known with another key is not trusted at first sight: anybody can use it in a beacon."""
         named: list[KnownServer] = [one for one in self._known if self._session and one.session == self._session]
-        if named and not self.familiar(key):
+        if named and not self.is_known(key):
             raise TrustError(
-                f"the session {self._session!r} at {self._address} has another key ({_mark(key)}) than the one known "
+                f"the session {self._session!r} at {self._address} has another key ({_fingerprint_or_none(key)}) than the one known "
                 f"by that name ({named[-1].fingerprint}): pair with it by a join code, or give its address if you "
                 "trust it"
             )
@@ -66,13 +66,13 @@ class Trust:
 
     def _differs(self, trusted: str, other: str, what: str) -> TrustError:
         return TrustError(
-            f"{self._address} is known with the key {_mark(trusted)}, but {what} has {_mark(other)}: somebody else "
+            f"{self._address} is known with the key {_fingerprint_or_none(trusted)}, but {what} has {_fingerprint_or_none(other)}: somebody else "
             "answers there, or its keys were made anew; if you know that they were: "
             f"iris-session keys forget {self._address}"
         )
 
 
-def _mark(key: str) -> str:
+def _fingerprint_or_none(key: str) -> str:
     return fingerprint(raw_key(key)) if key else "none"
 
 

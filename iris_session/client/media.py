@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from iris_session.client.core.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import InvalidMessageError, NotConnectedError
 from iris_session.client.reporting import PERIOD_NS
 from iris_session.client.sockets import ClientSockets
@@ -47,7 +47,7 @@ class MediaFeed:
     dropped: int = 0
     _taken: MediaFrame | None = field(default=None, repr=False)
 
-    def take(self) -> MediaFrame | None:
+    def pop_newest(self) -> MediaFrame | None:
         """The newest frame, once: None until there is another."""
         if self.newest is self._taken:
             return None
@@ -58,11 +58,11 @@ class MediaFeed:
 class Media:
     """Part of `Client`."""
 
-    connection: Connection
+    connection: ClientConnection
     _sockets: ClientSockets
     _lock: threading.RLock
     #: We want no more media than this, 0 for no limit of our own.
-    media_limit_mbit_per_s: float = 0.0
+    media_DOT_limit_mbit_per_s: float = 0.0
 
     @abstractmethod
     def session_now_ns(self) -> int: ...
@@ -79,10 +79,10 @@ class Media:
         self._media_ages: list[int] = []
         self._media_since_ns = 0
         #: Media messages that do not fit the protocol; and frames of a stream that was dropped before they came.
-        self.media_malformed = 0
-        self.media_late = 0
+        self.media_DOT_malformed = 0
+        self.media_DOT_late = 0
 
-    def media(self, stream: str) -> MediaFeed:
+    def media_DOT_subscribe(self, stream: str) -> MediaFeed:
         """Subscribes to a media stream; one that is not there yet comes when it is. The same feed for the same name.
 
         Raises `InvalidMessageError` for what cannot be the name of a stream.
@@ -94,19 +94,19 @@ class Media:
                 self._subscribe_soon()
             return self._feeds[stream]
 
-    def drop_media(self, stream: str) -> None:
+    def media_DOT_unsubscribe(self, stream: str) -> None:
         """Ends a subscription."""
         with self._lock:
             if self._feeds.pop(stream, None) is not None:
                 self._subscribe_soon()
 
     @property
-    def delivery(self) -> DeliveryBudget | None:
+    def media_DOT_delivery(self) -> DeliveryBudget | None:
         """What the session gives us of every stream that there is, and why; None until it has told."""
         told = self.connection.latest.get(DeliveryBudget)
         return told if isinstance(told, DeliveryBudget) else None
 
-    def publish_media(
+    def media_DOT_publish(
         self,
         stream: str,
         frames: bytes | Mapping[str, bytes],
@@ -119,7 +119,7 @@ class Media:
         `capture_ns`: session time. False: the link takes nothing now, the frame is dropped.
         """
         welcome = self.connection.welcome
-        if welcome is None or not self.connection.joined:
+        if welcome is None or not self.connection.is_joined:
             raise NotConnectedError(self.connection.describe())
         now_ns = self.session_now_ns() if capture_ns is None else capture_ns
         try:
@@ -138,8 +138,8 @@ class Media:
             self._sockets.close_media()
             self._subscribed.clear()
             self.connection.latest.pop(DeliveryBudget, None)
-        told = self.delivery
-        if told is None or not self.connection.joined:
+        told = self.media_DOT_delivery
+        if told is None or not self.connection.is_joined:
             return False
         classes = {budget.stream: budget.budget_class for budget in told.streams}
         for feed in self._feeds.values():
@@ -158,7 +158,7 @@ class Media:
         """To what is asked for, and to nothing else. The session has to tell first what we get: only then it knows
         whose subscription it is."""
         welcome = self.connection.welcome
-        if self.delivery is None or welcome is None or self._media_generation != self.connection.generation:
+        if self.media_DOT_delivery is None or welcome is None or self._media_generation != self.connection.generation:
             return
         if not self._sockets.has_media:
             self._subscribed.clear()
@@ -178,11 +178,11 @@ class Media:
                 _, head, data = frames
                 header = decode_media_header(head)
             except (ProtocolError, ValueError):
-                self.media_malformed += 1
+                self.media_DOT_malformed += 1
                 continue
             feed = self._feeds.get(header.stream)
             if feed is None:  # it was under way when we let go of the stream
-                self.media_late += 1
+                self.media_DOT_late += 1
                 continue
             feed.superseded += feed.stream in seen
             seen.add(feed.stream)
@@ -210,7 +210,7 @@ class Media:
             received / elapsed_ns * 1e9,
             0.0 if ages is None else ages.p50,
             report.display_hz,
-            self.media_limit_mbit_per_s,
+            self.media_DOT_limit_mbit_per_s,
         )
 
 

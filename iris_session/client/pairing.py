@@ -30,7 +30,7 @@ MAX_NAME: Final = 64  # as `protocol.common.Name`
 MAX_ANSWER_BYTES: Final = 65_536
 
 
-def key_name() -> str:
+def default_key_name() -> str:
     """Under which the allow-list shows the key of this user and machine."""
     try:
         user = getpass.getuser()
@@ -61,7 +61,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
         asking.curve_publickey = own.public.encode()
         asking.curve_secretkey = own.secret.encode()
         asking.connect(f"tcp://{address}")
-        answer = yield from _ask(asking, encode_client(envelope(request)), address)
+        answer = yield from _request_pairing(asking, encode_client(envelope(request)), address)
     finally:
         asking.close()
     if not pairing.same(answer.proof, pairing.server_proof(secret, server_public, own.raw_public)):
@@ -72,13 +72,13 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
     return answer
 
 
-def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
+def _request_pairing(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
     """Asks until there is an answer that stays. Raises as `pair_key`."""
     until = time.monotonic() + PATIENCE_S
     while True:
         asking.send(request)
         try:
-            return (yield from _answer(asking, address))
+            return (yield from _receive_answer(asking, address))
         except RefusedError as refused:
             if refused.code != RefusalCode.RATE or time.monotonic() > until:
                 raise
@@ -90,7 +90,7 @@ def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generat
             yield
 
 
-def _answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None, Paired]:
+def _receive_answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None, Paired]:
     """Raises `TimeoutError` after a while without a word, and as `pair_key`."""
     until = time.monotonic() + ANSWER_S
     while True:

@@ -8,9 +8,9 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Final, Self
 
-from iris_session.client.core.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError
 from iris_session.protocol.status import ClientReport, GetStatus, Quantiles, StatusReport, quantiles
 
@@ -34,7 +34,7 @@ class ArrivalMeter:
         self._bytes = 0
         self._since_ns = -1
 
-    def delivered(self, state: SceneState) -> None:
+    def record(self, state: SceneState) -> None:
         """A frame was handed to the application.
 
         One that is sent again, because its source is silent, is as old as that silence, and says nothing of its way.
@@ -49,9 +49,9 @@ class ArrivalMeter:
             self._ages_ns.append(state.age_ns)
         self._shown_ns = state.header.session_time
 
-    def take(self, connection: Connection, now_ns: int) -> ClientReport | None:
+    def poll_report(self, connection: ClientConnection, now_ns: int) -> ClientReport | None:
         """The report of the last second, when it is due and there is a session to tell it."""
-        if not connection.joined:
+        if not connection.is_joined:
             self._since_ns, self._seq, self._ages, self._shown_ns = -1, 0, None, -1
             return None
         received = connection.stream.counters.bytes_received
@@ -83,7 +83,7 @@ class ArrivalMeter:
 class Reporting:
     """Mixin of `Client`: asks the session how it does."""
 
-    connection: Connection
+    connection: ClientConnection
     _lock: threading.RLock
 
     @abstractmethod
@@ -122,6 +122,6 @@ class Reporting:
         raise RequestTimeoutError(f"no status within {timeout_s:g} s")
 
 
-def _ask(connection: Connection) -> bool:
+def _ask(connection: ClientConnection) -> bool:
     """False: nobody to ask now. While joining there is: whoever takes our hello also takes the question."""
-    return (connection.joined or connection.phase is Phase.JOINING) and connection._queue(GetStatus())
+    return (connection.is_joined or connection.phase is ConnectionPhase.JOINING) and connection._queue(GetStatus())

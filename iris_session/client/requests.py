@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import msgspec
 
-from iris_session.client.arguments import Numbers, PoseLike, names_of, numbers, pose_of, text_of
-from iris_session.client.core.connection import Connection
+from iris_session.client.arguments import Numbers, PoseLike, to_names, to_numbers, to_pose, to_text
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import DeniedError, InvalidMessageError, NotConnectedError, RequestTimeoutError
 from iris_session.protocol.client_messages import (
     Acquire,
@@ -40,7 +40,7 @@ from iris_session.protocol.server_messages import Reply
 class Requests:
     """Mixin of `Client`: everything a participant can ask for."""
 
-    connection: Connection
+    connection: ClientConnection
     _lock: threading.RLock
 
     @abstractmethod
@@ -72,7 +72,7 @@ class Requests:
     def answer(self, request_id: int) -> Reply | None:
         """The reply to a submitted request, once; `None` while there is none. Look at its `denial`."""
         with self._lock:
-            return self.connection.answers.take(request_id)
+            return self.connection.requests.pop_reply(request_id)
 
     def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
         """Sends a message that has a `request_id` (which is filled in) and waits for its answer.
@@ -82,7 +82,7 @@ class Requests:
         """
         with self._lock:
             generation = self.connection.generation
-            fault_before = self.connection.not_taken
+            fault_before = self.connection.last_protocol_fault
             request_id = self.submit(message)
         replies: list[Reply] = []
 
@@ -90,18 +90,18 @@ class Requests:
             reply = client.answer(request_id)
             if reply is not None:
                 replies.append(reply)
-            lost = client.connection.generation != generation or not client.connection.joined
-            return reply is not None or client.connection.not_taken is not fault_before or lost
+            lost = client.connection.generation != generation or not client.connection.is_joined
+            return reply is not None or client.connection.last_protocol_fault is not fault_before or lost
 
         self.wait_for(answered, timeout_s)
         with self._lock:
-            self.connection.answers.forget(request_id)
+            self.connection.requests.discard(request_id)
         kind = type(message).__name__
         if not replies:
-            if self.connection.generation != generation or not self.connection.joined:
+            if self.connection.generation != generation or not self.connection.is_joined:
                 raise NotConnectedError(f"connection lost while waiting for the answer to {kind}")
-            if self.connection.not_taken is not fault_before and self.connection.not_taken is not None:
-                raise InvalidMessageError(f"{kind} was not taken: {self.connection.not_taken.message}")
+            if self.connection.last_protocol_fault is not fault_before and self.connection.last_protocol_fault is not None:
+                raise InvalidMessageError(f"{kind} was not taken: {self.connection.last_protocol_fault.message}")
             raise RequestTimeoutError(f"no answer to {kind} within {timeout_s:g} s")
         if replies[0].denial is not None:
             raise DeniedError(self._with_name(replies[0].denial))
@@ -129,12 +129,12 @@ class Requests:
         it. `weight`: share in mode `shared`.
         """
         return self.request(
-            Acquire(0, names_of("robots", robots), names_of("objects", objects), wait, weight), timeout_s
+            Acquire(0, to_names("robots", robots), to_names("objects", objects), wait, weight), timeout_s
         ).leases
 
     def release(self, *names: str) -> None:
         """Gives robots and objects back; without names all, and leaves every queue. Denied for what is not ours."""
-        names = names_of("release", names)
+        names = to_names("release", names)
         leases = self.connection.mirror.leases
         kinds = [leases[name].kind if name in leases else TargetKind.ROBOT for name in names]
         tokens = [self.lease_version(name) or 0 for name in names]
@@ -150,7 +150,7 @@ class Requests:
 
     def assign(self, robots: str | Iterable[str], participant: str = "") -> tuple[Lease, ...]:
         """Director: gives robots to a participant, or frees them."""
-        return self.request(Assign(0, names_of("robots", robots), participant)).leases
+        return self.request(Assign(0, to_names("robots", robots), participant)).leases
 
     def set_mode(self, robot: str, mode: str) -> None:
         """Director: changes the lease mode of a robot."""
@@ -162,11 +162,11 @@ class Requests:
         A director may set it for whoever holds them. Back to 1 with the next holder. Raises `DeniedError`: not ours, or
         out of range.
         """
-        return self.request(SetScale(0, names_of("robots", robots), scale)).leases
+        return self.request(SetScale(0, to_names("robots", robots), scale)).leases
 
     def place_alignment(self, participant: str, T_world_tracking: PoseLike, *, offset: bool = False) -> None:
         """Director: aligns a participant by hand, or adds an offset to the measured alignment."""
-        self.request(PlaceAlignment(0, participant, pose_of("T_world_tracking", T_world_tracking), offset))
+        self.request(PlaceAlignment(0, participant, to_pose("T_world_tracking", T_world_tracking), offset))
 
     def align(self, action: str, participant: str = "") -> None:
         """`start`: measures the alignment anew, from nothing; `stop`: keeps what is in force, whatever is seen.
@@ -180,7 +180,7 @@ class Requests:
 
         `force`: also further than 5 m from where it was. Raises `DeniedError` (`too_far`) without it.
         """
-        self.request(MoveAnchor(0, anchor_id, pose_of("T_world_anchor", T_world_anchor), force))
+        self.request(MoveAnchor(0, anchor_id, to_pose("T_world_anchor", T_world_anchor), force))
 
     def estop(self, reason: object = "") -> bool:
         """Stops everything, at once and latched. Does not wait for an answer. Not a safety-rated stop.
@@ -190,7 +190,7 @@ class Requests:
         protocol takes. Raises only `NotConnectedError`: this client was never opened, was closed, refused, or its
         thread has ended (it is sent nevertheless while the socket stands).
         """
-        return self.send(EStop(text_of(reason)))
+        return self.send(EStop(to_text(reason)))
 
     def clear_estop(self) -> None:
         """Ends the e-stop; robots hold until clutched again."""
@@ -211,7 +211,7 @@ class Requests:
     def new_tracking_frame(self) -> int:
         """The tracking frame jumped: our alignment is void. Returns the new tracking epoch."""
         epoch = self.connection.tracking_epoch = self.connection.tracking_epoch + 1
-        if self.connection.joined:  # else the next welcome is answered with it
+        if self.connection.is_joined:  # else the next welcome is answered with it
             self.send(TrackingEpoch(epoch))
         return epoch
 
@@ -235,14 +235,14 @@ class Requests:
         rx, ry, rz [rad]), tracking axes; without it the session assumes that of a headset's camera. `tracking_epoch`:
         of the tracking frame that it was seen in, by default the present one.
         """
-        stated = numbers("covariance", covariance)
+        stated = to_numbers("covariance", covariance)
         if len(stated) not in (0, 36):
             raise InvalidMessageError(f"covariance: expected 36 numbers, 6x6 row-major, or none, got {len(stated)}")
         self.send(
             Observation(
                 anchor_id=anchor_id,
                 kind=kind,
-                T_tracking_anchor=pose_of("T_tracking_anchor", T_tracking_anchor),
+                T_tracking_anchor=to_pose("T_tracking_anchor", T_tracking_anchor),
                 capture_ns=self.session_now_ns() if capture_ns is None else capture_ns,
                 tracking_epoch=self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch,
                 viewpoint_id=viewpoint_id,

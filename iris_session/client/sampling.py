@@ -7,8 +7,8 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, Final
 
-from iris_session.client.arguments import PoseLike, names_of, numbers, plain, pose_of
-from iris_session.client.core.connection import Connection
+from iris_session.client.arguments import PoseLike, to_names, to_numbers, to_python_scalar, to_pose
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import InvalidMessageError
 from iris_session.protocol.client_messages import ClientMessage, Sample, Samples
 from iris_session.protocol.common import Alignment, Target
@@ -21,7 +21,7 @@ ARRAYS: Final[dict[str, int | None]] = {"q": None, "qd": None, "hand_joints": No
 class Sampling:
     """Input of our devices."""
 
-    connection: Connection
+    connection: ClientConnection
     _lock: threading.RLock
     _seq: dict[str, int]
 
@@ -71,13 +71,13 @@ class Sampling:
         """
         for name, length in ARRAYS.items():
             if fields.get(name) is not None:
-                fields[name] = numbers(name, fields[name], length)
+                fields[name] = to_numbers(name, fields[name], length)
         if kind is None:
             kind = (
                 SampleKind.JOINTS if fields.get("q") else SampleKind.TWIST if fields.get("twist") else SampleKind.POSE
             )
-        fields = {name: plain(value) for name, value in fields.items()}
-        own_pose = None if pose is None else pose_of("pose", pose)
+        fields = {name: to_python_scalar(value) for name, value in fields.items()}
+        own_pose = None if pose is None else to_pose("pose", pose)
         with self._lock:
             targets = [*self._targets(robots, TargetKind.ROBOT), *self._targets(objects, TargetKind.OBJECT)]
             seq = self._seq[device] = self._seq.get(device, 0) + 1
@@ -98,7 +98,7 @@ class Sampling:
 
     def _targets(self, names: str | Iterable[str], kind: str) -> list[Target]:
         targets = []
-        for name in names_of(f"{kind}s", names):
+        for name in to_names(f"{kind}s", names):
             token = self.connection.lease_version(name)
             if token is not None:
                 targets.append(Target(name, token, kind))

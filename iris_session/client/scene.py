@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from anchors.pose import PoseTuple, compose
-from iris_session.client.core.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import Poses, SceneState
 from iris_session.protocol.common import Alignment
 from iris_session.protocol.server_messages import PresenceItem
@@ -24,7 +24,7 @@ def pose_at(poses: Poses, index: int) -> PoseTuple:
 class SceneView:
     """Everything is in the world frame. Nothing here waits or sends."""
 
-    connection: Connection
+    connection: ClientConnection
     _lock: threading.RLock
     _state: SceneState | None
 
@@ -39,7 +39,7 @@ class SceneView:
         return self.connection.mirror
 
     @property
-    def scene_now(self) -> tuple[str, str, int] | None:
+    def scene_DOT_version(self) -> tuple[str, str, int] | None:
         """Session id, scene hash and scene epoch, all of one moment; `None` while they are not known, as between
         hearing of another scene and its snapshot."""
         with self._lock:
@@ -49,22 +49,22 @@ class SceneView:
             return welcome.session_id, mirror.scene_hash, mirror.scene_epoch
 
     @property
-    def state(self) -> SceneState | None:
+    def scene_DOT_state(self) -> SceneState | None:
         """The newest scene: header, poses (n, 7) in the world, age where it was handed over."""
         return self._state
 
     @property
-    def tick_period_ns(self) -> int:
+    def scene_DOT_tick_period_ns(self) -> int:
         """Simulated time of one tick of the present scene [ns], 0 before the first welcome. Another scene that is
         loaded may have another."""
         welcome = self.connection.welcome
         return self.connection.mirror.tick_period_ns or (0 if welcome is None else welcome.tick_period_ns)
 
     @property
-    def presence(self) -> dict[tuple[str, str], PresenceItem]:
+    def scene_DOT_presence(self) -> dict[tuple[str, str], PresenceItem]:
         """Heads and hands of everyone who is connected by `(participant, device)`, as they are now."""
         with self._lock:
-            self.connection.stream.keep_presence(self.connection.mirror.connected)
+            self.connection.stream.retain_presence(self.connection.mirror.connected)
             return dict(self.connection.stream.presence)
 
     @property
@@ -76,7 +76,7 @@ class SceneView:
         """Session time now [ns], by our estimate; its error is at most `clock_error_ns()`."""
         return self.connection.clock.session_ns(time.monotonic_ns())
 
-    def data_age_ns(self) -> int | None:
+    def scene_DOT_data_age_ns(self) -> int | None:
         """Age of the newest scene [ns] now: it grows while nothing comes, whatever the reason, and while a program that
         publishes its world is silent. `None`: no scene yet.
 
@@ -89,7 +89,7 @@ class SceneView:
         """Bound of the error of `session_now_ns()` [ns]."""
         return self.connection.clock.error_bound_ns(time.monotonic_ns())
 
-    def body_pose(self, body: str) -> PoseTuple | None:
+    def scene_DOT_body_pose(self, body: str) -> PoseTuple | None:
         """`T_world_body` in the newest scene; `None` when there is no such body or no scene yet, as for a moment after
         another one was loaded.
 
@@ -99,7 +99,7 @@ class SceneView:
         poses, index = self._placed, self.connection.mirror.body_index.get(body)
         return None if poses is None or index is None or index >= len(poses) else pose_at(poses, index)
 
-    def tip_pose(self, robot: str) -> PoseTuple | None:
+    def scene_DOT_tip_pose(self, robot: str) -> PoseTuple | None:
         """`T_world_site` of a robot's end effector in the newest scene."""
         poses, tip = self._placed, self.connection.mirror.tip(robot)
         return None if poses is None or tip is None or tip[0] >= len(poses) else compose(pose_at(poses, tip[0]), tip[1])

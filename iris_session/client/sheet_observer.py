@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_rotate
-from iris_session.client.arguments import PoseLike, pose_of
-from iris_session.client.core.connection import Connection
+from iris_session.client.arguments import PoseLike, to_pose
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import ClientError, InvalidMessageError
 from iris_session.protocol.client_messages import ClientMessage, Observation
 from iris_session.protocol.common import Pose
@@ -34,14 +34,14 @@ VIEWPOINT_RAD: Final = 0.26
 CAMERA_SIGMA: Final = (0.001, 0.001)  # [m], [rad]
 
 
-class Viewpoints:
+class ViewpointCounter:
     """Numbers of viewpoints: the same number until the camera was moved elsewhere or its tracking frame jumped."""
 
     def __init__(self) -> None:
         self._number = 0
         self._from: tuple[int, PoseTuple] | None = None
 
-    def at(self, tracking_epoch: int, T_tracking_camera: PoseTuple) -> int:
+    def number_at(self, tracking_epoch: int, T_tracking_camera: PoseTuple) -> int:
         """The number of the viewpoint that the camera is at now."""
         if self._from is not None and self._from[0] == tracking_epoch:
             p, q = self._from[1]
@@ -56,9 +56,9 @@ class Viewpoints:
 class Looking:
     """Mixin of `Client`: sees sheets in pictures and reports them."""
 
-    connection: Connection
+    connection: ClientConnection
     _lock: threading.RLock
-    _viewpoints: Viewpoints
+    _viewpoints: ViewpointCounter
     _detector: Any
 
     @abstractmethod
@@ -68,7 +68,7 @@ class Looking:
     def send(self, message: ClientMessage) -> bool: ...
 
     def _init_looking(self) -> None:
-        self._viewpoints, self._detector = Viewpoints(), None
+        self._viewpoints, self._detector = ViewpointCounter(), None
 
     def observe_image(
         self,
@@ -96,12 +96,12 @@ class Looking:
         """
         epoch = self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
         now_ns = self.session_now_ns() if capture_ns is None else capture_ns
-        pose = pose_of("T_tracking_camera", T_tracking_camera)
+        pose = to_pose("T_tracking_camera", T_tracking_camera)
         T: PoseTuple = (pose.p, pose.q)
         found = [one for one in self._sightings(image, camera, sheets) if not one.ambiguous]
         if viewpoint_id is None:
             with self._lock:
-                viewpoint_id = self._viewpoints.at(epoch, T)
+                viewpoint_id = self._viewpoints.number_at(epoch, T)
         for one in found:
             self.send(
                 Observation(
@@ -113,7 +113,7 @@ class Looking:
                     viewpoint_id,
                     one.edge_m,
                     device=device,
-                    covariance=in_tracking(one.covariance, T, one.T_camera_sheet, camera_sigma),
+                    covariance=to_tracking_covariance(one.covariance, T, one.T_camera_sheet, camera_sigma),
                 )
             )
         return found
@@ -141,7 +141,7 @@ def _without(error: ImportError) -> ClientError:
     )
 
 
-def in_tracking(
+def to_tracking_covariance(
     covariance: Sequence[float],
     T_tracking_camera: PoseTuple,
     T_camera_sheet: PoseTuple,

@@ -82,7 +82,7 @@ class ClientSockets:
         self._wake_out.setblocking(False)
         self._wake_in.setblocking(False)
 
-    def aim(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
+    def set_target(self, host: str, control_port: int, curve: CurveKeys | None) -> None:
         """Where the sockets that are opened from now on go, and with which keys."""
         self._host = f"[{host}]" if ":" in host else host
         self._control_port = control_port
@@ -205,9 +205,9 @@ class ClientSockets:
             messages.append([frame.buffer for frame in self._assets.recv_multipart(_NOBLOCK, copy=False)])
         return messages
 
-    def assets_ended(self) -> bool:
+    def poll_assets_disconnect(self) -> bool:
         """True once after the assets channel lost its peer, and with it what it had been asked."""
-        return _told(self._assets_monitor)
+        return _poll_monitor(self._assets_monitor)
 
     def close_assets(self) -> None:
         """Ends the connection to the assets channel, and what was asked by it."""
@@ -247,9 +247,9 @@ class ClientSockets:
         """Whether something came on the state channel."""
         return _readable(self._state)
 
-    def disconnected(self) -> bool:
+    def poll_disconnect(self) -> bool:
         """True once after the control socket lost its peer."""
-        return _told(self._monitor)
+        return _poll_monitor(self._monitor)
 
     def register(self, poller: zmq.Poller, *, sending: bool) -> zmq.Socket[bytes] | None:
         """Adds the sockets that peers can wake to `poller`; `sending`: also that the control socket takes more.
@@ -269,7 +269,7 @@ class ClientSockets:
         """Adds what `wake` wakes to `poller`."""
         poller.register(self._wake_in.fileno(), zmq.POLLIN)
 
-    def wake_anybody(self) -> None:
+    def enable_wake_registration(self) -> None:
         """From now on `wake` wakes whoever waits for our sockets, not only our own `poll`."""
         self._wakes_anybody = True
         self.version += 1
@@ -285,7 +285,7 @@ class ClientSockets:
             while self._wake_in.recv(4096):
                 pass
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Disconnects, after a session has sent us away: libzmq would knock at its door for ever."""
         if self._control is not None or self._state is not None:
             self.version += 1
@@ -333,7 +333,7 @@ def _readable(sock: zmq.Socket[bytes] | None) -> TypeGuard[zmq.Socket[bytes]]:
     return sock is not None and bool(sock.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
 
 
-def _told(monitor: zmq.Socket[bytes] | None) -> bool:
+def _poll_monitor(monitor: zmq.Socket[bytes] | None) -> bool:
     """Whether a monitor has told something since the last look."""
     told = False
     while _readable(monitor):

@@ -18,7 +18,7 @@ def test_what_is_here_can_be_read_or_looked_at_where_it_lies(tmp_path: Path) -> 
     cache = AssetCache(tmp_path)
     here = stored(cache, b"bytes of an asset")
     fetch = AssetFetch(cache, [here, LOST, WAITED], {here: 17}, None, None)
-    fetch.found(here, 17, (), fetched=True)
+    fetch.on_found(here, 17, (), fetched=True)
     fetch.fail(LOST, AssetError(LOST, "unknown", "nobody has it"))
     assert fetch.read(here) == fetch.view(here) == b"bytes of an asset"
     assert isinstance(fetch.view(here).obj, mmap.mmap), "a large one is not in memory twice"

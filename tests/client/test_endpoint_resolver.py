@@ -16,9 +16,9 @@ from iris_session.client import Client, ClientError, NotConnectedError, RefusedE
 from iris_session.client import endpoint_resolver as meeting_module
 from iris_session.client import pairing as pairing_module
 from iris_session.client.address import Address, pairing_uri
-from iris_session.client.discovery import ask_introduction
-from iris_session.client.endpoint_resolver import settle
-from iris_session.client.joining import wanted
+from iris_session.client.discovery import request_introduction
+from iris_session.client.endpoint_resolver import resolve_blocking
+from iris_session.client.joining import parse_connect_request
 from iris_session.client.pairing import pair_key
 from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
@@ -141,7 +141,7 @@ def test_two_sessions_of_one_name_are_told_by_address(lab: Lab) -> None:
 
 def test_a_name_that_nobody_has_lists_those_that_were_heard(lab: Lab) -> None:
     with pytest.raises(NotConnectedError, match=rf"'no-such' was not heard.*{lab.name} \({lab.address}\)"):
-        settle(wanted("", "no-such", None, ""), 0.6)
+        resolve_blocking(parse_connect_request("", "no-such", None, ""), 0.6)
     client = Client(session="no-such")
     with pytest.raises(NotConnectedError, match="was not heard"):
         client.connect(0.3)
@@ -155,7 +155,7 @@ def introduced_as(change: Callable[[Introduction], Introduction]) -> Ask:
     """`ask_introduction` with another answer: somebody else on the port below the control port."""
 
     def ask(host: str, port: int, timeout_s: float) -> Generator[None, None, Introduction]:
-        return change((yield from ask_introduction(host, port, timeout_s)))
+        return change((yield from request_introduction(host, port, timeout_s)))
 
     return ask
 

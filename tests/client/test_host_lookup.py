@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator
 import pytest
 
 from iris_session.client import host_lookup as resolving
-from iris_session.client.host_lookup import MAX_LOOKUPS, resolve
+from iris_session.client.host_lookup import MAX_LOOKUPS, resolve_host
 
 PATIENCE_S = 30.0
 
@@ -42,7 +42,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[NameServer]:
 
 
 def steps(host: str, patience_s: float = PATIENCE_S) -> Generator[None, None, str]:
-    return resolve(host, time.monotonic() + patience_s)
+    return resolve_host(host, time.monotonic() + patience_s)
 
 
 def end(asking: Generator[None, None, str]) -> str:

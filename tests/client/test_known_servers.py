@@ -9,7 +9,7 @@ from zmq.utils import z85
 
 from iris_session.client import TrustError
 from iris_session.client.address import Address
-from iris_session.client.known_servers import Trust, known_fingerprints
+from iris_session.client.known_servers import ServerTrust, known_fingerprints
 from iris_session.security import KeyHome
 
 A, B = (z85.encode(bytes([first] * 32)).decode() for first in (1, 2))
@@ -44,7 +44,7 @@ def test_the_key_that_is_used(
     if stored:
         home.servers.pin(str(LAB), "lab-1", stored)
     address = Address(LAB.host, LAB.port, given)
-    assert Trust(home, address).key(offered, loopback=loopback) == used
+    assert ServerTrust(home, address).select_key(offered, loopback=loopback) == used
 
 
 @pytest.mark.parametrize(
@@ -65,9 +65,9 @@ def test_another_key_is_an_error_and_never_stored(
 ) -> None:
     if stored:
         home.servers.pin(str(LAB), "lab-1", stored)
-    trust = Trust(home, Address(LAB.host, LAB.port, given))
+    trust = ServerTrust(home, Address(LAB.host, LAB.port, given))
     with pytest.raises(TrustError, match=r"10\.0\.0\.5:7721"):
-        trust.key(offered, loopback=loopback)
+        trust.select_key(offered, loopback=loopback)
     if stored:
         with pytest.raises(TrustError, match="iris-session keys forget"):
             trust.store("lab-1", A if stored == B else B)
@@ -76,18 +76,18 @@ def test_another_key_is_an_error_and_never_stored(
 
 def test_a_name_that_is_known_with_another_key_is_not_taken_at_first_sight(home: KeyHome) -> None:
     home.servers.pin("10.0.0.7:7721", "lab-1", A)
-    Trust(home, LAB, "lab-1").check_name(A)  # the machine has another address today
-    Trust(home, LAB, "lab-2").check_name(B)
-    Trust(home, LAB).check_name(B)  # not asked for by name
+    ServerTrust(home, LAB, "lab-1").check_name(A)  # the machine has another address today
+    ServerTrust(home, LAB, "lab-2").check_name(B)
+    ServerTrust(home, LAB).check_name(B)  # not asked for by name
     with pytest.raises(TrustError, match="another key"):
-        Trust(home, LAB, "lab-1").check_name(B)
+        ServerTrust(home, LAB, "lab-1").check_name(B)
 
 
 def test_known_by_whatever_address(home: KeyHome) -> None:
     assert known_fingerprints() == frozenset()
     stored = home.servers.pin("10.0.0.7:7721", "lab-1", A)
-    trust = Trust(home, LAB)
-    assert (trust.stored, trust.familiar(A), trust.familiar(B)) == ("", True, False)
+    trust = ServerTrust(home, LAB)
+    assert (trust.stored, trust.is_known(A), trust.is_known(B)) == ("", True, False)
     assert known_fingerprints() == {stored.fingerprint}
     (home.path / "known_servers.json").write_text("[")
     with pytest.raises(TrustError, match="damaged"):

@@ -26,8 +26,8 @@ def test_bodies_of_another_scene_are_where_they_are_and_not_where_others_were(
     seen: list[int] = []  # epochs in which all were there
 
     def look() -> None:
-        poses = {name: client.body_pose(name) for name in BODIES}
-        state = client.state
+        poses = {name: client.scene.body_pose(name) for name in BODIES}
+        state = client.scene.state
         if state is None or session._shown.bodies == scene().bodies:
             return
         found = {name: pose[0][1] for name, pose in poses.items() if pose is not None}
@@ -51,7 +51,7 @@ def test_bodies_of_another_scene_are_where_they_are_and_not_where_others_were(
         assert client.wait_for(shown, 30.0), (epoch, seen[-1:], client.mirror.synced)
         assert [body.name for body in client.mirror.bodies] == list(order)
     assert wrong == []
-    tip = client.tip_pose("left")
+    tip = client.scene.tip_pose("left")
     assert tip is not None
     assert tip[0][1] == Y["left/hand"]
 
@@ -60,12 +60,12 @@ def test_after_a_reset_bodies_are_where_they_were_until_the_next_state(
     session: LiveSession, join: Callable[..., Client]
 ) -> None:
     client = join()
-    assert client.wait_for(lambda c: c.state is not None)
+    assert client.wait_for(lambda c: c.scene.state is not None)
     session.reset()
 
     def both(_: Client) -> bool:
-        assert client.body_pose(BODIES[0]) is not None
-        state = client.state
+        assert client.scene.body_pose(BODIES[0]) is not None
+        state = client.scene.state
         return state is not None and state.header.scene_epoch == client.mirror.scene_epoch == 2
 
     assert client.wait_for(both, 30.0)
@@ -109,7 +109,7 @@ def test_hash_and_epoch_of_a_scene_go_together_whatever_the_thread_of_start_hear
     shapes = Deformables(client)
     monkeypatch.setattr(shapes, "_follow", lambda scene_hash, epoch: followed.append((scene_hash, epoch[1])))
     mirror.meanwhile = hear
-    shapes.tend()
+    shapes.update()
     assert changed.wait(30.0)
-    shapes.tend()
+    shapes.update()
     assert followed == [("first", 1), ("second", 2)]

@@ -18,7 +18,7 @@ from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_from_rot
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 from iris_session.client import Client, ClientError, InvalidMessageError
-from iris_session.client.sheet_observer import CAMERA_SIGMA, Viewpoints, in_tracking
+from iris_session.client.sheet_observer import CAMERA_SIGMA, ViewpointCounter, to_tracking_covariance
 from iris_session.protocol.client_messages import Align, ClientMessage, MoveAnchor, Observation
 from iris_session.protocol.common import Pose
 from iris_session.protocol.server_messages import Reply
@@ -152,25 +152,25 @@ def test_observations_can_be_of_an_earlier_tracking_frame(ann: Quiet) -> None:
 
 
 def test_viewpoints_are_counted_by_where_the_camera_goes() -> None:
-    viewpoints = Viewpoints()
+    viewpoints = ViewpointCounter()
     turned: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, 0.5, 0.0)))
-    assert viewpoints.at(0, ZERO) == 1
-    assert viewpoints.at(0, ((0.1, 0.0, 0.0), ZERO[1])) == 1
-    assert viewpoints.at(0, ((0.3, 0.0, 0.0), ZERO[1])) == 2
-    assert viewpoints.at(0, turned) == 3
-    assert viewpoints.at(1, turned) == 4, "the tracking frame jumped: nothing says that it is the same place"
+    assert viewpoints.number_at(0, ZERO) == 1
+    assert viewpoints.number_at(0, ((0.1, 0.0, 0.0), ZERO[1])) == 1
+    assert viewpoints.number_at(0, ((0.3, 0.0, 0.0), ZERO[1])) == 2
+    assert viewpoints.number_at(0, turned) == 3
+    assert viewpoints.number_at(1, turned) == 4, "the tracking frame jumped: nothing says that it is the same place"
 
 
 def test_covariance_of_a_turned_camera_is_turned_with_it() -> None:
     along_view = np.diag([1e-6, 1e-6, 1e-2, 1e-6, 1e-6, 1e-4])
     quarter: PoseTuple = ((0.0, 0.0, 0.0), quat_from_rotvec((0.0, math.pi / 2, 0.0)))  # its z is our x
-    C = np.reshape(in_tracking(along_view.ravel().tolist(), quarter, ZERO, (0.0, 0.0)), (6, 6))
+    C = np.reshape(to_tracking_covariance(along_view.ravel().tolist(), quarter, ZERO, (0.0, 0.0)), (6, 6))
     assert np.allclose(np.diag(C), [1e-2, 1e-6, 1e-6, 1e-4, 1e-6, 1e-6])
 
 
 def test_a_camera_whose_turn_is_uncertain_is_uncertain_across_the_view() -> None:
     far: PoseTuple = ((0.0, 0.0, 2.0), ZERO[1])
-    C = np.reshape(in_tracking([0.0] * 36, ZERO, far, (0.0, 0.01)), (6, 6))
+    C = np.reshape(to_tracking_covariance([0.0] * 36, ZERO, far, (0.0, 0.01)), (6, 6))
     assert np.allclose(np.diag(C), [4e-4, 4e-4, 0.0, 1e-4, 1e-4, 1e-4])
     wobble = np.array([0.0, 0.001, 0.0])
     moved = np.cross(wobble, far[0])

@@ -41,7 +41,7 @@ LONGEST_PAUSE_NS: Final = 2_000_000_000
 PATIENCE_NS: Final = 15_000_000_000
 
 
-class Ask(NamedTuple):
+class ChunkRequest(NamedTuple):
     """One request to be sent."""
 
     request_id: int
@@ -50,7 +50,7 @@ class Ask(NamedTuple):
     length: int
 
 
-class Failed(NamedTuple):
+class FailedAsset(NamedTuple):
     """An asset that will not come."""
 
     address: str
@@ -88,12 +88,12 @@ class AssetLoader:
 
     def __init__(self) -> None:
         #: Why the session puts requests off, in its words; empty while bytes come.
-        self.put_off = ""
+        self.refusal = ""
         self._wanted: dict[str, int] = {}  # not looked up yet; sizes as in `want`
         self._busy: dict[str, int] = {}  # in the hands of the workers
         self._items: dict[str, _Item] = {}  # of which bytes are to come, in their order
         self._anew: set[str] = set()  # whose part was thrown away because the session has less: once
-        self._asked: dict[int, tuple[Ask, int]] = {}  # with the time
+        self._asked: dict[int, tuple[ChunkRequest, int]] = {}  # with the time
         self._chunk_bytes = CHUNK_BYTES
         self._unstored = 0
         self._next_id = 0
@@ -110,48 +110,48 @@ class AssetLoader:
         """Whether bytes are to come over the network."""
         return bool(self._items)
 
-    def want(self, address: str, size: int = -1) -> bool:
+    def add(self, address: str, size: int = -1) -> bool:
         """Adds an asset at the end of the order; its size, if that is known. False: it is on its way already."""
         if address in self._wanted or address in self._busy or address in self._items:
             return False
         self._wanted[address] = size
         return True
 
-    def to_look(self) -> Iterator[str]:
+    def next_lookups(self) -> Iterator[str]:
         """Assets to be looked up in the cache now."""
         while self._wanted and len(self._busy) + len(self._items) < AT_ONCE:
             address = next(iter(self._wanted))
             self._busy[address] = self._wanted.pop(address)
             yield address
 
-    def missing(self, address: str, offset: int) -> None:
+    def on_missing(self, address: str, offset: int) -> None:
         """It is not in the cache, but its first `offset` bytes are."""
         if address in self._busy:
             item = self._items[address] = _Item(address, offset, self._busy.pop(address))
             item.anew = address in self._anew
 
-    def again(self, address: str) -> bool:
+    def restart_asset(self, address: str) -> bool:
         """The bytes that came were not those of the asset: from the beginning. False: that was the second time. Does
         nothing for one that was let go of meanwhile."""
         item = self._items.get(address)
         if item is None:
             return True
         if item.anew:
-            self.drop(address)
+            self.remove(address)
             return False
         fresh = self._items[address] = _Item(address, 0, -1)
         fresh.anew = True
         return True
 
-    def drop(self, address: str) -> None:
+    def remove(self, address: str) -> None:
         """It is there, or will not come."""
         for table in (self._wanted, self._busy, self._items):
             table.pop(address, None)
         self._anew.discard(address)
 
-    def requests(self, now_ns: int) -> Iterator[Ask]:
+    def next_requests(self, now_ns: int) -> Iterator[ChunkRequest]:
         """What is to be asked now, in the order of the assets. What was yielded counts as asked."""
-        if self.pauses(now_ns):
+        if self.is_paused(now_ns):
             return
         for item in list(self._items.values()):
             while item.open:
@@ -161,7 +161,7 @@ class AssetLoader:
                 if not self._asked:
                     self._progress_ns = now_ns
                 self._next_id += 1
-                ask = Ask(self._next_id, item.address, item.asked, length)
+                ask = ChunkRequest(self._next_id, item.address, item.asked, length)
                 self._asked[self._next_id] = ask, now_ns
                 item.asked += length
                 yield ask
@@ -170,26 +170,26 @@ class AssetLoader:
     def _outstanding(self) -> int:
         return self._unstored + sum(ask.length for ask, _ in self._asked.values())
 
-    def chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | Failed | None:
+    def process_chunk(self, chunk: AssetChunk, size: int, now_ns: int) -> bool | FailedAsset | None:
         """`size` bytes came. True: they are the next ones, to be stored (then call `stored`). None: they are of no use
         any more. False: nobody asked for them."""
         ask, asked_ns = self._asked.pop(chunk.request_id, (None, 0))
         if ask is None or ask.offset != chunk.offset or ask.address != chunk.address:
             return False
-        self._overtake(ask.request_id)
-        self._progress_ns, self._pause_ns, self.put_off = now_ns, 0, ""
-        self._suit(ask, size, now_ns - asked_ns)
+        self._restore_lost_requests(ask.request_id)
+        self._progress_ns, self._pause_ns, self.refusal = now_ns, 0, ""
+        self._adapt_chunk_size(ask, size, now_ns - asked_ns)
         item = self._items.get(ask.address)
         if item is None or chunk.offset != item.got:
             return None
         expected = min(ask.length, chunk.total - chunk.offset)
         if item.total not in (-1, chunk.total) or size > ask.length or (size == 0 and expected):
-            self.drop(ask.address)
-            return Failed(ask.address, "protocol", f"the session contradicts itself about asset {ask.address}")
+            self.remove(ask.address)
+            return FailedAsset(ask.address, "protocol", f"the session contradicts itself about asset {ask.address}")
         if chunk.total > MAX_ASSET_BYTES:
-            self.drop(ask.address)
+            self.remove(ask.address)
             text = f"asset {ask.address} is said to have {chunk.total} bytes: at most {MAX_ASSET_BYTES} are fetched"
-            return Failed(ask.address, "protocol", text)
+            return FailedAsset(ask.address, "protocol", text)
         item.total = chunk.total
         item.got += size
         if size < expected:
@@ -198,7 +198,7 @@ class AssetLoader:
         self._unstored += size
         return True
 
-    def _overtake(self, request_id: int) -> None:
+    def _restore_lost_requests(self, request_id: int) -> None:
         """This request was answered: those before it will not be, and are made again."""
         for lost in [earlier for earlier in self._asked if earlier < request_id]:
             ask, _ = self._asked.pop(lost)
@@ -206,7 +206,7 @@ class AssetLoader:
             if item is not None:
                 item.asked = max(item.got, min(item.asked, ask.offset))
 
-    def _suit(self, ask: Ask, size: int, took_ns: int) -> None:
+    def _adapt_chunk_size(self, ask: ChunkRequest, size: int, took_ns: int) -> None:
         """Larger chunks for a fast link, smaller ones for a slow one: whole chunks tell."""
         if size != self._chunk_bytes or size != ask.length:
             return
@@ -215,60 +215,60 @@ class AssetLoader:
         elif took_ns > SLOW_NS:
             self._chunk_bytes = max(size // 2, MIN_CHUNK_BYTES)
 
-    def whole(self, address: str) -> bool:
+    def is_complete(self, address: str) -> bool:
         """Whether all its bytes came."""
         item = self._items.get(address)
         return item is not None and item.got == item.total
 
-    def stored(self, size: int) -> None:
+    def on_stored(self, size: int) -> None:
         """These bytes are in the cache, or thrown away: they fill the window no more."""
         self._unstored -= size
 
-    def refused(self, refused: AssetRefused, now_ns: int) -> Failed | str:
+    def process_refusal(self, refused: AssetRefused, now_ns: int) -> FailedAsset | str:
         """A request was refused. A `Failed` when the asset will not come; an address when it is to begin anew, after
         its part was thrown away (then call `missing` with 0); else empty: it is asked for again after a pause."""
         ask, _ = self._asked.pop(refused.request_id, (None, 0))
         if ask is None:
             return ""
-        self._overtake(ask.request_id)
+        self._restore_lost_requests(ask.request_id)
         self._progress_ns = now_ns
         item = self._items.get(ask.address)
         if item is None:
             return ""
         if refused.reason in AssetRefusal.PASSING:
-            self.put_off = f"{refused.reason}: {refused.advice}"
+            self.refusal = f"{refused.reason}: {refused.advice}"
             self._pause(now_ns, self._pause_ns)
             item.asked = max(item.got, min(item.asked, ask.offset))
             return ""
-        self.drop(ask.address)
+        self.remove(ask.address)
         if refused.reason == AssetRefusal.BAD_RANGE and item.got and not item.anew:
             self._busy[ask.address] = -1  # our part is longer than the asset: it was of something else
             self._anew.add(ask.address)
             return ask.address
         text = f"asset {ask.address} was refused ({refused.reason}): {refused.advice}"
-        return Failed(ask.address, refused.reason, text)
+        return FailedAsset(ask.address, refused.reason, text)
 
-    def pauses(self, now_ns: int) -> bool:
+    def is_paused(self, now_ns: int) -> bool:
         """Whether nothing is to be asked for now."""
         return now_ns < self._paused_until_ns
 
-    def broke_off(self, now_ns: int) -> None:
+    def on_link_lost(self, now_ns: int) -> None:
         """As `cut_off`, of a connection that the other end or the network ended: the next one is made after a pause."""
         before_ns = self._pause_ns
-        self.cut_off()
+        self.on_link_closed()
         self._pause(now_ns, before_ns)
 
     def _pause(self, now_ns: int, before_ns: int) -> None:
         self._pause_ns = min(max(FIRST_PAUSE_NS, 2 * before_ns), LONGEST_PAUSE_NS)
         self._paused_until_ns = now_ns + self._pause_ns
 
-    def cut_off(self) -> None:
+    def on_link_closed(self) -> None:
         """We ended the connection: what was asked by it will not come, what came stays."""
         self._asked.clear()
         self._pause_ns = self._paused_until_ns = 0
         for item in self._items.values():
             item.asked = item.got
 
-    def overdue(self, now_ns: int) -> bool:
+    def is_overdue(self, now_ns: int) -> bool:
         """Whether answers have not come for too long."""
         return bool(self._asked) and now_ns - self._progress_ns > PATIENCE_NS

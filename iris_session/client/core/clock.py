@@ -77,7 +77,7 @@ class ClockSync:
         """Shortest round trip in the window [ns], 0 before the first exchange."""
         return self._rtt
 
-    def ping_due(self, local_ns: int) -> bool:
+    def poll_ping(self, local_ns: int) -> bool:
         """True when a `ClockPing` is to be sent now; counts it as sent."""
         if local_ns < self._next_ping:
             return False
@@ -90,7 +90,7 @@ class ClockSync:
         """When the next ping is due [local ns]."""
         return self._next_ping
 
-    def pong(self, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> None:
+    def process_pong(self, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> None:
         """Counts one exchange: `t0`, `t3` on the client's clock, `t1`, `t2` in session time.
 
         Impossible ones (time runs backwards, or the server held it longer than the round trip) are rejected.
@@ -117,21 +117,21 @@ class ClockSync:
 
     def _contradicts(self, exchange: Exchange) -> bool:
         """Whether this exchange and the estimate cannot both be right."""
-        reach = _reach(exchange, exchange.at_ns) + int(DRIFT * (exchange.at_ns - self._offset_at))
+        reach = _uncertainty(exchange, exchange.at_ns) + int(DRIFT * (exchange.at_ns - self._offset_at))
         return exchange.offset_ns + reach < self._low or exchange.offset_ns - reach > self._high
 
     def _estimate(self, now_ns: int, *, jumped: bool) -> None:
-        offset = self._slewed(now_ns)
+        offset = self._slewed_offset(now_ns)
         fresh = sorted((e for e in self._window if now_ns - e.at_ns <= MAX_AGE_NS), key=lambda e: e.rtt_ns)
         quickest = fresh[: max(1, len(fresh) // 4)]
-        self._low, self._high = _intersection(fresh, now_ns)
+        self._low, self._high = _intersect(fresh, now_ns)
         self._target = max(self._low, min(self._high, int(median(e.offset_ns for e in quickest))))
         self._rtt = quickest[0].rtt_ns
         self._offset, self._offset_at = self._target if jumped else offset, now_ns
 
     def session_ns(self, local_ns: int) -> int:
         """Session time [ns] at `local_ns`. Meaningless before `synced`."""
-        return local_ns + self._slewed(local_ns)
+        return local_ns + self._slewed_offset(local_ns)
 
     def local_ns(self, session_ns: int) -> int:
         """The client's clock at session time `session_ns`, by the estimate as it stands."""
@@ -139,29 +139,29 @@ class ClockSync:
 
     def error_bound_ns(self, local_ns: int) -> int:
         """Bound of the error of `session_ns(local_ns)`: round trips, drift, and slew still to do."""
-        offset = self._slewed(local_ns)
-        doubts = [(e.offset_ns, _reach(e, local_ns)) for e in self._contradicting]  # they may be right
+        offset = self._slewed_offset(local_ns)
+        doubts = [(e.offset_ns, _uncertainty(e, local_ns)) for e in self._contradicting]  # they may be right
         low = min(self._low, *(at - reach for at, reach in doubts)) if doubts else self._low
         high = max(self._high, *(at + reach for at, reach in doubts)) if doubts else self._high
         return max(high - offset, offset - low) + int(DRIFT * abs(local_ns - self._offset_at))
 
-    def _slewed(self, local_ns: int) -> int:
+    def _slewed_offset(self, local_ns: int) -> int:
         elapsed, way = max(0, local_ns - self._offset_at), self._target - self._offset
         quick = min(elapsed, max(0, abs(way) - LARGE_NS) / SLEW_LARGE)  # nanoseconds of quick movement
         room = int(SLEW_LARGE * quick + SLEW * (elapsed - quick))
         return self._offset + max(-room, min(room, way))
 
 
-def _reach(exchange: Exchange, now_ns: int) -> int:
+def _uncertainty(exchange: Exchange, now_ns: int) -> int:
     """How far the offset can be from that of an exchange [ns]."""
     return exchange.rtt_ns // 2 + int(DRIFT * (now_ns - exchange.at_ns)) + 1
 
 
-def _intersection(exchanges: list[Exchange], now_ns: int) -> tuple[int, int]:
+def _intersect(exchanges: list[Exchange], now_ns: int) -> tuple[int, int]:
     """Offsets (lowest, highest) that agree with the exchanges, quickest first; one that contradicts is left out."""
     low, high = -(2**63), 2**63
     for exchange in exchanges:
-        reach = _reach(exchange, now_ns)
+        reach = _uncertainty(exchange, now_ns)
         if exchange.offset_ns - reach <= high and exchange.offset_ns + reach >= low:
             low, high = max(low, exchange.offset_ns - reach), min(high, exchange.offset_ns + reach)
     return low, high

@@ -16,9 +16,9 @@ from typing import Any
 
 import msgspec
 
-from iris_session.client.arguments import checked_bytes
+from iris_session.client.arguments import encode_checked
 from iris_session.client.core.clock import ClockSync
-from iris_session.client.core.inbox import Answers
+from iris_session.client.core.inbox import PendingRequests
 from iris_session.client.core.limits import (
     BACKOFF_MAX_NS,
     BACKOFF_MIN_NS,
@@ -28,10 +28,10 @@ from iris_session.client.core.limits import (
     SNAPSHOT_RETRY_NS,
     STEADY_NS,
 )
-from iris_session.client.core.outbox import Outgoing, PendingStop
-from iris_session.client.core.receiving import Receiving, Told
+from iris_session.client.core.outbox import Outbox, PendingEStop
+from iris_session.client.core.receiving import Receiving, InboxMessage
 from iris_session.client.core.state_stream import StateStream
-from iris_session.client.core.status import ConnectionCounters, Phase
+from iris_session.client.core.status import ConnectionCounters, ConnectionPhase
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import (
@@ -58,19 +58,19 @@ from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
-class Connection(Receiving):
+class ClientConnection(Receiving):
     """One participant's connection, over any number of sockets."""
 
     def __init__(self, hello: Hello, identity: Identity) -> None:
         self.hello = hello
         self.identity = identity
-        self.phase = Phase.IDLE
+        self.phase = ConnectionPhase.IDLE
         self.generation = 0
         self.welcome: Welcome | None = None
         self.failure: ClientError | None = None
-        self.put_off: Refused | None = None  # the newest refusal that passes, until a session lets us in
+        self.retryable_refusal: Refused | None = None  # the newest refusal that passes, until a session lets us in
         self.wake_ns = 0  # when the shell has something to do that is not ours; 0: never
-        self.not_taken: ProtocolFault | None = None  # the newest fault of `NOT_TAKEN`
+        self.last_protocol_fault: ProtocolFault | None = None  # the newest fault of `NOT_TAKEN`
         self.stalled = False
         self.worn = True
         self.tracking_epoch = 0
@@ -78,12 +78,12 @@ class Connection(Receiving):
         self.clock = ClockSync()
         self.stream = StateStream()
         self.counters = ConnectionCounters()
-        self.inbox: deque[Told] = deque()
+        self.inbox: deque[InboxMessage] = deque()
         #: Newest message of the kinds of which only the newest matters, by type.
         self.latest: dict[type, StatusReport | DeliveryBudget | Paired] = {}
-        self.answers = Answers(self.counters)
-        self.stop = PendingStop()
-        self._outgoing = Outgoing(self.counters)
+        self.requests = PendingRequests(self.counters)
+        self.pending_estop = PendingEStop()
+        self._outgoing = Outbox(self.counters)
         self._backoff_ns = BACKOFF_MIN_NS
         self._hello_at = 0
         self._hello_wait_ns = HELLO_TIMEOUT_NS
@@ -99,34 +99,34 @@ class Connection(Receiving):
 
     def open(self, now_ns: int) -> None:
         """Starts joining, also after a refusal."""
-        self.failure = self.put_off = None
+        self.failure = self.retryable_refusal = None
         self._backoff_ns, self._hello_wait_ns = BACKOFF_MIN_NS, HELLO_TIMEOUT_NS
-        self._say_hello(now_ns)
+        self._send_hello(now_ns)
 
     def close(self) -> None:
         """Says bye; leases are released at once. What `peek_outgoing` still shows should be sent."""
         if self.welcome is not None:
             self._queue(Bye())
-            if self.phase is not Phase.REFUSED:  # then the token in a shared file may be that of who took over
+            if self.phase is not ConnectionPhase.REFUSED:  # then the token in a shared file may be that of who took over
                 self.counters.identity_unwritten += not self.identity.remember(b"")
-        self.phase = Phase.CLOSED
+        self.phase = ConnectionPhase.CLOSED
 
-    def lost(self, now_ns: int) -> None:
+    def handle_disconnect(self, now_ns: int) -> None:
         """The socket lost its peer, or the front its memory of us: join again, at once if this one stood for long."""
-        if not self.joined:
+        if not self.is_joined:
             return
         self.counters.reconnects += 1
         self._hello_wait_ns = HELLO_TIMEOUT_NS
         if now_ns - self._joined_at < STEADY_NS:
-            self._wait(now_ns)
+            self._start_backoff(now_ns)
         else:
             self._backoff_ns = BACKOFF_MIN_NS
-            self._say_hello(now_ns)
+            self._send_hello(now_ns)
 
     @property
-    def joined(self) -> bool:
+    def is_joined(self) -> bool:
         """The session accepted us, and the connection stands as far as we know."""
-        return self.phase in (Phase.SYNCING, Phase.READY)
+        return self.phase in (ConnectionPhase.SYNCING, ConnectionPhase.READY)
 
     @property
     def participant_id(self) -> str:
@@ -141,21 +141,21 @@ class Connection(Receiving):
         if now_ns - self._ticked_at > STEADY_NS:
             self._heard_at = now_ns  # it was us who stood still: what was said meanwhile is still to be read
         self._ticked_at = now_ns
-        if self.phase is Phase.WAITING and now_ns >= self._retry_at:
-            self._say_hello(now_ns)
-        elif self.phase is Phase.JOINING and now_ns >= self._hello_at + self._hello_wait_ns:
+        if self.phase is ConnectionPhase.WAITING and now_ns >= self._retry_at:
+            self._send_hello(now_ns)
+        elif self.phase is ConnectionPhase.JOINING and now_ns >= self._hello_at + self._hello_wait_ns:
             self._hello_wait_ns = min(2 * self._hello_wait_ns, HELLO_TIMEOUT_MAX_NS)
-            self._wait(now_ns)
-        elif self.joined:
-            self._keep_up(now_ns)
+            self._start_backoff(now_ns)
+        elif self.is_joined:
+            self._send_periodic(now_ns)
 
     def next_deadline_ns(self, now_ns: int) -> int:
         """When `tick` must be called at the latest."""
-        if self.phase is Phase.WAITING:
+        if self.phase is ConnectionPhase.WAITING:
             return self._retry_at
-        if self.phase is Phase.JOINING:
+        if self.phase is ConnectionPhase.JOINING:
             return self._hello_at + self._hello_wait_ns
-        if not self.joined:
+        if not self.is_joined:
             return self.wake_ns or now_ns + STEADY_NS
         due = min(self.clock.next_ping_ns, self._heartbeat_at, self._heard_at + self._silence_ns)
         return min(due, self._snapshot_at) if self._snapshot_wanted else due
@@ -168,11 +168,11 @@ class Connection(Receiving):
         An e-stop is kept until the session has it, over any number of connections: false says that there is none now.
         Raises `InvalidMessageError` when the protocol does not take it, connected or not.
         """
-        data = checked_bytes(message, self.connection_epoch)
-        if isinstance(message, EStop) and (self.joined or self.phase in (Phase.JOINING, Phase.WAITING)):
-            self.stop.ask(message)
-            return self.phase is not Phase.WAITING and self._outgoing.push(message, data)
-        if not self.joined:
+        data = encode_checked(message, self.connection_epoch)
+        if isinstance(message, EStop) and (self.is_joined or self.phase in (ConnectionPhase.JOINING, ConnectionPhase.WAITING)):
+            self.pending_estop.begin(message)
+            return self.phase is not ConnectionPhase.WAITING and self._outgoing.push(message, data)
+        if not self.is_joined:
             if isinstance(message, Sample | Samples):
                 self.counters.samples_not_sent += 1
                 return False
@@ -181,16 +181,16 @@ class Connection(Receiving):
 
     def request(self, message: Any) -> int:
         """Queues a request under a fresh `request_id`, which is returned."""
-        if not self.joined:
+        if not self.is_joined:
             raise NotConnectedError(self.describe())
-        request_id = self.answers.next_request
+        request_id = self.requests.next_request
         message = msgspec.structs.replace(message, request_id=request_id)
-        data = checked_bytes(message, self.connection_epoch)
+        data = encode_checked(message, self.connection_epoch)
         if not self._outgoing.push(message, data):
             raise NotConnectedError("the session takes nothing: too many messages wait to be sent")
         if isinstance(message, ClearEStop):
-            self.stop.withdraw()
-        self.answers.expect()
+            self.pending_estop.withdraw()
+        self.requests.add_pending()
         return request_id
 
     def peek_outgoing(self) -> tuple[bool, bytes] | None:
@@ -203,7 +203,7 @@ class Connection(Receiving):
 
     def lease_version(self, target: str) -> int | None:
         """Our fencing token for `target`, by events or by a reply that came before its event."""
-        granted, known = self.answers.granted(target), self.mirror.leases.get(target)
+        granted, known = self.requests.granted_lease(target), self.mirror.leases.get(target)
         if granted is not None and (known is None or granted.lease_version > known.lease_version):
             ours = granted.holder == self.participant_id or self.participant_id in granted.sub_holders
             return granted.lease_version if ours else None
@@ -211,11 +211,11 @@ class Connection(Receiving):
 
     def describe(self) -> str:
         """One line for people: why there is no connection now."""
-        if self.phase in (Phase.WAITING, Phase.JOINING) and self.put_off is not None:
-            return f"not let in yet, trying again: {RefusedError(self.put_off)}"
-        if self.phase in (Phase.WAITING, Phase.JOINING):
+        if self.phase in (ConnectionPhase.WAITING, ConnectionPhase.JOINING) and self.retryable_refusal is not None:
+            return f"not let in yet, trying again: {RefusedError(self.retryable_refusal)}"
+        if self.phase in (ConnectionPhase.WAITING, ConnectionPhase.JOINING):
             return "the connection was lost; joining again" if self.welcome else "no session has answered yet"
-        texts = {Phase.IDLE: "not connected: call connect() first", Phase.CLOSED: "this client was closed"}
+        texts = {ConnectionPhase.IDLE: "not connected: call connect() first", ConnectionPhase.CLOSED: "this client was closed"}
         return texts.get(self.phase, str(self.failure) if self.failure else "connected")
 
     # --- timers -------------------------------------------------------------------------------------------------------
@@ -228,14 +228,14 @@ class Connection(Receiving):
     def _snapshot_wanted(self) -> bool:
         return not self.mirror.synced or self.stream.wants_snapshot
 
-    def _keep_up(self, now_ns: int) -> None:
+    def _send_periodic(self, now_ns: int) -> None:
         assert self.welcome is not None
         if now_ns - self._heard_at >= self._silence_ns:
-            self.lost(now_ns)
+            self.handle_disconnect(now_ns)
             return
-        if self.clock.ping_due(now_ns):
+        if self.clock.poll_ping(now_ns):
             self._queue(ClockPing(now_ns))
-            self.stop.pinged(now_ns)
+            self.pending_estop.on_ping(now_ns)
         if now_ns >= self._heartbeat_at:
             self._heartbeat_at = now_ns + self._heartbeat_ns // 2
             self._queue(Heartbeat(self.worn))
@@ -243,24 +243,24 @@ class Connection(Receiving):
             self._snapshot_at = now_ns + SNAPSHOT_RETRY_NS
             self._queue(GetSnapshot())
 
-    def _say_hello(self, now_ns: int) -> None:
+    def _send_hello(self, now_ns: int) -> None:
         """A fresh socket and a new hello: nothing meant for an earlier connection can reach the session."""
         self.generation += 1
-        self.phase = Phase.JOINING
+        self.phase = ConnectionPhase.JOINING
         self.stalled = False
         self._hello_at = now_ns
         self._heard_at = now_ns
         self._outgoing.clear()
-        self.answers.clear()
+        self.requests.clear()
         hello = msgspec.structs.replace(
             self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
         )
         self._outgoing.push(hello, encode_client(envelope(hello)))
-        if self.stop.message is not None:  # anyone may stop, however early
-            self._outgoing.push(self.stop.message, encode_client(envelope(self.stop.message)))
+        if self.pending_estop.message is not None:  # anyone may stop, however early
+            self._outgoing.push(self.pending_estop.message, encode_client(envelope(self.pending_estop.message)))
 
-    def _wait(self, now_ns: int) -> None:
-        self.phase = Phase.WAITING
+    def _start_backoff(self, now_ns: int) -> None:
+        self.phase = ConnectionPhase.WAITING
         self._outgoing.clear()
         self._retry_at = now_ns + self._backoff_ns
         self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)

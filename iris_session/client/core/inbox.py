@@ -8,7 +8,7 @@ from iris_session.protocol.common import Lease
 from iris_session.protocol.server_messages import Reply
 
 
-class Answers:
+class PendingRequests:
     """Of one connection; `clear` for the next one. Request numbers go on."""
 
     def __init__(self, counters: ConnectionCounters) -> None:
@@ -24,23 +24,23 @@ class Answers:
         self._pending.clear()
         self._replies.clear()
 
-    def expect(self) -> None:
+    def add_pending(self) -> None:
         """The request `next_request` was sent. Of too many the oldest is no longer waited for."""
         if len(self._pending) >= MAX_PENDING:
             self._pending.discard(min(self._pending))
         self._pending.add(self.next_request)
         self.next_request += 1
 
-    def take(self, request_id: int) -> Reply | None:
+    def pop_reply(self, request_id: int) -> Reply | None:
         """The answer to a request, once."""
         return self._replies.pop(request_id, None)
 
-    def forget(self, request_id: int) -> None:
+    def discard(self, request_id: int) -> None:
         """Nobody waits for this answer any more."""
         self._pending.discard(request_id)
         self._replies.pop(request_id, None)
 
-    def came(self, reply: Reply) -> bool:
+    def process_reply(self, reply: Reply) -> bool:
         """Takes an answer. False: a denial that nobody waits for, which is to be told another way."""
         self._granted.update((lease.target, lease) for lease in reply.leases)
         while len(self._granted) > MAX_GRANTED:
@@ -57,6 +57,6 @@ class Answers:
             return True
         return reply.denial is None
 
-    def granted(self, target: str) -> Lease | None:
+    def granted_lease(self, target: str) -> Lease | None:
         """The lease of the newest answer that spoke of `target`: it may be ahead of the event."""
         return self._granted.get(target)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Poses = NDArray[np.float64]
 
 
-class Shown(NamedTuple):
+class ShownPoses(NamedTuple):
     """Poses (n, 7) `x y z qw qx qy qz` at `session_time_ns`; `age_ns` = now - that time; `starved`: no newer frame."""
 
     poses: Poses
@@ -70,7 +70,7 @@ class PoseBuffer:
         else:
             self._frames.append((session_time_ns, poses))
 
-    def show(self, now_ns: int) -> Shown | None:
+    def poses_at(self, now_ns: int) -> ShownPoses | None:
         """The scene at `now_ns - delay_ns`, or the nearest frame held; `None` before the first. Never goes back."""
         if not self._frames:
             return None
@@ -80,13 +80,13 @@ class PoseBuffer:
             starved = wanted > newest_ns
             self.starvations += starved
             self._shown_ns = newest_ns
-            return Shown(newest, newest_ns, now_ns - newest_ns, starved)
+            return ShownPoses(newest, newest_ns, now_ns - newest_ns, starved)
         after_ns, after = newest_ns, newest
         for at_ns, poses in reversed(self._frames):
             if at_ns <= wanted:
                 self._shown_ns = wanted
                 fraction = (wanted - at_ns) / (after_ns - at_ns)
-                return Shown(interpolate(poses, after, fraction), wanted, now_ns - wanted, False)
+                return ShownPoses(interpolate(poses, after, fraction), wanted, now_ns - wanted, False)
             after_ns, after = at_ns, poses
         self._shown_ns = after_ns
-        return Shown(after, after_ns, now_ns - after_ns, False)
+        return ShownPoses(after, after_ns, now_ns - after_ns, False)

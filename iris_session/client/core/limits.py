@@ -24,19 +24,19 @@ MAX_PENDING: Final = 64
 MAX_GRANTED: Final = 4096  # targets of which an answer spoke
 
 #: Refusals that pass: somebody who was in before keeps trying (after `rate` everybody does).
-TRANSIENT: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
+RETRYABLE_REFUSALS: Final = frozenset({RefusalCode.RATE, RefusalCode.FULL, DenialReason.SESSION_FULL})
 #: Faults about a message of ours that the session could not read: whoever waits for its answer waits in vain.
-NOT_TAKEN: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LARGE})
+UNREAD_MESSAGE_FAULTS: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LARGE})
 #: Why the session let a connection go that another one resumed. Joining again would only take it back in turn.
 REPLACED: Final = "replaced"
 
 
-def heartbeat_period(welcome: Welcome) -> int:
+def bounded_heartbeat_ns(welcome: Welcome) -> int:
     """What the session asks for [ns], within reason."""
     return min(max(welcome.heartbeat_ns, HEARTBEAT_MIN_NS), HEARTBEAT_MAX_NS)
 
 
-def end_for_good(fault: ProtocolFault) -> Refused | None:
+def final_refusal(fault: ProtocolFault) -> Refused | None:
     """What a fault means after which a client does not join again by itself, `None` for any other fault."""
     if fault.code == FaultCode.DROPPED and fault.reason == REPLACED:
         advice = "give every client that runs at the same time an identity of its own"

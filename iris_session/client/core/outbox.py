@@ -11,7 +11,7 @@ from iris_session.protocol.client_messages import Bye, ClientMessage, EStop, Hel
 MAX_OUTGOING: Final = 256
 
 
-class Outgoing:
+class Outbox:
     """Messages as `(may be dropped when the socket is full, bytes)`. Drops are counted in `counters`.
 
     An e-stop passes everything but a hello. A release passes samples only: it may mean what an acquire before it asks
@@ -76,7 +76,7 @@ class Outgoing:
         self._hello_waits = False
 
 
-class PendingStop:
+class PendingEStop:
     """An e-stop of ours until the session is known to have it: a connection may die with it on the way.
 
     The session has it when it says that it is stopped, after we asked. Where it was stopped already it has nothing to
@@ -88,7 +88,7 @@ class PendingStop:
         self.message: EStop | None = None
         self._proof_ns: int | None = None
 
-    def ask(self, message: EStop) -> None:
+    def begin(self, message: EStop) -> None:
         """The user stops; also called when it is sent again."""
         self.message, self._proof_ns = message, None
 
@@ -96,12 +96,12 @@ class PendingStop:
         """The user clears the e-stop, or the session has it."""
         self.message = None
 
-    def pinged(self, t0_ns: int) -> None:
+    def on_ping(self, t0_ns: int) -> None:
         """A ping was queued."""
         if self.message is not None and self._proof_ns is None:
             self._proof_ns = t0_ns
 
-    def answered(self, t0_ns: int, *, stopped: bool) -> None:
+    def on_pong(self, t0_ns: int, *, stopped: bool) -> None:
         """A ping was answered, while the session is `stopped` as far as we know."""
         if stopped and self._proof_ns is not None and t0_ns >= self._proof_ns:
             self.message = None

@@ -10,11 +10,11 @@ from collections import deque
 from collections.abc import Sequence
 
 from iris_session.client.core.clock import ClockSync
-from iris_session.client.core.inbox import Answers
-from iris_session.client.core.limits import MAX_INBOX, NOT_TAKEN, TRANSIENT, end_for_good, heartbeat_period
-from iris_session.client.core.outbox import PendingStop
+from iris_session.client.core.inbox import PendingRequests
+from iris_session.client.core.limits import MAX_INBOX, UNREAD_MESSAGE_FAULTS, RETRYABLE_REFUSALS, final_refusal, bounded_heartbeat_ns
+from iris_session.client.core.outbox import PendingEStop
 from iris_session.client.core.state_stream import StateStream, poses_from_bytes
-from iris_session.client.core.status import ConnectionCounters, Phase
+from iris_session.client.core.status import ConnectionCounters, ConnectionPhase
 from iris_session.client.errors import ClientError, RefusedError, VersionError
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import ClientMessage, TrackingEpoch
@@ -38,14 +38,14 @@ from iris_session.protocol.session_mirror import Missed, SessionMirror
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 #: What is handed to the application, in this order. Replies: denials that nobody waits for.
-Told = Event | Missed | Feedback | ProtocolFault | Reply
+InboxMessage = Event | Missed | Feedback | ProtocolFault | Reply
 
 
 class Receiving:
     """Part of `Connection`."""
 
     identity: Identity
-    phase: Phase
+    phase: ConnectionPhase
     welcome: Welcome | None
     failure: ClientError | None
     put_off: Refused | None
@@ -56,10 +56,10 @@ class Receiving:
     clock: ClockSync
     stream: StateStream
     counters: ConnectionCounters
-    inbox: deque[Told]
+    inbox: deque[InboxMessage]
     latest: dict[type, StatusReport | DeliveryBudget | Paired]
-    answers: Answers
-    stop: PendingStop
+    requests: PendingRequests
+    pending_estop: PendingEStop
     _heard_at: int
     _heartbeat_at: int
     _heartbeat_ns: int
@@ -110,11 +110,11 @@ class Receiving:
         elif not self.joined or wrapped.connection_epoch != self.connection_epoch:
             self.counters.other_connection += 1
         elif isinstance(message, ClockPong):
-            self.clock.pong(message.t0_ns, message.t1_ns, message.t2_ns, now_ns)
-            self.stop.answered(message.t0_ns, stopped=self.mirror.synced and self.mirror.estop)
+            self.clock.process_pong(message.t0_ns, message.t1_ns, message.t2_ns, now_ns)
+            self.pending_estop.on_pong(message.t0_ns, stopped=self.mirror.synced and self.mirror.estop)
             self._maybe_ready()
         elif isinstance(message, Reply):
-            if not self.answers.came(message):
+            if not self.requests.process_reply(message):
                 self.counters.unasked_denials += 1
                 self._deliver(message)
         elif isinstance(message, Event):
@@ -124,7 +124,7 @@ class Receiving:
                     # Another scene: its bodies are asked for at once, however lately others were.
                     self._snapshot_at = min(self._snapshot_at, now_ns)
                 if isinstance(message.body, EStopChanged) and message.body.active:
-                    self.stop.withdraw()
+                    self.pending_estop.withdraw()
                 self._deliver(message)
         elif isinstance(message, Snapshot):
             self._snapshot(message, frames[1:])
@@ -134,7 +134,7 @@ class Receiving:
             self.latest[type(message)] = message
 
     def _welcomed(self, welcome: Welcome, now_ns: int) -> None:
-        if self.phase is not Phase.JOINING:
+        if self.phase is not ConnectionPhase.JOINING:
             self.counters.other_connection += 1
             return
         if self.welcome is None or welcome.session_id != self.welcome.session_id:
@@ -142,47 +142,47 @@ class Receiving:
             self.clock.reset()
             self.stream.reset()  # else state goes on: a restarted front numbers its frames above the old one's
         self.clock.restart()  # this machine may have slept
-        self.stream.reconnected()
+        self.stream.restart()
         self.mirror.synced = False
         self.welcome = welcome
         self.put_off = None
         self.counters.identity_unwritten += not self.identity.remember(welcome.resume_token)
-        self.phase = Phase.SYNCING
+        self.phase = ConnectionPhase.SYNCING
         self._joined_at = now_ns
-        self._heartbeat_ns = heartbeat_period(welcome)
+        self._heartbeat_ns = bounded_heartbeat_ns(welcome)
         self._heartbeat_at = now_ns + self._heartbeat_ns // 2
         self._snapshot_at = now_ns
-        if self.stop.message is not None:
-            self.stop.ask(self.stop.message)
-            self._queue(self.stop.message)
+        if self.pending_estop.message is not None:
+            self.pending_estop.begin(self.pending_estop.message)
+            self._queue(self.pending_estop.message)
         if self.tracking_epoch:
             self._queue(TrackingEpoch(self.tracking_epoch))
         self._keep_up(now_ns)
 
     def _refused(self, refused: Refused, now_ns: int) -> None:
-        if self.phase is not Phase.JOINING:
+        if self.phase is not ConnectionPhase.JOINING:
             return
         if refused.code == RefusalCode.RESUME_TOKEN and self.identity.resume_token:
             # Used up or forgotten: join as somebody new.
             self.counters.identity_unwritten += not self.identity.remember(b"")
             self._say_hello(now_ns)
-        elif refused.code == RefusalCode.RATE or (refused.code in TRANSIENT and self.welcome is not None):
+        elif refused.code == RefusalCode.RATE or (refused.code in RETRYABLE_REFUSALS and self.welcome is not None):
             self.put_off = refused
             self._wait(now_ns)
         else:
-            self.phase = Phase.REFUSED
+            self.phase = ConnectionPhase.REFUSED
             self.failure = (VersionError if refused.code == RefusalCode.VERSION else RefusedError)(refused)
 
     def _fault(self, fault: ProtocolFault, now_ns: int) -> None:
-        self.counters.fault(fault.code)
+        self.counters.count_fault(fault.code)
         self._deliver(fault)
-        if fault.code in NOT_TAKEN:
+        if fault.code in UNREAD_MESSAGE_FAULTS:
             self.not_taken = fault
         elif fault.code in ("stalled", "recovered"):
             self.stalled = fault.code == "stalled"
-        elif (end := end_for_good(fault)) is not None:
+        elif (end := final_refusal(fault)) is not None:
             self.failure = RefusedError(end)
-            self.phase = Phase.REFUSED
+            self.phase = ConnectionPhase.REFUSED
         elif fault.code == "session_ended" and self.joined:
             self.counters.reconnects += 1
             self._wait(now_ns)
@@ -198,19 +198,19 @@ class Receiving:
         for told in self.mirror.apply_snapshot(snapshot):
             self._deliver(told)
         if self.mirror.estop:
-            self.stop.withdraw()
+            self.pending_estop.withdraw()
         self.stream.scene_epoch = self.mirror.bodies_until
-        self.stream.keep_presence(self.mirror.connected)
+        self.stream.retain_presence(self.mirror.connected)
         self.stream.load_keyframe(snapshot.state_seq, poses)
         self._maybe_ready()
 
     def _maybe_ready(self) -> None:
-        if self.phase is Phase.SYNCING and self.mirror.synced and self.clock.settled:
-            self.phase = Phase.READY
+        if self.phase is ConnectionPhase.SYNCING and self.mirror.synced and self.clock.settled:
+            self.phase = ConnectionPhase.READY
 
-    def _deliver(self, message: Told) -> None:
+    def _deliver(self, message: InboxMessage) -> None:
         if isinstance(message, Event) and isinstance(message.body, ParticipantLeft):
-            self.stream.forget_presence(message.body.participant)
+            self.stream.remove_presence(message.body.participant)
         if len(self.inbox) >= MAX_INBOX:
             self._make_room()
         self.inbox.append(message)

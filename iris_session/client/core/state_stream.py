@@ -82,7 +82,7 @@ class StateStream:
         self.scene_epoch = 0
         self.wants_snapshot = False
         self._decoder: RigidDecoder | None = None
-        self.reconnected()
+        self.restart()
 
     def reset(self) -> None:
         """Another connection: frames may be numbered anew, nothing held is of use."""
@@ -91,9 +91,9 @@ class StateStream:
         self._presence_ns = 0
         self._presence_waiting = []
         self.wants_snapshot = False
-        self.reconnected()
+        self.restart()
 
-    def reconnected(self) -> None:
+    def restart(self) -> None:
         """Frames come by another way from now on: nothing waits in queues yet, and the usual age may be another."""
         self._came_ns = -1  # when a frame came last; on the client's own clock, as the next one
         self._flush_until = 0  # old frames are thrown away until then
@@ -133,10 +133,10 @@ class StateStream:
                 self.counters.unknown_topic += 1
         state = None if newest is None else self._decode(*newest, now_ns, local_ns)
         if len(self._presence_waiting) >= PRESENCE_WAITING:
-            self._take_presence()
+            self._decode_presence()
         return state
 
-    def still_fresh(self, local_ns: int) -> bool:
+    def check_fresh(self, local_ns: int) -> bool:
         """Whether what was drained last is still to be handed out, at `local_ns` on the client's clock.
 
         Not when the client stood still since then: fresh frames are right behind. Only the first time in a row, for who
@@ -153,23 +153,23 @@ class StateStream:
     @property
     def presence(self) -> dict[tuple[str, str], PresenceItem]:
         """Heads and hands of everyone by `(participant, device)`. Decoded when looked at: the scene goes first."""
-        self._take_presence()
+        self._decode_presence()
         return self._presence
 
-    def keep_presence(self, participants: Container[str]) -> None:
+    def retain_presence(self, participants: Container[str]) -> None:
         """Only these are here: what others sent before they left, and came after, is not shown."""
-        self._take_presence()
+        self._decode_presence()
         for key in [key for key in self._presence if key[0] not in participants]:
             del self._presence[key]
 
-    def forget_presence(self, participant: str) -> None:
+    def remove_presence(self, participant: str) -> None:
         """This participant left: nothing of it is shown any more."""
         presence = self.presence
         for key in [key for key in presence if key[0] == participant]:
             del presence[key]
 
     def _decode(self, header: StateHeader, payload: bytes, now_ns: int, local_ns: int) -> SceneState | None:
-        if self._waited_in_a_queue(now_ns - header.published_ns, local_ns):
+        if self._is_from_queue(now_ns - header.published_ns, local_ns):
             self.counters.queued_old += 1
             return None
         decoder = self._decoder
@@ -197,7 +197,7 @@ class StateStream:
         poses.flags.writeable = False
         return SceneState(header, poses, now_ns, now_ns - header.session_time)
 
-    def _waited_in_a_queue(self, age_ns: int, local_ns: int) -> bool:
+    def _is_from_queue(self, age_ns: int, local_ns: int) -> bool:
         """Whether a frame that comes now is to be thrown away, because fresher ones must be right behind it."""
         stood_still = self._came_ns >= 0 and local_ns - self._came_ns > STALLED_NS
         self._came_ns = local_ns
@@ -212,7 +212,7 @@ class StateStream:
         self._flush_until = 0
         return False
 
-    def _take_presence(self) -> None:
+    def _decode_presence(self) -> None:
         waiting, self._presence_waiting = self._presence_waiting, []
         for data in waiting:
             try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 MAX_CODES = 64
 
 
-class Phase(enum.Enum):
+class ConnectionPhase(enum.Enum):
     """Where the connection stands, see `connection`."""
 
     IDLE = "idle"
@@ -39,6 +39,6 @@ class ConnectionCounters:
     reconnects: int = 0
     faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`, beyond `MAX_CODES` as "other"
 
-    def fault(self, code: str) -> None:
+    def count_fault(self, code: str) -> None:
         code = code if code in self.faults or len(self.faults) < MAX_CODES else "other"
         self.faults[code] = self.faults.get(code, 0) + 1

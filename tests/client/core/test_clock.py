@@ -19,7 +19,7 @@ def exchange(
     """One exchange starting at `local_ns`; returns the local time of its end."""
     t1 = local_ns + out_ns + offset_ns
     end = local_ns + out_ns + held_ns + back_ns
-    clock.pong(local_ns, t1, t1 + held_ns, end)
+    clock.process_pong(local_ns, t1, t1 + held_ns, end)
     return end
 
 
@@ -96,18 +96,18 @@ def test_a_start_on_a_busy_link_does_not_leave_samples_in_the_future_for_seconds
 @pytest.mark.parametrize("stamps", [(10, 5, 5, 9), (0, 10, 5, 20), (0, 0, 30, 20)])
 def test_impossible_exchanges_are_counted_and_ignored(stamps: tuple[int, int, int, int]) -> None:
     clock = ClockSync()
-    clock.pong(*stamps)
+    clock.process_pong(*stamps)
     assert clock.rejected == 1
     assert not clock.synced
 
 
 def test_pings_come_in_a_burst_then_slowly() -> None:
     clock = ClockSync()
-    sent = [t for t in range(0, 3 * SECOND, 1_000_000) if clock.ping_due(t)]
+    sent = [t for t in range(0, 3 * SECOND, 1_000_000) if clock.poll_ping(t)]
     assert sum(t < SECOND // 4 for t in sent) == BURST
     assert 4 <= sum(t >= SECOND // 4 for t in sent) <= 7
     clock.reset()
-    assert clock.ping_due(0)
+    assert clock.poll_ping(0)
 
 
 def settled(clock: ClockSync, local_ns: int = 0) -> int:
@@ -125,7 +125,7 @@ def test_a_machine_that_slept_knows_the_time_again_after_four_exchanges() -> Non
         local = exchange(clock, local, 300_000, 300_000, OFFSET + slept)
         truth = local + OFFSET + slept
         assert abs(clock.session_ns(local) - truth) <= clock.error_bound_ns(local), "the bound is honest throughout"
-        assert i == JUMP - 1 or clock.ping_due(local), "found out quickly"
+        assert i == JUMP - 1 or clock.poll_ping(local), "found out quickly"
     assert abs(clock.session_ns(local) - local - OFFSET - slept) < 1_000_000
     assert clock.error_bound_ns(local) < 1_000_000
 

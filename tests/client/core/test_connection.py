@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client.core.clock import SETTLED
-from iris_session.client.core.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.limits import (
     BACKOFF_MAX_NS,
     HELLO_TIMEOUT_MAX_NS,
@@ -19,7 +19,7 @@ from iris_session.client.core.limits import (
     MAX_PENDING,
 )
 from iris_session.client.core.outbox import MAX_OUTGOING
-from iris_session.client.core.status import Phase
+from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
 from iris_session.client.identity import Identity
 from iris_session.protocol.client_messages import (
@@ -63,7 +63,7 @@ class Wire:
     """A connection and what it sent."""
 
     def __init__(self) -> None:
-        self.connection = Connection(Hello("operator", "ann"), Identity(b"s" * 16))
+        self.connection = ClientConnection(Hello("operator", "ann"), Identity(b"s" * 16))
         self.epoch = 0
 
     def sent(self) -> list[ClientMessage]:
@@ -103,7 +103,7 @@ class Wire:
         self.clock(now_ns)
         self.snapshot(now_ns)
         self.sent()
-        assert self.connection.phase is Phase.READY
+        assert self.connection.phase is ConnectionPhase.READY
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def wire() -> Wire:
 
 
 def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
-    assert wire.connection.phase is Phase.IDLE
+    assert wire.connection.phase is ConnectionPhase.IDLE
     wire.connection.open(0)
     (hello,) = wire.sent()
     assert isinstance(hello, Hello)
@@ -121,9 +121,9 @@ def test_join_says_hello_then_asks_for_clock_and_snapshot(wire: Wire) -> None:
     assert wire.connection.identity.resume_token == b"token"
     assert {type(m) for m in wire.sent()} == {ClockPing, GetSnapshot}
     wire.snapshot(20 * MS)
-    assert wire.connection.phase is Phase.SYNCING  # no clock yet
+    assert wire.connection.phase is ConnectionPhase.SYNCING  # no clock yet
     wire.clock(20 * MS)
-    assert wire.connection.phase is Phase.READY
+    assert wire.connection.phase is ConnectionPhase.READY
 
 
 def test_hello_without_answer_is_said_again_on_a_fresh_socket_with_back_off(wire: Wire) -> None:
@@ -146,7 +146,7 @@ def test_over_a_slow_link_an_answer_is_waited_for_longer_until_the_connection_is
     """Five ways there and back of 600 ms: the first two hellos are given up too early, the third is not."""
     wire.connection.open(0)
     said, now = 0, 0
-    while not wire.connection.joined:
+    while not wire.connection.is_joined:
         assert now < 60 * SECOND
         generation = wire.connection.generation
         now = wire.connection.next_deadline_ns(now)
@@ -158,7 +158,7 @@ def test_over_a_slow_link_an_answer_is_waited_for_longer_until_the_connection_is
         if wire.connection.generation != generation:
             said = now
     assert wire.connection.generation == 3
-    wire.connection.lost(now + 10 * SECOND)
+    wire.connection.handle_disconnect(now + 10 * SECOND)
     assert wire.connection.next_deadline_ns(now + 10 * SECOND) == now + 10 * SECOND + HELLO_TIMEOUT_NS
 
 
@@ -173,7 +173,7 @@ def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
             kinds.append(type(message))
             if isinstance(message, ClockPing):
                 wire.get(ClockPong(message.t0_ns, now, now), now)
-    assert wire.connection.phase is Phase.READY
+    assert wire.connection.phase is ConnectionPhase.READY
     assert kinds.count(Heartbeat) >= 19
     assert 15 <= kinds.count(ClockPing) <= 35
 
@@ -181,7 +181,7 @@ def test_timers_keep_a_quiet_connection_alive(wire: Wire) -> None:
 def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> None:
     wire.join()
     now = 0
-    while wire.connection.joined:
+    while wire.connection.is_joined:
         now = max(now + MS, wire.connection.next_deadline_ns(now))
         wire.connection.tick(now)
     assert 3 * SECOND <= now <= 5 * SECOND
@@ -194,7 +194,7 @@ def test_silence_ends_the_connection_and_the_token_resumes_it(wire: Wire) -> Non
 def test_who_stood_still_first_reads_what_was_said_meanwhile(wire: Wire) -> None:
     wire.join()
     wire.connection.tick(60 * SECOND)
-    assert wire.connection.phase is Phase.READY
+    assert wire.connection.phase is ConnectionPhase.READY
     assert {type(message) for message in wire.sent()} == {ClockPing, Heartbeat}
     wire.connection.tick(60 * SECOND + 500 * MS)
     wire.get(ProtocolFault("hello", "say hello"), 60 * SECOND + 600 * MS)
@@ -206,8 +206,8 @@ def test_a_connection_that_breaks_at_once_is_retried_with_back_off(wire: Wire) -
     now, waits = 0, []
     for _ in range(6):
         wire.welcome(now)
-        wire.connection.lost(now + MS)
-        assert wire.connection.phase is Phase.WAITING
+        wire.connection.handle_disconnect(now + MS)
+        assert wire.connection.phase is ConnectionPhase.WAITING
         waits.append(wire.connection.next_deadline_ns(now) - now)
         now = wire.connection.next_deadline_ns(now)
         wire.connection.tick(now)
@@ -228,16 +228,16 @@ def test_used_token_is_dropped_and_hello_said_again(wire: Wire) -> None:
 
 def test_refusals_end_it_unless_they_pass(wire: Wire) -> None:
     wire.join()
-    wire.connection.lost(SECOND)
+    wire.connection.handle_disconnect(SECOND)
     wire.get(Refused(DenialReason.SESSION_FULL, "full"), 2 * SECOND, epoch=0)
-    assert wire.connection.phase is Phase.WAITING
+    assert wire.connection.phase is ConnectionPhase.WAITING
     wire.connection.tick(5 * SECOND)
     wire.get(Refused(RefusalCode.VERSION, "other version", supported_versions=(7, 8)), 5 * SECOND, epoch=0)
-    assert wire.connection.phase is Phase.REFUSED
+    assert wire.connection.phase is ConnectionPhase.REFUSED
     assert isinstance(wire.connection.failure, VersionError)
     assert wire.connection.failure.supported_versions == (7, 8)
     wire.connection.open(6 * SECOND)
-    assert wire.connection.phase is Phase.JOINING
+    assert wire.connection.phase is ConnectionPhase.JOINING
     assert wire.connection.failure is None
 
 
@@ -247,7 +247,7 @@ def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire:
     for _ in range(8):
         wire.sent()
         wire.get(Refused(RefusalCode.RATE, "too many hellos at once", "try again in a second"), now, epoch=0)
-        assert wire.connection.phase is Phase.WAITING
+        assert wire.connection.phase is ConnectionPhase.WAITING
         assert "too many hellos" in wire.connection.describe()
         waits.append(wire.connection.next_deadline_ns(now) - now)
         now = wire.connection.next_deadline_ns(now)
@@ -255,14 +255,14 @@ def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire:
     assert waits == sorted(waits)
     assert waits[-1] == BACKOFF_MAX_NS
     wire.welcome(now)
-    assert wire.connection.put_off is None
+    assert wire.connection.retryable_refusal is None
     assert wire.connection.failure is None
 
 
 @pytest.mark.parametrize(
-    ("code", "phase"), [("session_ended", Phase.WAITING), ("dropped", Phase.JOINING), ("hello", Phase.JOINING)]
+    ("code", "phase"), [("session_ended", ConnectionPhase.WAITING), ("dropped", ConnectionPhase.JOINING), ("hello", ConnectionPhase.JOINING)]
 )
-def test_faults_that_end_the_connection(wire: Wire, code: str, phase: Phase) -> None:
+def test_faults_that_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase) -> None:
     wire.join()
     wire.get(ProtocolFault(code, "the session let this connection go: heartbeat"), SECOND)
     assert wire.connection.phase is phase
@@ -274,7 +274,7 @@ def test_another_session_makes_everything_anew_but_keeps_the_tracking_epoch(wire
     wire.connection.tracking_epoch = 3
     wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
     assert wire.connection.mirror.event_seq == 1
-    wire.connection.lost(SECOND)
+    wire.connection.handle_disconnect(SECOND)
     wire.sent()
     wire.welcome(2 * SECOND, session="s2")
     assert not wire.connection.clock.synced
@@ -290,7 +290,7 @@ def test_samples_are_never_kept_for_later_and_other_messages_raise(wire: Wire) -
         wire.connection.request(Acquire(0))
     wire.join()
     wire.connection.send(SAMPLE)
-    wire.connection.lost(SECOND)
+    wire.connection.handle_disconnect(SECOND)
     assert [type(message) for message in wire.sent()] == [Hello]
     assert not wire.connection.send(SAMPLE)
     assert wire.connection.counters.samples_not_sent == 2
@@ -315,12 +315,12 @@ def test_replies_reach_who_asked_and_leases_count_at_once(wire: Wire) -> None:
     wire.get(Reply(number, True, leases=(lease,)), MS)
     wire.get(Reply(number, True), MS)
     assert wire.connection.counters.unexpected_replies == 1
-    reply = wire.connection.answers.take(number)
+    reply = wire.connection.requests.pop_reply(number)
     assert reply is not None
     assert reply.ok
-    assert wire.connection.answers.take(number) is None
+    assert wire.connection.requests.pop_reply(number) is None
     assert wire.connection.lease_version("left") == 4
-    wire.connection.lost(SECOND)
+    wire.connection.handle_disconnect(SECOND)
     assert wire.connection.lease_version("left") is None
 
 
@@ -406,7 +406,7 @@ def test_close_says_bye_and_forgets_the_token(wire: Wire) -> None:
 def test_a_client_whose_identity_was_taken_over_leaves_the_token_to_the_other(wire: Wire) -> None:
     wire.join()
     wire.get(ProtocolFault("dropped", "let go", "replaced"), MS)
-    assert wire.connection.phase is Phase.REFUSED
+    assert wire.connection.phase is ConnectionPhase.REFUSED
     wire.connection.close()
     assert wire.connection.identity.resume_token == b"token"
 
@@ -418,8 +418,8 @@ def test_answers_that_nobody_fetches_are_bounded(wire: Wire) -> None:
         ids.append(wire.connection.request(Acquire(0)))
         wire.get(Reply(ids[-1], True), MS)
     assert wire.connection.counters.inbox_dropped == 5
-    assert wire.connection.answers.take(ids[4]) is None
-    assert wire.connection.answers.take(ids[5]) == Reply(ids[5], True)
+    assert wire.connection.requests.pop_reply(ids[4]) is None
+    assert wire.connection.requests.pop_reply(ids[5]) == Reply(ids[5], True)
 
 
 @given(st.lists(st.lists(st.binary(max_size=80), max_size=3), max_size=20))
@@ -429,7 +429,7 @@ def test_any_bytes_from_a_server_are_counted_and_harm_nothing(messages: list[lis
     wire.join()
     for frames in messages:
         wire.connection.receive(frames, MS)
-    assert wire.connection.phase is Phase.READY
+    assert wire.connection.phase is ConnectionPhase.READY
     assert wire.connection.counters.malformed == len(messages)
 
 
@@ -459,7 +459,7 @@ def test_a_full_disk_ends_neither_joining_nor_closing(
     monkeypatch.setattr(wire.connection.identity, "_write", full)
     wire.join()
     assert wire.connection.identity.resume_token == b"token"
-    wire.connection.lost(2 * SECOND)
+    wire.connection.handle_disconnect(2 * SECOND)
     wire.get(Refused(RefusalCode.RESUME_TOKEN, "used"), 2 * SECOND, epoch=0)
     wire.welcome(3 * SECOND, b"next")
     wire.connection.close()

@@ -33,10 +33,10 @@ def test_equal_orientations_do_not_divide_by_zero() -> None:
 
 def test_shows_the_past_between_frames_with_its_age() -> None:
     buffer = PoseBuffer(delay_ns=30 * MS)
-    assert buffer.show(0) is None
+    assert buffer.poses_at(0) is None
     for i in range(6):
         buffer.add(i * 16 * MS, frame(0.016 * i))
-    shown = buffer.show(70 * MS)
+    shown = buffer.poses_at(70 * MS)
     assert shown is not None
     assert shown.poses[0, 0] == pytest.approx(0.040)
     assert (shown.session_time_ns, shown.age_ns, shown.starved) == (40 * MS, 30 * MS, False)
@@ -45,7 +45,7 @@ def test_shows_the_past_between_frames_with_its_age() -> None:
 def test_starved_display_keeps_the_newest_and_says_so() -> None:
     buffer = PoseBuffer(delay_ns=10 * MS)
     buffer.add(0, frame(1.0))
-    shown = buffer.show(500 * MS)
+    shown = buffer.poses_at(500 * MS)
     assert shown is not None
     assert shown.poses[0, 0] == 1.0
     assert shown.age_ns == 500 * MS
@@ -57,15 +57,15 @@ def test_time_shown_never_goes_back_and_old_frames_are_counted() -> None:
     buffer = PoseBuffer(delay_ns=10 * MS)
     for i in range(4):
         buffer.add(i * 10 * MS, frame(float(i)))
-    first = buffer.show(35 * MS)
-    again = buffer.show(25 * MS)
+    first = buffer.poses_at(35 * MS)
+    again = buffer.poses_at(25 * MS)
     assert first is not None
     assert again is not None
     assert again.session_time_ns == first.session_time_ns
     buffer.add(5 * MS, frame(9.0))
     assert buffer.late == 1
     buffer.clear()
-    assert buffer.show(40 * MS) is None
+    assert buffer.poses_at(40 * MS) is None
 
 
 def test_large_batches_are_right() -> None:

@@ -173,12 +173,12 @@ def test_a_frame_in_hand_when_the_client_stood_still_is_not_handed_out(server: S
     server.frame(0)
     server.join(stream)
     assert drain(stream, [server.frame(MS)], MS) is not None
-    assert stream.still_fresh(2 * MS + LOCAL)
+    assert stream.check_fresh(2 * MS + LOCAL)
     assert drain(stream, [server.frame(17 * MS)], 17 * MS) is not None
-    assert not stream.still_fresh(3000 * MS + LOCAL)
+    assert not stream.check_fresh(3000 * MS + LOCAL)
     assert drain(stream, [server.frame(33 * MS)], 3001 * MS) is None  # nor what waited meanwhile
     assert drain(stream, [server.frame(3002 * MS)], 3003 * MS) is not None
-    assert stream.still_fresh(3004 * MS + LOCAL)
+    assert stream.check_fresh(3004 * MS + LOCAL)
     assert (stream.counters.delivered, stream.counters.queued_old) == (2, 2)
 
 
@@ -189,7 +189,7 @@ def test_who_is_slow_with_every_frame_is_handed_them_all_but_the_first(server: S
     kept = []
     for t in range(100 * MS, 1100 * MS, 100 * MS):
         assert drain(stream, [server.frame(t - MS)], t) is not None
-        kept.append(stream.still_fresh(t + 80 * MS + LOCAL))
+        kept.append(stream.check_fresh(t + 80 * MS + LOCAL))
     assert kept == [False] + [True] * 9
 
 
@@ -237,7 +237,7 @@ def test_presence_of_who_is_not_here_is_not_kept() -> None:
     stream = StateStream()
     items = (PresenceItem("p1", "head", IDENTITY), PresenceItem("p2", "head", IDENTITY))
     drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(10, 11, items))]], 12)
-    stream.keep_presence({"p2"})
+    stream.retain_presence({"p2"})
     assert set(stream.presence) == {("p2", "head")}
 
 
@@ -248,7 +248,7 @@ def test_presence_keeps_the_latest_per_device_and_forgets_who_left() -> None:
     drain(stream, [[TOPIC_PRESENCE, encode_presence(Presence(9, 11, items[:1]))]], 12)  # older
     assert set(stream.presence) == {("p1", "head"), ("p2", "head")}
     assert stream.counters.out_of_order == 1
-    stream.forget_presence("p1")
+    stream.remove_presence("p1")
     assert set(stream.presence) == {("p2", "head")}
 
 
