@@ -16,7 +16,7 @@ from fuzz_decoders import Decoder
 from fuzz_inputs import Corpus, encoded
 from fuzz_machines import FrontControl
 
-from iris_session.client.core.asset_loader import WINDOW_BYTES, WINDOW_REQUESTS, ChunkRequest, AssetLoader
+from iris_session.client.core.asset_loader import WINDOW_BYTES, WINDOW_REQUESTS, AssetLoader, ChunkRequest
 from iris_session.protocol import codec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.errors import ProtocolError

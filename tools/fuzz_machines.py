@@ -20,8 +20,7 @@ import zmq
 from fuzz_decoders import client_messages, rigid_frames, server_messages
 from fuzz_inputs import Corpus, encoded
 
-from iris_session.client.core.connection import ClientConnection
-from iris_session.client.core.limits import MAX_INBOX
+from iris_session.client.core.connection import MAX_INBOX, ClientConnection
 from iris_session.client.core.state_stream import StateStream
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
@@ -47,7 +46,7 @@ sys.path.insert(0, str(ROOT))  # the harness and the random entries are those of
 MS: Final = 1_000_000
 
 
-class ClientConnection:
+class HostileSession:
     """A client that a hostile session talks to: after an honest welcome now and then, anything."""
 
     def __init__(self, rng: Random) -> None:
@@ -324,7 +323,7 @@ class Core:
 
 
 MACHINES: Final[dict[str, Callable[[Random], Any]]] = {
-    "connection": ClientConnection,
+    "connection": HostileSession,
     "state-stream": ClientState,
     "front": FrontControl,
     "front-tcp": FrontTcp,

@@ -36,7 +36,7 @@ TRIM_EVERY: Final = 64 << 20
 PART: Final = ".part"
 ADDRESS_DIGITS: Final = 64
 #: What to do when the folder cannot be used, for error texts.
-ANOTHER: Final = "name another folder: client.asset_cache = AssetCache(folder), or set XDG_CACHE_HOME"
+ANOTHER: Final = "name another folder: client.assets.cache = AssetCache(folder), or set XDG_CACHE_HOME"
 
 
 def default_folder() -> Path:

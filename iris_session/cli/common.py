@@ -100,8 +100,8 @@ def expect_session(arguments: argparse.Namespace) -> None:
     """Raises `CommandError` within `CONNECT_S` where nothing listens at the address that was given: a client would wait
     for it to begin. A session by its name has no address yet."""
     from iris_session.client.address import Address
+    from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
     from iris_session.client.host_lookup import resolve_host
-    from iris_session.client.joining import LOCAL_ADDRESS
 
     if arguments.session:
         return

@@ -24,7 +24,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def run(arguments: argparse.Namespace) -> int:
     """Exit status 0 when any was heard, 1 when none was."""
     from iris_session.client import find_sessions
-    from iris_session.client.known_servers import known_fingerprints
+    from iris_session.client.endpoint_resolver import known_fingerprints
 
     known = known_fingerprints()
     found = find_sessions(arguments.seconds)

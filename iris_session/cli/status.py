@@ -100,7 +100,7 @@ def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport
         try:
             report = client.status()
         except (NotConnectedError, RequestTimeoutError) as error:
-            why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
+            why = str(error) if client.ready else f"no session answers at {client.describe_failure('now')}"
             raise CommandError(why) from None
         yield client, report
     finally:

@@ -5,7 +5,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 """
 
 from iris_session.assets.cache import AssetCache
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.core.interpolation import PoseBuffer, ShownPoses
 from iris_session.client.core.state_stream import SceneState

@@ -5,52 +5,19 @@ Whatever cannot be converted raises `InvalidMessageError` at once, in one line t
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.client.errors import InvalidMessageError
-from iris_session.protocol.client_messages import ClientMessage, envelope
-from iris_session.protocol.codec import decode_client, encode_client
 from iris_session.protocol.common import MAX_TEXT, Pose
-from iris_session.protocol.errors import ProtocolError
 
 Numbers = Sequence[float] | NDArray[Any]
 #: `((x, y, z) [m], (w, x, y, z))` of tuples, lists or arrays, or a `Pose`.
 PoseLike = Pose | tuple[Numbers, Numbers]
 POSE_FORM: Final = "((x, y, z), (w, x, y, z))"
-#: Where msgspec says that an error is: after the three fields of the envelope before the message.
-_PLACE: Final = re.compile(r" - at `\$\[3\]\.?([^`]*)`$")
-
-
-def encode_checked(message: ClientMessage, connection_epoch: int = 0) -> bytes:
-    """The encoded envelope of `message`, decoded once as the session will do. Raises `InvalidMessageError`."""
-    kind = type(message).__name__
-    try:
-        data = encode_client(envelope(message, connection_epoch))
-        decode_client(data)
-    except ProtocolError as error:
-        text = str(error).removeprefix(f"{kind.lower()}: ")
-        place = _PLACE.search(text)
-        where = f"{place[1]}: " if place and place[1] else ""
-        raise InvalidMessageError(f"{kind} cannot be sent: {where}{_PLACE.sub('', text)}") from None
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidMessageError(f"{kind} cannot be sent: {_find_unencodable(message) or error}") from None
-    return data
-
-
-def _find_unencodable(message: ClientMessage) -> str:
-    """The first field that MessagePack cannot carry."""
-    for name, value in msgspec.structs.asdict(message).items():
-        try:
-            msgspec.msgpack.encode(value)
-        except (TypeError, ValueError, OverflowError):
-            return f"{name}: {type(value).__name__} {str(value)[:40]!r} is not of a type that the protocol has"
-    return ""
 
 
 def to_text(value: object) -> str:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.errors import AssetError, ClientError, NotConnectedError
 from iris_session.protocol.assets import is_address

@@ -1,36 +1,29 @@
-"""Waiting for several clients in one loop, without threads."""
+"""Groups of clients in one loop, without threads."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import zmq
 
+from iris_session.client.client import Client
 from iris_session.client.core.status import ConnectionPhase
+from iris_session.client.sockets import to_milliseconds
 
-if TYPE_CHECKING:
-    from iris_session.client.client import Client
-
-
-def to_milliseconds(nanoseconds: int) -> int:
-    """Rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
-    return max(0, -(-nanoseconds // 1_000_000))
-
-
-#: Looks at the state sockets of all before the rest is seen to, when state came for any.
+#: Passes over the state sockets of all clients before anything else, when state came for any.
 _ROUNDS: Final = 3
 
 
 class ClientGroup:
-    """Several clients that one loop polls; those that were closed are passed over.
+    """Several clients polled by one loop; closed ones are skipped.
 
     Keeps its poller from wait to wait: making one anew costs more than waiting.
 
-    group = ClientGroup(clients)
-    while running:
-        group.poll(0.1)
+        group = ClientGroup(clients)
+        while running:
+            group.poll(0.1)
     """
 
     def __init__(self, clients: Sequence[Client]) -> None:
@@ -40,27 +33,36 @@ class ClientGroup:
         self._registered: list[tuple[int, bool]] = []
 
     def wait(self, timeout_s: float) -> list[Client]:
-        """Waits until one of them has something to do, at most `timeout_s`. Polls none of them.
+        """Wait until a client has something to do, without polling any.
 
-        Returns those to be polled: something came for them, or their own timer is due.
+        Args:
+            timeout_s: Seconds to wait at most.
+
+        Returns:
+            Clients to be polled: something came for them, or their own timer is due.
         """
         state, rest = self._wait(timeout_s)
         return [c for c in self.clients if c in state or c in rest]
 
     def poll(self, timeout_s: float) -> None:
-        """Waits like `wait`, then polls: first the state of all for whom state came, then the rest of those who have
-        anything else to do. So nobody's picture waits for the chores of others."""
+        """Wait like `wait`, then poll: first the state of all clients that have some, then the rest of the work.
+
+        So no client's state waits for the other work of others.
+
+        Args:
+            timeout_s: Seconds to wait at most.
+        """
         state, rest = self._wait(timeout_s)
         for _ in range(_ROUNDS):
             for client in state:
                 client.poll_state()
-            # Pictures come to all within a millisecond: asking each socket costs a tenth of waiting anew.
-            state = [client for client in self.clients if client.state_waits] if state else []
+            # State comes to all within a millisecond: asking each socket costs a tenth of waiting anew.
+            state = [client for client in self.clients if client.has_state] if state else []
         for client in rest:
             client.poll(0.0)
 
     def _wait(self, timeout_s: float) -> tuple[list[Client], list[Client]]:
-        """Clients for whom state came, and those for whom anything else came or whose timer is due."""
+        """Return the clients for which state came, and those for which anything else came or a timer is due."""
         now = time.monotonic_ns()
         clients = [client for client in self.clients if client.connection.phase is not ConnectionPhase.CLOSED]
         due = [client.connection.next_deadline_ns(now) for client in clients]
@@ -86,16 +88,29 @@ class ClientGroup:
 
 
 def _poller_key(sock: zmq.Socket[bytes] | int) -> int:
-    """What a poller calls a socket: itself one of ZeroMQ, by its descriptor any other."""
+    """Return the key of a socket in a poller: its id for one of ZeroMQ, its descriptor for any other."""
     return sock if isinstance(sock, int) else id(sock)
 
 
 def wait_any(clients: Sequence[Client], timeout_s: float) -> list[Client]:
-    """One `ClientGroup.wait` for these clients."""
+    """Wait once for any of several clients, as `ClientGroup.wait`.
+
+    Args:
+        clients: The clients.
+        timeout_s: Seconds to wait at most.
+
+    Returns:
+        Clients to be polled.
+    """
     return ClientGroup(clients).wait(timeout_s)
 
 
 def poll_all(clients: Sequence[Client], timeout_s: float = 0.0) -> None:
-    """Polls several clients that have no thread, after `wait_any`."""
+    """Wait once for any of several clients that have no thread, and poll those that have something to do.
+
+    Args:
+        clients: The clients.
+        timeout_s: Seconds to wait at most.
+    """
     for client in wait_any(clients, timeout_s):
         client.poll(0.0)

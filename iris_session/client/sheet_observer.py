@@ -1,13 +1,11 @@
-"""Looking at sheets through a camera of our own: a picture in, observations of the session's anchors out.
+"""Observation of printed sheets through a camera: an image in, observations of the session's anchors out.
 
-For headsets whose camera can be read, and for cameras on a tracked thing. The detector is that of `anchors`; OpenCV and
-SciPy, which it needs, are imported with the first picture.
+For headsets whose camera can be read, and for cameras on a tracked device. The detector is that of `anchors`; OpenCV
+and SciPy, which it needs, are imported with the first image.
 """
 
 from __future__ import annotations
 
-import threading
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_rotate
-from iris_session.client.arguments import PoseLike, to_pose
-from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import ClientError, InvalidMessageError
-from iris_session.protocol.client_messages import ClientMessage, Observation
+from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import Pose
 
 if TYPE_CHECKING:
@@ -26,7 +22,6 @@ if TYPE_CHECKING:
     from anchors.detection import Sighting
     from anchors.sheet import Sheet
 
-Array = NDArray[np.float64]
 #: From further away, or after such a turn, the errors of lens and light are others: a new viewpoint.
 VIEWPOINT_M: Final = 0.15
 VIEWPOINT_RAD: Final = 0.26
@@ -42,7 +37,7 @@ class ViewpointCounter:
         self._from: tuple[int, PoseTuple] | None = None
 
     def number_at(self, tracking_epoch: int, T_tracking_camera: PoseTuple) -> int:
-        """The number of the viewpoint that the camera is at now."""
+        """Return the number of the viewpoint that the camera is at now."""
         if self._from is not None and self._from[0] == tracking_epoch:
             p, q = self._from[1]
             near = distance(p, T_tracking_camera[0]) <= VIEWPOINT_M
@@ -53,89 +48,64 @@ class ViewpointCounter:
         return self._number
 
 
-class Looking:
-    """Mixin of `Client`: sees sheets in pictures and reports them."""
+class SheetObserver:
+    """Detects sheets in images; keeps the detector of the camera and sheets that it was last used with."""
 
-    connection: ClientConnection
-    _lock: threading.RLock
-    _viewpoints: ViewpointCounter
-    _detector: Any
+    def __init__(self) -> None:
+        self.viewpoints = ViewpointCounter()
+        self._detector: Any = None
 
-    @abstractmethod
-    def session_now_ns(self) -> int: ...
+    def detect(self, image: NDArray[Any], camera: Camera, sheets: Sequence[Sheet]) -> list[Sighting]:
+        """Return the sheets in an image, (height, width[, 3]) uint8, whose pose is not ambiguous.
 
-    @abstractmethod
-    def send(self, message: ClientMessage) -> bool: ...
-
-    def _init_looking(self) -> None:
-        self._viewpoints, self._detector = ViewpointCounter(), None
-
-    def observe_image(
-        self,
-        image: NDArray[Any],
-        camera: Camera,
-        sheets: Sequence[Sheet],
-        T_tracking_camera: PoseLike,
-        *,
-        capture_ns: int | None = None,
-        viewpoint_id: int | None = None,
-        device: str = "head",
-        camera_sigma: tuple[float, float] = CAMERA_SIGMA,
-        tracking_epoch: int | None = None,
-    ) -> list[Sighting]:
-        """Finds `sheets` in a picture, (height, width[, 3]) uint8, and reports them. Returns those that were reported.
-
-        `T_tracking_camera`: where the camera was when it took the picture (x right, y down, z into the scene), at
-        `capture_ns` of session time (default: now), known to `camera_sigma` ([m], [rad], standard deviations).
-        `viewpoint_id`: by default counted by where the camera goes. `tracking_epoch`: of the frame that
-        `T_tracking_camera` is in, by default the present one when this is called. Sightings of which nobody can tell
-        which of the two poses of a plane is right are left out. Takes tenths of a second: not for the loop that sends
-        samples.
-
-        Raises `InvalidMessageError` for a picture, camera or pose that cannot be, `ClientError` without OpenCV.
+        Raises `InvalidMessageError` for an image or camera that cannot be, `ClientError` without OpenCV.
         """
-        epoch = self.connection.tracking_epoch if tracking_epoch is None else tracking_epoch  # before the detection
-        now_ns = self.session_now_ns() if capture_ns is None else capture_ns
-        pose = to_pose("T_tracking_camera", T_tracking_camera)
-        T: PoseTuple = (pose.p, pose.q)
-        found = [one for one in self._sightings(image, camera, sheets) if not one.ambiguous]
-        if viewpoint_id is None:
-            with self._lock:
-                viewpoint_id = self._viewpoints.number_at(epoch, T)
-        for one in found:
-            self.send(
-                Observation(
-                    one.anchor_id,
-                    one.kind,
-                    Pose(*compose(T, one.T_camera_sheet)),
-                    now_ns,
-                    epoch,
-                    viewpoint_id,
-                    one.edge_m,
-                    device=device,
-                    covariance=to_tracking_covariance(one.covariance, T, one.T_camera_sheet, camera_sigma),
-                )
-            )
-        return found
+        return [one for one in self._sightings(image, camera, sheets) if not one.ambiguous]
 
     def _sightings(self, image: NDArray[Any], camera: Camera, sheets: Sequence[Sheet]) -> list[Sighting]:
         try:
             from anchors.camera import CameraError
             from anchors.detection import DetectionError, SheetDetector
         except ImportError as error:
-            raise _without(error) from error
+            raise _missing_package(error) from error
         try:
             detector = self._detector
             if detector is None or (detector.camera, detector.sheets) != (camera, tuple(sheets)):
                 detector = self._detector = SheetDetector(sheets, camera)
             return list(detector.detect(np.asarray(image)))
         except ImportError as error:  # OpenCV is imported where it is used
-            raise _without(error) from error
+            raise _missing_package(error) from error
         except (DetectionError, CameraError) as error:
             raise InvalidMessageError(f"observe_image: {error}") from error
 
 
-def _without(error: ImportError) -> ClientError:
+def to_observation(
+    sighting: Sighting,
+    T_tracking_camera: PoseTuple,
+    *,
+    capture_ns: int,
+    tracking_epoch: int,
+    viewpoint_id: int,
+    device: str,
+    camera_sigma: tuple[float, float],
+) -> Observation:
+    """Return the observation of a sheet that was seen from `T_tracking_camera`."""
+    return Observation(
+        sighting.anchor_id,
+        sighting.kind,
+        Pose(*compose(T_tracking_camera, sighting.T_camera_sheet)),
+        capture_ns,
+        tracking_epoch,
+        viewpoint_id,
+        sighting.edge_m,
+        device=device,
+        covariance=to_tracking_covariance(
+            sighting.covariance, T_tracking_camera, sighting.T_camera_sheet, camera_sigma
+        ),
+    )
+
+
+def _missing_package(error: ImportError) -> ClientError:
     return ClientError(
         f"finding sheets needs OpenCV and SciPy ({error.name} is missing): pip install 'iris-session[anchors]'"
     )

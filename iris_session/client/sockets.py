@@ -9,17 +9,18 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
 import zmq
 
-from iris_session.client.asset_context import asset_context
 from iris_session.client.errors import IdentityError
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.security import KeysError, load_public, load_secret
+from iris_session.system.priority import made_below
 
 STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
@@ -57,6 +58,11 @@ class CurveKeys:
         except KeysError as error:
             raise IdentityError(str(error)) from None
         return cls(server_public.encode(), own.public.encode(), own.secret.encode())
+
+
+def to_milliseconds(nanoseconds: int) -> int:
+    """Convert to milliseconds, rounded up: rounded down, the last millisecond of a wait would be a busy loop."""
+    return max(0, -(-nanoseconds // 1_000_000))
 
 
 class ClientSockets:
@@ -243,7 +249,7 @@ class ClientSockets:
         return _drain(self._state)
 
     @property
-    def state_waits(self) -> bool:
+    def has_state(self) -> bool:
         """Whether something came on the state channel."""
         return _readable(self._state)
 
@@ -364,3 +370,22 @@ def _receive(sock: zmq.Socket[bytes]) -> list[bytes]:
         frame = sock.recv(_NOBLOCK, copy=False)
         frames.append(frame.bytes)
     return frames
+
+
+_lock = threading.Lock()
+_context: tuple[int, zmq.Context[zmq.Socket[bytes]]] | None = None
+
+
+def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
+    """One per process; a forked child gets its own."""
+    global _context  # noqa: PLW0603
+    with _lock:
+        if _context is None or _context[0] != os.getpid():
+            _context = os.getpid(), made_below(_opened)
+        return _context[1]
+
+
+def _opened() -> zmq.Context[zmq.Socket[bytes]]:
+    made: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    made.socket(zmq.DEALER).close(linger=0)  # with the first socket libzmq starts its threads
+    return made

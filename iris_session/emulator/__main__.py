@@ -13,8 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.client import ClientError
-from iris_session.client.endpoint_resolver import ConnectRequest, resolve_blocking
-from iris_session.client.joining import parse_connect_request
+from iris_session.client.endpoint_resolver import ConnectRequest, parse_connect_request, resolve_blocking
 from iris_session.emulator.equipment import behaviour_of, curve_of
 from iris_session.emulator.orders import Orders
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets

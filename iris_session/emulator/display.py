@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from anchors.pose import PoseTuple, Vec3, compose
 from iris_session.client import Client, PoseBuffer, SceneState, ShownPoses
-from iris_session.client.scene import pose_at
+from iris_session.client.core.scene_follower import pose_at
 
 
 class Display:

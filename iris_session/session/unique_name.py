@@ -37,7 +37,9 @@ class Neighbours:
             self._listener.wait(left)
             self._listener.poll_sessions()
         heard = {
-            session.name: session.address for session in self._listener.poll_sessions() if session.session_id != session_id
+            session.name: session.address
+            for session in self._listener.poll_sessions()
+            if session.session_id != session_id
         }
         if name not in heard:
             return name

@@ -259,7 +259,7 @@ def test_a_folder_that_cannot_be_used_says_so(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="cannot be used") as caught:
         AssetCache(tmp_path / "file").begin(ADDRESS)
     assert caught.value.reason == "cache"
-    assert "client.asset_cache = AssetCache(folder)" in str(caught.value), "how to name another one"
+    assert "client.assets.cache = AssetCache(folder)" in str(caught.value), "how to name another one"
     assert "XDG_CACHE_HOME" in str(caught.value)
     with pytest.raises(ValueError, match="no address"):
         AssetCache(tmp_path).path("../../etc/passwd")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.client import AssetCache, AssetError
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from tests.assets.test_cache import stored
 
 LOST, WAITED = "0" * 64, "1" * 64

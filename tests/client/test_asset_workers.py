@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from iris_session.client import AssetCache
-from iris_session.client.asset_workers import AssetWorkers, AssetFailed, AssetMissing, Result, BytesStored
+from iris_session.client.asset_workers import AssetFailed, AssetMissing, AssetWorkers, BytesStored, Result
 from tests.assets.test_cache import ADDRESS, DATA
 
 

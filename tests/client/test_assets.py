@@ -375,7 +375,7 @@ def test_a_frame_larger_than_any_is_not_taken_into_memory(
     client, _ = turn_to(answers)
     fetch = client.assets.fetch([address])
     assert client.wait_for(lambda _: len(told) == 1, DEADLINE_S)
-    client._drop_asset_link()  # as after `PATIENCE_NS`
+    client.assets._close_link()  # as after `PATIENCE_NS`
     until_done(client, fetch)
     assert told == [0, 0]
     assert (fetch.read(address), fetch.bytes_received, client.assets.malformed) == (data, len(data), 0)

@@ -237,7 +237,7 @@ def test_after_a_patch_all_go_on_and_what_is_the_same_is_not_begun_anew(play: Pl
     assert [mesh is kept.get(mesh.key) for mesh in play.shapes._meshes] == [True, False]
     assert {name: mesh.look for name, mesh in play.shapes.meshes.items()} == {first: recoloured, "other": renamed}
     assert play.client.media.subscribe(play.parts[0].stream) is feeds[play.parts[0].stream]
-    assert play.client._feeds.keys() == {part.stream for part in play.parts[:2]}
+    assert play.client.media._feeds.keys() == {part.stream for part in play.parts[:2]}
     assert play.faults == {""}
 
 
@@ -279,7 +279,7 @@ def test_of_another_scene_nothing_is_shown_before_it_is_known(play: Play, shared
     play.until(lambda: play.client.mirror.synced and play.client.mirror.scene_epoch == 2)
     play.until(lambda: "unknown_asset" in play.shapes.fault)
     assert (play.shapes.vertices, play.shapes.capture_ns, play.shapes.meshes) == ({}, {}, {})
-    assert not play.client._feeds
+    assert not play.client.media._feeds
     play.live.show(address, assets, "")
     play.until(lambda: play.shapes.scene_hash == address)
     feed = play.client.media.subscribe(play.parts[0].stream)
@@ -297,7 +297,9 @@ def test_names_that_are_names_stay() -> None:
 
     assert deformable_keys([part("cloth", "flex-0"), part("rope", "flex-1")]) == ["cloth", "rope"]
     assert deformable_keys([part("", "a"), part("", "b"), part("x", "c"), part("x", "d")]) == ["a", "b", "c", "d"]
-    assert deformable_keys([part("", "x"), part("x", "y")]) == ["x'", "x"], "somebody is called like the stream of another"
+    assert deformable_keys([part("", "x"), part("x", "y")]) == ["x'", "x"], (
+        "somebody is called like the stream of another"
+    )
     assert deformable_keys([part("", "x"), part("", "x")]) == ["x", "x'"]
 
 
@@ -318,7 +320,7 @@ def test_numbers_of_vertices_that_cannot_be_are_a_fault(
         client, shapes = watch(live, joined, tmp_path / "cache")
         assert client.wait_for(lambda _: (shapes.update(), bool(shapes.fault))[1], DEADLINE_S)
         assert "vertex" in shapes.fault or "vertices" in shapes.fault
-        assert not client._feeds, "nothing of it is subscribed to"
+        assert not client.media._feeds, "nothing of it is subscribed to"
     finally:
         live.close()
 
@@ -357,10 +359,10 @@ def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
     shapes._use(both, "1" * 64)
     feed = client.media.subscribe(part.stream)
     shapes._use(both[:1], "2" * 64)
-    assert client._feeds == {part.stream: feed}
+    assert client.media._feeds == {part.stream: feed}
     assert both[0].feed is feed
     shapes._use([], "3" * 64)
-    assert client._feeds == {}
+    assert client.media._feeds == {}
     client.close()
 
 

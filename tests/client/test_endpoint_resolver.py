@@ -14,12 +14,10 @@ import zmq
 
 from iris_session.client import Client, ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client import endpoint_resolver as meeting_module
-from iris_session.client import pairing as pairing_module
+from iris_session.client import endpoint_resolver as resolver_module
 from iris_session.client.address import Address, pairing_uri
 from iris_session.client.discovery import request_introduction
-from iris_session.client.endpoint_resolver import resolve_blocking
-from iris_session.client.joining import parse_connect_request
-from iris_session.client.pairing import pair_key
+from iris_session.client.endpoint_resolver import pair_key, parse_connect_request, resolve_blocking
 from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
@@ -166,7 +164,7 @@ def test_who_lets_us_in_must_be_who_introduced_himself(lab: Lab, monkeypatch: py
     def other_id(said: Introduction) -> Introduction:
         return msgspec.structs.replace(said, beacon=msgspec.structs.replace(said.beacon, session_id="other"))
 
-    monkeypatch.setattr(meeting_module, "ask_introduction", introduced_as(other_id))
+    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_id))
     with pytest.raises(SessionNameError, match="where another introduced itself"):
         lab.join(lab.address)
     with pytest.raises(SessionNameError, match="heard there"):
@@ -180,7 +178,7 @@ def test_the_introduction_of_a_neighbouring_port_is_not_taken(lab: Lab, monkeypa
         beacon = msgspec.structs.replace(said.beacon, control=said.beacon.control + 1, session_id="other")
         return Introduction(beacon, KeyPair.new().public)
 
-    monkeypatch.setattr(meeting_module, "ask_introduction", introduced_as(other_port))
+    monkeypatch.setattr(meeting_module, "request_introduction", introduced_as(other_port))
     lab.join(lab.address).close()  # by the stored key
 
 
@@ -207,8 +205,8 @@ def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
 
 def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """As when a class puts on its headsets: nobody has to type the code again."""
-    monkeypatch.setattr(pairing_module, "AGAIN_S", 0.01)
-    monkeypatch.setattr(pairing_module, "ANSWER_S", 1.0)
+    monkeypatch.setattr(resolver_module, "PAIR_RETRY_S", 0.01)
+    monkeypatch.setattr(resolver_module, "ANSWER_S", 1.0)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
     server, own, code = KeyPair.new(), KeyPair.new(), "7KQ2-M4XD-9PTR"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

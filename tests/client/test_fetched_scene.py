@@ -12,7 +12,7 @@ import mujoco
 import pytest
 
 from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError, fetched_scene
-from iris_session.client.asset_fetch import AssetFetch
+from iris_session.client.assets import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.assets import AssetRefused, AssetRequest
 from iris_session.protocol.codec import encode_asset_header

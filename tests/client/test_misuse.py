@@ -12,7 +12,8 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.client import Client, ClientError, DeniedError, InvalidMessageError
-from iris_session.client.arguments import encode_checked, to_names, to_numbers, to_pose, to_text
+from iris_session.client.arguments import to_names, to_numbers, to_pose, to_text
+from iris_session.client.core.outbox import encode_checked
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.client_messages import Acquire, Control, EStop, Marker, Observation, PlaceAlignment, Sample
 from iris_session.protocol.codec import decode_client

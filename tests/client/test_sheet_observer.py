@@ -131,13 +131,13 @@ def test_looks_are_of_the_tracking_frame_that_the_picture_was_taken_in(
     ann: Quiet, picture: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Finding sheets takes tenths of a second, and the frame may jump meanwhile."""
-    honest = ann._sightings
+    honest = ann._sheets._sightings
 
     def slow(*given: Any) -> Any:
         ann.new_tracking_frame()
         return honest(*given)
 
-    monkeypatch.setattr(ann, "_sightings", slow)
+    monkeypatch.setattr(ann._sheets, "_sightings", slow)
     ann.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA)
     ann.observe_image(picture, CAMERA, [TABLE], T_TRACKING_CAMERA, tracking_epoch=0)
     assert ann.connection.tracking_epoch == 2

@@ -151,7 +151,9 @@ def test_blackout_of_five_seconds(linked: Linked) -> None:
     assert watcher.mirror.leases["left"].holder == me, "in grace"
     proxy.do("resume")
     resumed_ns = watcher.session_now_ns()
-    stage.run(lambda: ann.ready and ann.scene.state is not None and ann.scene.state.received_ns > resumed_ns, "ann is back")
+    stage.run(
+        lambda: ann.ready and ann.scene.state is not None and ann.scene.state.received_ns > resumed_ns, "ann is back"
+    )
     assert ann.participant_id == me
     stage.run(lambda: watcher.mirror.leases["left"].lease_version > before.lease_version, "ann's lease is resumed")
     assert watcher.mirror.leases["left"].holder == me
@@ -209,7 +211,9 @@ def test_another_network(linked: Linked) -> None:
     stage.run(lambda: watcher.mirror.leases["left"].lease_version > before.lease_version, "the lease is resumed")
     assert watcher.mirror.leases["left"].holder == me
     begun_ns = watcher.session_now_ns()
-    stage.run(lambda: ann.scene.state is not None and ann.scene.state.received_ns > begun_ns, "ann sees the scene again")
+    stage.run(
+        lambda: ann.scene.state is not None and ann.scene.state.received_ns > begun_ns, "ann sees the scene again"
+    )
     hand.velocity = (0.0, 0.0, 0.0)
     stage.engage(hand)
     stage.run(lambda: watcher.session_now_ns() - begun_ns > 2_500 * MS, "the dead connection's silence is noticed")

@@ -256,9 +256,13 @@ def _pause_and_resume(stage: Stage, hand: Hand, director: Client) -> None:
     stage.seconds(0.3)
     assert director.scene.state.header.tick == tick
     director.control("step", 5)
-    stage.run(lambda: director.scene.state is not None and director.scene.state.header.tick == tick + 5, "five single steps")
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick == tick + 5, "five single steps"
+    )
     director.control("resume")
-    stage.run(lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 50, "running again")
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 50, "running again"
+    )
 
 
 def _reset(stage: Stage, hand: Hand, director: Client) -> None:

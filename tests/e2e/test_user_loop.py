@@ -208,7 +208,9 @@ def test_a_loop_that_blocks_for_five_seconds(script: Callable[[str], Stage], bod
     hand.velocity = (0.0, 0.2, 0.0)  # the hand goes on, clutch closed
     assert director.scene.state is not None
     assert director.scene.state.header.tick == tick, "the loop still stands"
-    stage.run(lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 100, "the loop goes on")
+    stage.run(
+        lambda: director.scene.state is not None and director.scene.state.header.tick > tick + 100, "the loop goes on"
+    )
     assert distance(before[0], hand.tip[0]) < 2e-3
     feedback = ann.feedback["left"]
     assert feedback.state == CommandKind.HOLD
@@ -254,7 +256,10 @@ def test_a_reset_by_the_script_is_a_new_epoch(script: Callable[[str], Stage]) ->
     stage.run(lambda: watcher.mirror.scene_epoch == epoch + 1, "a new scene epoch")
     causes = [e.body.cause for e in stage.events["watcher"] if isinstance(e.body, SceneChanged)]
     assert causes == ["external"]
-    stage.run(lambda: watcher.scene.state is not None and watcher.scene.state.header.scene_epoch == epoch + 1, "its first picture")
+    stage.run(
+        lambda: watcher.scene.state is not None and watcher.scene.state.header.scene_epoch == epoch + 1,
+        "its first picture",
+    )
     stage.seconds(1.0)
     assert distance(start[0], hand.tip[0]) < 2e-3, "the robot must stay where the reset put it"
     hand.sending, hand.velocity = True, (0.0, 0.0, 0.0)

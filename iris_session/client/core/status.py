@@ -1,4 +1,4 @@
-"""Where a connection stands, and what happened on it."""
+"""Phase and counters of a client connection."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MAX_CODES = 64
 
 
 class ConnectionPhase(enum.Enum):
-    """Where the connection stands, see `connection`."""
+    """Phase of a connection; `connection` draws the transitions."""
 
     IDLE = "idle"
     JOINING = "joining"
@@ -22,7 +22,7 @@ class ConnectionPhase(enum.Enum):
 
 @dataclass(slots=True)
 class ConnectionCounters:
-    """What happened on the control channel, since the client was made."""
+    """Counters of the control channel, since the client was made."""
 
     sent: int = 0
     received: int = 0
@@ -32,7 +32,7 @@ class ConnectionCounters:
     malformed: int = 0  # frames that do not fit the protocol
     other_connection: int = 0  # addressed to an earlier connection of ours
     unexpected_replies: int = 0
-    unasked_denials: int = 0  # of messages that expect no answer; handed to `on_denial`
+    unasked_denials: int = 0  # of messages that expect no reply; passed to `on_denial`
     identity_unwritten: int = 0  # the identity file took no new resume token: after a kill it cannot resume
     inbox_dropped: int = 0  # events, feedback and replies that the application did not fetch
     snapshots: int = 0
@@ -40,5 +40,6 @@ class ConnectionCounters:
     faults: dict[str, int] = field(default_factory=dict)  # by `ProtocolFault.code`, beyond `MAX_CODES` as "other"
 
     def count_fault(self, code: str) -> None:
+        """Count a `ProtocolFault`."""
         code = code if code in self.faults or len(self.faults) < MAX_CODES else "other"
         self.faults[code] = self.faults.get(code, 0) + 1

@@ -17,8 +17,8 @@ from iris_session.client.core.asset_loader import (
     SLOW_NS,
     WINDOW_BYTES,
     WINDOW_REQUESTS,
-    ChunkRequest,
     AssetLoader,
+    ChunkRequest,
     FailedAsset,
 )
 from iris_session.protocol.assets import MAX_ASSET_BYTES, AssetChunk, AssetRefused
@@ -34,7 +34,9 @@ def started(*addresses: str, offset: int = 0) -> AssetLoader:
     return loader
 
 
-def answer(loader: AssetLoader, ask: ChunkRequest, total: int, size: int = -1, now_ns: int = FAST_NS) -> bool | FailedAsset | None:
+def answer(
+    loader: AssetLoader, ask: ChunkRequest, total: int, size: int = -1, now_ns: int = FAST_NS
+) -> bool | FailedAsset | None:
     """By default as fast as leaves the size of chunks as it is."""
     size = max(0, min(ask.length, total - ask.offset)) if size < 0 else size
     return loader.process_chunk(AssetChunk(1, ask.request_id, ask.address, ask.offset, total), size, now_ns)

@@ -10,15 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.client.core.clock import SETTLED
-from iris_session.client.core.connection import ClientConnection
-from iris_session.client.core.limits import (
+from iris_session.client.core.connection import (
     BACKOFF_MAX_NS,
     HELLO_TIMEOUT_MAX_NS,
     HELLO_TIMEOUT_NS,
     MAX_INBOX,
-    MAX_PENDING,
+    ClientConnection,
 )
-from iris_session.client.core.outbox import MAX_OUTGOING
+from iris_session.client.core.outbox import MAX_OUTGOING, MAX_PENDING
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.errors import IdentityError, NotConnectedError, VersionError
 from iris_session.client.identity import Identity
@@ -260,7 +259,12 @@ def test_a_first_hello_that_is_one_of_too_many_is_said_again_with_back_off(wire:
 
 
 @pytest.mark.parametrize(
-    ("code", "phase"), [("session_ended", ConnectionPhase.WAITING), ("dropped", ConnectionPhase.JOINING), ("hello", ConnectionPhase.JOINING)]
+    ("code", "phase"),
+    [
+        ("session_ended", ConnectionPhase.WAITING),
+        ("dropped", ConnectionPhase.JOINING),
+        ("hello", ConnectionPhase.JOINING),
+    ],
 )
 def test_faults_that_end_the_connection(wire: Wire, code: str, phase: ConnectionPhase) -> None:
     wire.join()
@@ -437,7 +441,7 @@ def test_a_request_that_cannot_be_queued_raises(wire: Wire) -> None:
     wire.join()
     for _ in range(MAX_OUTGOING):
         wire.connection.send(Marker(0, "x"))
-    with pytest.raises(NotConnectedError, match="takes nothing"):
+    with pytest.raises(NotConnectedError, match="queue full"):
         wire.connection.request(Acquire(0))
 
 

@@ -1,4 +1,4 @@
-"""The context of assets: one per process, and its I/O thread gives way to others."""
+"""Sockets: the context of assets is one per process, and its I/O thread has a lower priority than others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 CODE = """
 import os, time
 from pathlib import Path
-from iris_session.client.asset_context import asset_context
+from iris_session.client.sockets import asset_context
 from iris_session.system.priority import NICER
 
 def lower():

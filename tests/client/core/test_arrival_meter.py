@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from iris_session.client import Client, NotConnectedError
+from iris_session.client.core.arrival_meter import MAX_AGES, PERIOD_NS, ArrivalMeter
 from iris_session.client.core.connection import ClientConnection
 from iris_session.client.core.state_stream import SceneState
 from iris_session.client.core.status import ConnectionPhase
 from iris_session.client.identity import Identity
-from iris_session.client.reporting import MAX_AGES, PERIOD_NS, ArrivalMeter
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.server_messages import StateHeader
 from iris_session.protocol.status import ClientReport
