@@ -149,7 +149,7 @@ def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -
         return False
 
     polling, ann.poll = ann.poll, lambda timeout_s=0.0: tell(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]
-    with pytest.raises(InvalidMessageError, match="Acquire was not taken: acquire: robots is wrong"):
+    with pytest.raises(InvalidMessageError, match="Acquire: acquire: robots is wrong"):
         ann.request(Acquire(0, ("left",)), timeout_s=30.0)
     session.pause_steps(False)
 
