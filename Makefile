@@ -6,7 +6,7 @@ export IRIS_DATA ?= $(abspath ../shared)
 # Some environments forbid compiled files: then each process that a test starts compiles all our modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev demo test check test-unit test-e2e test-random coverage bench clean help
+.PHONY: install install-dev demo screenshots test check test-unit test-e2e test-random coverage bench clean help
 
 help:
 	@echo "make demo     two emulated operators hand a hammer over, recorded and verified"
@@ -16,7 +16,8 @@ help:
 	@echo "  make test-e2e   tests that start real processes;  make test-e2e T=tests/e2e/test_people.py"
 	@echo "  make coverage   the bounds of coverage, after test-unit"
 	@echo "make test-random  the unit tests with other random examples than the usual ones"
-	@echo "make bench    the benchmarks of the README"
+	@echo "make bench    the benchmarks of docs/benchmarks.md"
+	@echo "make screenshots  records the demo anew and makes the moving picture of the README"
 	@echo "make install  only makes $(VENV) and installs"
 
 $(VENV)/.installed: pyproject.toml
@@ -35,6 +36,12 @@ install-dev: $(VENV)/.installed-dev
 
 demo: install
 	@$(BIN)/iris-session demo handover
+
+# OpenGL without a display (Debian: libegl1 libgl1-mesa-dri).
+screenshots: install
+	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
+	$(BIN)/iris-session demo handover --record "$$folder/session.rrd" && \
+	MUJOCO_GL=egl $(BIN)/python tools/render_recording.py "$$folder/session.rrd" docs/img/handover.gif --size 720 430
 
 check: install-dev
 	$(BIN)/ruff check .

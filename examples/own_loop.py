@@ -10,8 +10,7 @@ import time
 
 import mujoco
 
-from iris_session import Session, SessionConfig
-from iris_session.demo.scenes import scene_path
+from iris_session import Session, SessionConfig, scene_path
 
 
 def main(seconds: float) -> None:

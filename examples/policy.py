@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import sys
 
-from iris_session import Client, ClientError
-from iris_session.protocol.names import HoldReason
+from iris_session import Client, ClientError, HoldReason
 
 #: Holds that end only when the clutch was opened and closed again; anything else needs no reaction.
 OPEN_CLUTCH = frozenset(

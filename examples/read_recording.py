@@ -11,8 +11,7 @@ from itertools import groupby
 
 import numpy as np
 
-from iris_session.protocol.server_messages import ParticipantJoined
-from iris_session.recording import Recording
+from iris_session import ParticipantJoined, Recording
 
 
 def main(path: str) -> None:

@@ -12,8 +12,7 @@ import time
 
 import mujoco
 
-from iris_session import Session
-from iris_session.demo.scenes import scene_path
+from iris_session import Session, scene_path
 
 
 def main(seconds: float) -> None:

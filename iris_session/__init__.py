@@ -1,17 +1,11 @@
-"""iris-session: several people with XR headsets in one robot scene.
+"""Put several people with XR headsets into one robot scene.
 
-Public API, nothing else is public:
+The names of this package are the public API; everything below it may change.
 
-- `Session`, `SessionConfig`: share a MuJoCo scene from your own process. Errors: `SessionError` and its subclasses.
-- `SceneBuilder`: compose a scene without MuJoCo, from shapes and files (glTF, URDF, OBJ, STL, ...). Error:
-  `SceneBuildError`.
-- `ScenePublisher`: share such a scene, moved by another simulator or a real robot. Error: `PublishError`.
-- `Client`: join a session from any process. `ClientGroup`, `wait_any`: several clients in one loop. `Identity`,
-  `CurveKeys`: who a client is. `SceneState`, `PoseBuffer`: newest and interpolated poses. Errors: `ClientError` and its
-  subclasses `NotConnectedError`, `RefusedError`, `DeniedError`, `RequestTimeoutError`, `InvalidMessageError`,
-  `TrustError`, `AssetError`. `find_sessions`: sessions on this network, as `FoundSession`.
-- `fetch_scene`: specification, meshes and textures of the scene, as `FetchedScene`; `Budget`, `QUEST_3` choose levels
-  of detail, `AssetCache` keeps assets. `Deformables`: vertices and triangles of cloths, ropes and soft bodies.
+- Share a MuJoCo scene: `Session`, `SessionConfig`, with `AuthorityConfig` and `ControlConfig`.
+- Share another world: `SceneBuilder` composes a scene, `ScenePublisher` moves it.
+- Join a session: `Client`, `find_sessions`, `fetch_scene`, `Deformables`.
+- Read a recording: `Recording`.
 
 Names are imported on first use, so that a light client does not load MuJoCo.
 """
@@ -22,7 +16,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from iris_session.assets.cache import AssetCache
+    from iris_session.assets.store import AssetStore
+    from iris_session.authority.config import AuthorityConfig
     from iris_session.client import (
         AssetError,
         Client,
@@ -44,9 +39,28 @@ if TYPE_CHECKING:
     )
     from iris_session.client.deformables import Deformables
     from iris_session.client.fetched_scene import FetchedScene, fetch_scene
+    from iris_session.control.config import ControlConfig
+    from iris_session.demo.named_scenes import scene_by_name
+    from iris_session.demo.scenes import n_arms_scene, scene_path
+    from iris_session.physics import load_model, load_robots_toml
+    from iris_session.protocol.common import Pose
+    from iris_session.protocol.names import HoldReason
+    from iris_session.protocol.scene import (
+        AddMaterial,
+        AddMesh,
+        AddVisual,
+        Geometry,
+        RemoveVisual,
+        SetVisual,
+        Visual,
+    )
+    from iris_session.protocol.server_messages import ParticipantJoined
+    from iris_session.protocol.specs import ObjectSpec, RobotSpec
+    from iris_session.recording import Recording, RecordingError
     from iris_session.scene.budget import QUEST_3, Budget
     from iris_session.scene.compose import SceneBuilder
     from iris_session.scene.errors import SceneBuildError
+    from iris_session.scene.mujoco_scene import parse_mujoco
     from iris_session.session.config import SessionConfig
     from iris_session.session.errors import (
         ConfigError,
@@ -58,79 +72,135 @@ if TYPE_CHECKING:
     )
     from iris_session.session.scene_publisher import ScenePublisher
     from iris_session.session.session import Session
+    from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
+    from iris_session.streams.deformable_topology import DeformableTopology
 
-_HOME: Final = {
-    "Session": "iris_session.session.session",
-    "SessionConfig": "iris_session.session.config",
-    "SessionError": "iris_session.session.errors",
-    "ConfigError": "iris_session.session.errors",
-    "StartError": "iris_session.session.errors",
-    "ResumeError": "iris_session.session.errors",
-    "OwnershipError": "iris_session.session.errors",
-    "SceneBuilder": "iris_session.scene.compose",
-    "SceneBuildError": "iris_session.scene.errors",
-    "ScenePublisher": "iris_session.session.scene_publisher",
-    "PublishError": "iris_session.session.errors",
-    "Client": "iris_session.client",
-    "ClientError": "iris_session.client",
-    "DeniedError": "iris_session.client",
-    "RefusedError": "iris_session.client",
-    "NotConnectedError": "iris_session.client",
-    "RequestTimeoutError": "iris_session.client",
-    "InvalidMessageError": "iris_session.client",
-    "TrustError": "iris_session.client",
-    "AssetError": "iris_session.client",
-    "ClientGroup": "iris_session.client",
-    "wait_any": "iris_session.client",
-    "CurveKeys": "iris_session.client",
-    "Identity": "iris_session.client",
-    "SceneState": "iris_session.client",
-    "PoseBuffer": "iris_session.client",
-    "AssetCache": "iris_session.assets.cache",
-    "FoundSession": "iris_session.client",
-    "find_sessions": "iris_session.client",
-    "fetch_scene": "iris_session.client.fetched_scene",
-    "FetchedScene": "iris_session.client.fetched_scene",
-    "Budget": "iris_session.scene.budget",
-    "QUEST_3": "iris_session.scene.budget",
-    "Deformables": "iris_session.client.deformables",
+#: Module -> public names that live there.
+_PUBLIC: Final = {
+    "iris_session.session.session": ("Session",),
+    "iris_session.session.config": ("SessionConfig",),
+    "iris_session.session.errors": (
+        "SessionError",
+        "ConfigError",
+        "StartError",
+        "ResumeError",
+        "OwnershipError",
+        "PublishError",
+    ),
+    "iris_session.session.scene_publisher": ("ScenePublisher",),
+    "iris_session.authority.config": ("AuthorityConfig",),
+    "iris_session.control.config": ("ControlConfig",),
+    "iris_session.protocol.specs": ("RobotSpec", "ObjectSpec"),
+    "iris_session.physics": ("load_model", "load_robots_toml"),
+    "iris_session.demo.scenes": ("scene_path", "n_arms_scene"),
+    "iris_session.demo.named_scenes": ("scene_by_name",),
+    "iris_session.scene.compose": ("SceneBuilder",),
+    "iris_session.scene.errors": ("SceneBuildError",),
+    "iris_session.scene.mujoco_scene": ("parse_mujoco",),
+    "iris_session.scene.budget": ("Budget", "QUEST_3"),
+    "iris_session.assets.store": ("AssetStore",),
+    "iris_session.protocol.common": ("Pose",),
+    "iris_session.protocol.scene": (
+        "Geometry",
+        "Visual",
+        "SetVisual",
+        "AddVisual",
+        "RemoveVisual",
+        "AddMesh",
+        "AddMaterial",
+    ),
+    "iris_session.protocol.names": ("HoldReason",),
+    "iris_session.protocol.server_messages": ("ParticipantJoined",),
+    "iris_session.client": (
+        "Client",
+        "ClientGroup",
+        "wait_any",
+        "Identity",
+        "CurveKeys",
+        "SceneState",
+        "PoseBuffer",
+        "ClientError",
+        "NotConnectedError",
+        "RefusedError",
+        "DeniedError",
+        "RequestTimeoutError",
+        "InvalidMessageError",
+        "TrustError",
+        "AssetError",
+        "FoundSession",
+        "find_sessions",
+    ),
+    "iris_session.client.fetched_scene": ("fetch_scene", "FetchedScene"),
+    "iris_session.client.deformables": ("Deformables",),
+    "iris_session.streams.deformable": ("DeformableEncoder", "DeformableDecoder"),
+    "iris_session.streams.deformable_topology": ("DeformableTopology",),
+    "iris_session.recording": ("Recording", "RecordingError"),
 }
+_HOME: Final = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
     "Session",
     "SessionConfig",
+    "AuthorityConfig",
+    "ControlConfig",
+    "RobotSpec",
+    "ObjectSpec",
     "SessionError",
     "ConfigError",
     "StartError",
     "ResumeError",
     "OwnershipError",
+    "load_model",
+    "load_robots_toml",
+    "scene_path",
+    "scene_by_name",
+    "n_arms_scene",
+    # scenes
     "SceneBuilder",
     "SceneBuildError",
     "ScenePublisher",
     "PublishError",
+    "parse_mujoco",
+    "AssetStore",
+    "Pose",
+    "Geometry",
+    "Visual",
+    "SetVisual",
+    "AddVisual",
+    "RemoveVisual",
+    "AddMesh",
+    "AddMaterial",
+    # clients
     "Client",
+    "ClientGroup",
+    "wait_any",
+    "Identity",
+    "CurveKeys",
+    "SceneState",
+    "PoseBuffer",
     "ClientError",
-    "DeniedError",
-    "RefusedError",
     "NotConnectedError",
+    "RefusedError",
+    "DeniedError",
     "RequestTimeoutError",
     "InvalidMessageError",
     "TrustError",
     "AssetError",
-    "ClientGroup",
-    "wait_any",
-    "CurveKeys",
-    "Identity",
-    "SceneState",
-    "PoseBuffer",
-    "AssetCache",
     "FoundSession",
     "find_sessions",
+    "HoldReason",
     "fetch_scene",
     "FetchedScene",
     "Budget",
     "QUEST_3",
     "Deformables",
+    "DeformableEncoder",
+    "DeformableDecoder",
+    "DeformableTopology",
+    # recordings
+    "Recording",
+    "RecordingError",
+    "ParticipantJoined",
 ]
 
 

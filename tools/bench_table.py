@@ -1,4 +1,4 @@
-"""Runs the benchmarks of a session under every profile and prints the table of docs/links.md.
+"""Runs the benchmarks of a session under every profile and prints the table of docs/evidence/links.md.
 
 python tools/bench_table.py --seconds 20 > table.md
 python tools/bench_table.py --profiles lan,busy-wifi --seconds 5 --json
@@ -17,7 +17,7 @@ import subprocess
 import sys
 from typing import Any, Final
 
-from iris_session.bench import contract
+from iris_session.bench import report
 
 PROFILES: Final = ("", "lan", "good-wifi", "busy-wifi", "wan", "blackout")
 #: Label, arguments of `iris-session bench`, and what of the results goes into the table: key, label.
@@ -107,7 +107,7 @@ def main() -> int:
         print(json.dumps(reports))
     elif reports:
         print(rows(reports, options.profiles.split(",")))
-        machine = contract.machine()
+        machine = report.describe_machine()
         versions = f"Python {machine['python']}, MuJoCo {machine['mujoco']}"
         print(f"\n{machine['cpus']} cores, {versions}; {options.seconds:g} s each, seed {options.seed}.")
     return status

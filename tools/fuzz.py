@@ -21,12 +21,10 @@ from random import Random
 from typing import Any, Final
 
 import psutil
-from fuzz_assets import ASSET_DECODERS, ASSET_MACHINES
 from fuzz_decoders import DECODERS
-from fuzz_machines import ALL_TYPES, MACHINES
-from fuzz_media import MEDIA_DECODERS, MEDIA_MACHINES
+from fuzz_state_machines import ALL_TYPES, MACHINES
 
-TARGETS: Final = {**DECODERS, **MEDIA_DECODERS, **MACHINES, **MEDIA_MACHINES, **ASSET_DECODERS, **ASSET_MACHINES}
+TARGETS: Final = {**DECODERS, **MACHINES}
 #: What a target may hold more than after its first inputs.
 MAX_GROWTH_MIB: Final = 64
 WARM_UP: Final = 5000

@@ -1,6 +1,6 @@
 """Puts a bad link between a session and its clients; or measures what the proxy itself adds.
 
-    python tools/impair.py --link 127.0.0.2=busy-wifi          clients join at 127.0.0.2:7721, docs/links.md
+    python tools/impair.py --link 127.0.0.2=busy-wifi          clients join at 127.0.0.2:7721, docs/evidence/links.md
     python tools/impair.py measure --clients 16 --json
 
 `measure` sends what a session's state stream sends (60 messages of 3,700 bytes a second to each client) directly and

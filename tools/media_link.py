@@ -1,6 +1,6 @@
 """What a slow link does to the age of state beside 20 Mbit/s of media, with and without adaptive delivery.
 
-    python tools/media_link.py            prints the table of docs/links.md
+    python tools/media_link.py            prints the table of docs/evidence/links.md
 
 One observer behind the impairment proxy, state and media over one link; the session is a process of its own. Each row
 takes `--seconds`, after `--settle` on the slow link.

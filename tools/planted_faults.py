@@ -1,6 +1,6 @@
 """Plants faults, one after the other, and looks whether `iris-session doctor` names each of them.
 
-    python tools/planted_faults.py                 the table of docs/doctor.md; exit status 1 when one is not named
+    python tools/planted_faults.py                 table of docs/evidence/doctor.md; exit status 1 when one is not named
     python tools/planted_faults.py --only revoked --only full-disk --verbose
     python tools/planted_faults.py --list
 
@@ -19,14 +19,332 @@ import sys
 import tempfile
 import textwrap
 import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from planted import FAULTS, Fault, Visit, from_client
-from planted_lab import Lab, LabError, require
+from planted_lab import COMMAND, Lab, LabError, Machine, require, system, wait
 
-from iris_session.cli.doctor import lines, verdict
-from iris_session.doctor.findings import FAILED, Finding
+from iris_session.cli.doctor import format_findings, format_verdict
+from iris_session.doctor.findings import FAILED, WARNING, Finding
+
+IMPAIR: Final = str(Path(__file__).with_name("impair.py"))
+RECENTRED: Final = """
+import sys
+from iris_session import Client
+from iris_session.protocol.names import Role
+with Client(sys.argv[1], role=Role.DIRECTOR, alignment="not_needed", name="dora") as dora:
+    dora.start()
+    with Client(sys.argv[1], name="ann", devices=("head",)) as ann:
+        dora.place_alignment(ann.participant_id, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+        ann.wait_for(lambda c: c.alignment is not None and c.alignment.kind == "placed")
+        ann.new_tracking_frame()
+        ann.wait_for(lambda c: c.alignment is None or c.alignment.kind == "none")
+        print("recentred", flush=True)
+        ann.sleep(60)
+"""
+SLOW_LOOP: Final = """
+import time
+import mujoco
+from iris_session import Session, SessionConfig
+from iris_session.demo.scenes import scene_path
+config = SessionConfig(control_port=7741, state_port=7742, beacon_port=0, record=False)
+with Session(scene_path("handover"), config=config) as session:
+    mujoco.set_mjcb_passive(lambda model, data: time.sleep(0.003))  # of 2 ms that a tick has
+    print("on", session.address, flush=True)
+    session.run()
+"""
+#: Another address of the server, at which the link is bad.
+BEHIND: Final = "10.77.2.3"
+#: Looks at the sheet all the time, so that what the bump did is seen.
+BUMPED: Final = "name=ann,behaviour=idle,robot=left,glance_every_s=2,bump_m=0.2/0/0"
+#: A session of the next protocol version, as far as a doctor sees it.
+FUTURE: Final = """
+import socket
+from iris_session.protocol.codec import encode_introduction
+from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import PROTOCOL_VERSION
+said = Introduction(Beacon(PROTOCOL_VERSION + 1, "s2", "future", "live", "10.77.2.1", 7751, 0, 0, 0, 0))
+introducing, control = (socket.create_server(("10.77.2.1", port)) for port in (7750, 7751))
+print("listens", flush=True)
+while True:
+    visitor, _ = introducing.accept()
+    with visitor:
+        visitor.sendall(encode_introduction(said))
+"""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Where the doctor is called, and how. `keys`: the user who calls it."""
+
+    machine: Machine
+    arguments: tuple[str, ...]
+    keys: str = "keys"
+
+
+Plant = Callable[[Lab], AbstractContextManager[Visit]]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """`check` must be in `state` and say all of `says`. `follows`: checks that fail because of it."""
+
+    name: str
+    planted: str
+    plant: Plant
+    check: str
+    says: tuple[str, ...]
+    state: str = FAILED
+    follows: tuple[str, ...] = ()
+
+
+FAULTS: Final[list[Fault]] = []
+
+
+def fault(
+    planted: str, check: str, *says: str, state: str = FAILED, follows: tuple[str, ...] = ()
+) -> Callable[[Callable[[Lab], Iterator[Visit]]], Plant]:
+    """Puts the function on the list. `planted`: what it does, for the table."""
+
+    def decorate(function: Callable[[Lab], Iterator[Visit]]) -> Plant:
+        plant = contextmanager(function)
+        name = function.__name__.replace("_", "-")
+        FAULTS.append(Fault(name, planted, plant, check, says, state, follows))
+        return plant
+
+    return decorate
+
+
+def from_client(lab: Lab, *options: str, keys: str = "keys") -> Visit:
+    return Visit(lab.client, (lab.server.address, *options), keys)
+
+
+# --- the way ---------------------------------------------------------------------------------------------------------
+
+
+@fault("an address that no machine has", "tcp", "cannot be reached", "lab-1 (10.77.2.1:7721)")
+def wrong_address(lab: Lab) -> Iterator[Visit]:
+    yield Visit(lab.client, ("10.77.2.99",))
+
+
+@fault("a port on which nothing listens", "tcp", "nothing listens", "port 7799", "lab-1 (10.77.2.1:7721)")
+def wrong_port(lab: Lab) -> Iterator[Visit]:
+    yield Visit(lab.client, (f"{lab.server.address}:7799",))
+
+
+@fault("the client is in 10.88.2.0/24", "subnet", "10.88.2.0/24", "same network", follows=("tcp",))
+def wrong_subnet(lab: Lab) -> Iterator[Visit]:
+    with lab.client.addressed("10.88.2.2/24"):
+        yield from_client(lab)
+
+
+@fault("the server's firewall drops every TCP port", "tcp", "no answer", "a firewall", "let TCP 7721 in")
+def firewall(lab: Lab) -> Iterator[Visit]:
+    with lab.server.firewall("tcp dport 7720-7726"):
+        yield from_client(lab)
+
+
+@fault("it drops TCP 7722 alone", "state", "no answer", "port 7722 (state)", "let TCP 7722 in")
+def firewall_state_only(lab: Lab) -> Iterator[Visit]:
+    with lab.server.firewall("tcp dport 7722"):
+        yield from_client(lab)
+
+
+@fault("broadcasts are blocked, the address works", "beacon", "blocks broadcasts", "type", state=WARNING)
+def broadcasts_blocked(lab: Lab) -> Iterator[Visit]:
+    with lab.client.firewall("udp dport 7720"):
+        yield from_client(lab)
+
+
+@fault("broadcasts are blocked, and the session is sought by name", "beacon", "'lab-1'", "give its address")
+def by_name_without_broadcasts(lab: Lab) -> Iterator[Visit]:
+    with lab.client.firewall("udp dport 7720"):
+        yield Visit(lab.client, ("--session", "lab-1"))
+
+
+@fault("a session of the next protocol version", "version", "version 2", "update this machine")
+def other_version(lab: Lab) -> Iterator[Visit]:
+    with lab.server.doing(sys.executable, "-c", FUTURE, says="listens"):
+        yield Visit(lab.client, (f"{lab.server.address}:7751",))
+
+
+# --- the door --------------------------------------------------------------------------------------------------------
+
+
+@fault("a user who has not paired", "key", "not on the session's list", "iris-session pair")
+def not_paired(lab: Lab) -> Iterator[Visit]:
+    yield from_client(lab, keys="stranger")
+
+
+@fault("a join code with wrong letters", "code", "join code", "iris-session pair")
+def wrong_code(lab: Lab) -> Iterator[Visit]:
+    lab.code()
+    yield from_client(lab, "--code", "7KQ2-M4XD-9PTR", keys="stranger")
+
+
+@fault("a join code after its time", "code", "expired", "iris-session pair")
+def expired_code(lab: Lab) -> Iterator[Visit]:
+    code = lab.code("--minutes", "0.02")
+    time.sleep(1.5)  # its 1.2 s
+    yield from_client(lab, "--code", code, keys="stranger")
+
+
+@fault("`keys revoke` after the user had joined", "key", "let in before", "taken off", "iris-session pair")
+def revoked(lab: Lab) -> Iterator[Visit]:
+    joined = lab.client.iris("doctor", lab.server.address, "--code", lab.code("--name", "quest-3"), keys="loser")
+    if joined.returncode:
+        raise LabError(joined.stdout)
+    lab.server.iris("keys", "revoke", "quest-3")
+    yield from_client(lab, keys="loser")
+
+
+@fault("an observer's key wants to drive", "role", "may not join", "observer")
+def role(lab: Lab) -> Iterator[Visit]:
+    lab.server.iris("keys", "allow", "screen", lab.key_of("observer"), "--role", "observer")
+    yield from_client(lab, "--role", "operator", keys="observer")
+
+
+@fault("another server at the known address", "server_key", "is known for", "iris-session keys forget")
+def other_server(lab: Lab) -> Iterator[Visit]:
+    with lab.server.doing(
+        *COMMAND, "serve", "arm", "--no-record", "--host", lab.server.address, "--port-base", "7760",
+        says=r"on \S+:\d+,", keys="elsewhere",
+    ):  # fmt: skip
+        known = lab.client.folder / "victim" / "known_servers.json"
+        joined = lab.client.iris("doctor", lab.server.address, "--code", lab.code(), keys="victim")
+        if joined.returncode:
+            raise LabError(joined.stdout)
+        known.write_text(known.read_text().replace(":7721", ":7761"))
+        yield Visit(lab.client, (f"{lab.server.address}:7761",), "victim")
+
+
+# --- the session -----------------------------------------------------------------------------------------------------
+
+
+def emulate(lab: Lab, says: str, *people: str, orders: bool = False) -> AbstractContextManager[Any]:
+    """People with emulated headsets, from when one of them `says` something."""
+    headsets = [word for person in people for word in ("--headset", person)]
+    options = ["--orders"] if orders else []
+    return lab.client.doing(*COMMAND, "emulate", lab.server.address, *headsets, *options, says=says)
+
+
+@fault(
+    "a headset that has seen no sheet of the session",
+    "alignment",
+    "ann has no alignment",
+    "none of a sheet of this session",
+    "session: table",
+)
+def no_alignment(lab: Lab) -> Iterator[Visit]:
+    with emulate(lab, r"ann +look", "name=ann,behaviour=idle,robot=left,anchor_id=elsewhere"):
+        yield from_client(lab)
+
+
+@fault("a headset was recentred", "alignment", "ann has no alignment (lost", "jumped", "look at the sheet")
+def recentred(lab: Lab) -> Iterator[Visit]:
+    with lab.client.doing(sys.executable, "-c", RECENTRED, lab.server.address, says="recentred"):
+        yield from_client(lab)
+
+
+@fault(
+    "a headset was bumped, and nobody measures its alignment anew", "alarm", "ann: the tracking frame jumped",
+    "mm", "look at a sheet", follows=("alignment",),
+)  # fmt: skip
+def bumped(lab: Lab) -> Iterator[Visit]:
+    with emulate(lab, r"ann +work", BUMPED, orders=True) as ann:
+        lab.client.iris("anchors", "align", "stop", "ann", "--address", lab.server.address)
+        ann.stdin.write(b"bump ann\n")
+        ann.stdin.flush()
+        wait(lambda: "ALARM" in lab.client.iris("anchors", "status", lab.server.address).stdout, "an alarm")
+        yield from_client(lab)
+
+
+@fault("both robots are somebody else's", "leases", "carl has no robot", "left: ann", "right: bob", state=WARNING)
+def robot_held(lab: Lab) -> Iterator[Visit]:
+    here = ("name=ann,behaviour=idle,robot=left", "name=bob,behaviour=idle,robot=right")
+    both, wants = r"ann +work[\s\S]*bob +work|bob +work[\s\S]*ann +work", r"carl +\w+ +samples [1-9]"
+    with emulate(lab, both, *here), emulate(lab, wants, "name=carl,behaviour=idle,robot=left"):
+        wait(lambda: has_no_robot(lab, "carl"), "carl, who wants one")
+        yield from_client(lab)
+
+
+def has_no_robot(lab: Lab, name: str) -> bool:
+    return any(one["name"] == name and not one["holds"] for one in people(lab))
+
+
+def people(lab: Lab) -> list[dict[str, Any]]:
+    """Participants, as the status has them, those too whose connection is lost."""
+    status = json.loads(lab.client.iris("status", lab.server.address, "--json").stdout)
+    participants: list[dict[str, Any]] = status["participants"]
+    return participants
+
+
+@fault("a client's program stands still", "clients", "ann:", "silent", "is the app in front")
+def frozen_client(lab: Lab) -> Iterator[Visit]:
+    with emulate(lab, r"ann +look +samples [1-9]", "name=ann,behaviour=observer") as ann:
+        system("kill", "-STOP", str(ann.pid))
+        yield from_client(lab)
+    wait(lambda: "ann" not in {one["name"] for one in people(lab)}, "the end of what is kept for ann")
+
+
+@fault(
+    "a link of 100 ms each way (`tools/impair.py`)",
+    "clock",
+    "round trips are long",
+    "look at the network",
+    state=WARNING,
+)
+def slow_link(lab: Lab) -> Iterator[Visit]:
+    yield from behind(lab, "100ms")
+
+
+@fault("a link of 400 ms each way", "join", "introduces itself", "a link that is very slow", "look at the network")
+def very_slow_link(lab: Lab) -> Iterator[Visit]:
+    yield from behind(lab, "400ms")
+
+
+def behind(lab: Lab, profile: str) -> Iterator[Visit]:
+    """The server has another address, with such a link before it."""
+    words = (sys.executable, IMPAIR, "--link", f"{BEHIND}={profile}", "--target", lab.server.address)
+    with lab.server.addressed(f"{BEHIND}/24", too=True), lab.server.doing(*words, says="."):
+        yield Visit(lab.client, (BEHIND,))
+
+
+@fault("physics takes 3 ms of a tick of 2 ms", "ticks", "physics takes longer than a tick", "a larger time step")
+def late_ticks(lab: Lab) -> Iterator[Visit]:
+    with lab.server.doing(sys.executable, "-c", SLOW_LOOP, says="on "):
+        time.sleep(5.0)  # most of the ten seconds that late ticks are counted over
+        yield Visit(lab.server, ("127.0.0.1:7741",))
+
+
+@fault("the disk below the recording is full", "disk", "the disk is full", "make room", follows=("recorder",))
+def full_disk(lab: Lab) -> Iterator[Visit]:
+    disk = lab.small_disk(24)
+    with lab.server.doing(
+        *COMMAND, "serve", "handover", "--port-base", "7730", "--no-beacon", "--record", str(disk / "session.rrd"),
+        says=r"on \S+:\d+,",
+    ):  # fmt: skip
+        system("sh", "-c", f"cat /dev/zero > {disk}/other 2>/dev/null || true")
+        time.sleep(3.0)  # until the recorder has met it
+        yield Visit(lab.server, ("127.0.0.1:7731",))
+
+
+@fault("the session's program is stopped", "session", "stands still", "look at that program", follows=("join",))
+def session_stopped(lab: Lab) -> Iterator[Visit]:
+    [session] = lab.server.running[:1]
+    system("kill", "-STOP", str(session.pid))
+    try:
+        time.sleep(1.0)
+        yield from_client(lab)
+    finally:
+        system("kill", "-CONT", str(session.pid))
+
+
+# --- judging ----------------------------------------------------------------------------------------------------------
+
 
 SCREEN: Final = (120, 50)
 """Columns and lines of a screen."""
@@ -49,7 +367,9 @@ def consult(visit: Visit) -> tuple[list[Finding], int, float]:
 def screen(findings: list[Finding]) -> int:
     """Lines that the findings take on a screen."""
     columns, _ = SCREEN
-    return sum(max(1, len(textwrap.wrap(line, columns))) for line in [*lines(findings), verdict(findings)])
+    return sum(
+        max(1, len(textwrap.wrap(line, columns))) for line in [*format_findings(findings), format_verdict(findings)]
+    )
 
 
 def judge(one: Fault, findings: list[Finding], status: int) -> str:
@@ -108,7 +428,7 @@ def examine_all(lab: Lab, chosen: list[Fault], *, verbose: bool) -> list[str]:
             print(f"| {number} | {one.planted} | **not planted**: {error} | | | | |", flush=True)
             continue
         if verbose:
-            print("\n".join([*lines(findings), verdict(findings)]), file=sys.stderr)
+            print("\n".join([*format_findings(findings), format_verdict(findings)]), file=sys.stderr)
         if why := judge(one, findings, status):
             unnamed.append(f"{one.name}: {why}")
             print(f"| {number} | {one.planted} | **not named**: {why} | | | {status} | {took:.1f} |", flush=True)

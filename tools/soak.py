@@ -18,18 +18,436 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
+import re
 import shutil
+import signal
+import struct
+import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from soak_run import Soak
+import msgspec
+import numpy as np
+import psutil
+from soak_worker import RECORD, Job, fingerprint
 
-from iris_session.client import ClientError
+from iris_session.client import Client, ClientError
+from iris_session.demo.scenes import n_arms_scene
+from iris_session.demo.scenes.generators import arm_names
+from iris_session.emulator.specs import OBSERVER, HeadsetSpec
+from iris_session.netsim.process import ImpairmentProcess
 from iris_session.netsim.profiles import load_profile
+from iris_session.protocol.client_messages import Acquire, Release
+from iris_session.protocol.common import Target
+from iris_session.protocol.server_messages import Event, MarkerAdded
+from iris_session.recording import Recording
+
+COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
+#: Disturbances by how often they come, relative to each other.
+KINDS: Final = {"kill": 3, "leave": 1, "cut": 3, "reset": 3, "stall": 3, "roam": 2, "freeze": 2, "takeover": 6}
+EVERY_S: Final = 1.5  # mean time between two of them
+LONGEST_S: Final = 4.0  # of a stall or a frozen process
+RECOVER_S: Final = 60.0
+START_S: Final = 90.0
+SAY_EVERY_S: Final = 60.0
+END: Final = "end of the soak"
+
+
+@dataclass
+class Worker:
+    """One process of people and its link. `undo`: when what is done to it ends, and how."""
+
+    number: int
+    link: str
+    specs: tuple[HeadsetSpec, ...]
+    process: subprocess.Popen[bytes] | None = None
+    lives: int = 0
+    undo: tuple[float, str] | None = None
+
+
+@dataclass
+class Result:
+    problems: list[str] = field(default_factory=list)
+    disturbances: Counter[str] = field(default_factory=Counter)
+    rss: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+class Soak:
+    """One run. `folder`: for recording, logs and identities."""
+
+    def __init__(self, options: argparse.Namespace, folder: Path, stack: ExitStack) -> None:
+        self.options, self.folder, self.stack = options, folder, stack
+        self.random = random.Random(options.seed)
+        self.result = Result()
+        self.events: list[Event] = []
+        self.recording = folder / "session.rrd"
+        self._next_sample_s = 0.0
+        self._robbed: list[tuple[float, str]] = []
+        self._sources = 0
+
+    # --- start --------------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Session, director, proxy, people. Raises `SystemExit` when the session does not listen."""
+        scene = self.folder / "arms.xml"
+        spec = n_arms_scene(self.options.operators)
+        spec.compile()
+        scene.write_text(spec.to_xml())
+        ports = ["--control-port", "0", "--state-port", "0", "--mode", "takeover"]
+        self.server = subprocess.Popen(
+            [*COMMAND, "serve", str(scene), *ports, "--record", str(self.recording), "--json"],
+            stdout=self._log("serve.json"),
+            stderr=self._log("serve.out"),
+        )
+        self.stack.callback(self._end_server)
+        said = self._wait(lambda: re.search(r" on (\S+):(\d+),", self._read("serve.out")), "the session listens")
+        host, port = said[1], int(said[2])
+        self.director = self._join(f"{host}:{port}", "director")
+        self.thief = self._join(f"{host}:{port}", "operator")
+        welcome = self.director.connection.welcome
+        assert welcome is not None
+        self.workers = self._workers()
+        self.proxy = self.stack.enter_context(
+            ImpairmentProcess(
+                dict.fromkeys((w.link for w in self.workers), self.options.profile),
+                [port, welcome.endpoints.state],
+                target=host,
+                seed=self.options.seed,
+            )
+        )
+        self.port = port
+        for worker in self.workers:
+            self.stack.callback(self._kill, worker)
+            self._spawn(worker)
+        self._run_until(self._everybody_works, START_S, "everybody drives at the beginning")
+
+    def _join(self, address: str, role: str) -> Client:
+        client = Client(address, role=role, name=f"soak-{role}", alignment="not_needed")
+        if role == "director":
+            client.on_event = self.events.append
+        self.stack.callback(client.close)
+        return client.connect(30.0)
+
+    def _workers(self) -> list[Worker]:
+        options = self.options
+        made: list[Worker] = []
+        arms = arm_names(options.operators)
+        behaviours = [("wander", f"operator{i}", arms[i]) for i in range(options.operators)]
+        behaviours += [(OBSERVER, f"observer{i}", "") for i in range(options.observers)]
+        specs = [
+            HeadsetSpec(
+                name=name,
+                behaviour=behaviour,
+                robot=robot,
+                seed=options.seed + i,
+                viewpoints=4,
+                phase_timeout_s=1e6,
+                identity_file=str(self.folder / f"{name}.identity"),
+            )
+            for i, (behaviour, name, robot) in enumerate(behaviours)
+        ]
+        for i in range(0, len(specs), options.per_process):
+            number = len(made)
+            made.append(Worker(number, f"127.0.1.{number + 1}", tuple(specs[i : i + options.per_process])))
+        return made
+
+    def _spawn(self, worker: Worker) -> None:
+        worker.lives += 1
+        job = Job(
+            f"{worker.link}:{self.port}", worker.specs, str(self.folder / f"worker{worker.number}-{worker.lives}")
+        )
+        worker.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("soak_worker.py"))],
+            stdin=subprocess.PIPE,
+            stdout=self._log(f"worker{worker.number}.out"),
+            stderr=subprocess.STDOUT,
+        )
+        assert worker.process.stdin is not None
+        worker.process.stdin.write(msgspec.json.encode(job))
+        worker.process.stdin.close()
+
+    # --- the run ------------------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Disturbs until the time is over, then lets everybody recover."""
+        begun = due = said = time.monotonic()
+        end = begun + self.options.seconds
+        while (now := time.monotonic()) < end:
+            self._poll()
+            self._undo(now)
+            if now - said >= SAY_EVERY_S:
+                said = now
+                self._say(now - begun)
+            if now >= due:
+                due = now + self.random.expovariate(1.0 / EVERY_S)
+                kind = self.random.choices(list(KINDS), list(KINDS.values()))[0]
+                self._disturb(kind, now)
+        self._undo(float("inf"))
+        self.proxy.do("profile good-wifi")
+        if self._run_until(self._everybody_works, RECOVER_S, "everybody drives again at the end"):
+            self.director.marker(END)
+            self._run_until(self._everybody_knows_the_end, RECOVER_S, "everybody has the last event")
+
+    def _say(self, seconds: float) -> None:
+        """Where the run stands, for whoever waits."""
+        memory = ", ".join(f"{name} {rows[-1][1]:.0f} MiB" for name, rows in self.result.rss.items())
+        done = f"{seconds / 60.0:.0f} of {self.options.seconds / 60.0:.0f} min"
+        many = f"{self.result.disturbances.total()} disturbances, {len(self.result.problems)} problems"
+        print(f"{done}: {many}; {memory}", file=sys.stderr, flush=True)
+
+    def _disturb(self, kind: str, now: float) -> None:
+        worker = self.random.choice(self.workers)
+        if worker.undo is not None or worker.process is None:
+            return
+        self.result.disturbances[kind] += 1
+        seconds = self.random.uniform(0.2, LONGEST_S)
+        if kind in ("kill", "leave"):
+            worker.process.send_signal(signal.SIGKILL if kind == "kill" else signal.SIGTERM)
+            worker.process.wait(20.0)
+            worker.process = None
+            worker.undo = (now + seconds, "spawn")
+        elif kind in ("cut", "reset"):
+            self.proxy.do(f"{kind} @{worker.link}")
+        elif kind == "roam":
+            self._sources = self._sources % 250 + 1
+            self.proxy.do(f"roam 127.0.2.{self._sources} @{worker.link}")
+        elif kind == "stall":
+            self.proxy.do(f"stall @{worker.link}")
+            worker.undo = (now + seconds, "resume")
+        elif kind == "freeze":
+            worker.process.send_signal(signal.SIGSTOP)
+            worker.undo = (now + seconds, "thaw")
+        else:
+            robot = self.random.choice(arm_names(self.options.operators))
+            self._ask(Acquire(0, (robot,)))
+            self._robbed.append((now + self.random.uniform(0.2, 2.0), robot))
+
+    def _undo(self, now: float) -> None:
+        """Ends what is over: who was killed comes again, who was stopped goes on."""
+        for worker in self.workers:
+            if worker.undo is None or worker.undo[0] > now:
+                continue
+            what, worker.undo = worker.undo[1], None
+            if what == "spawn":
+                self._spawn(worker)
+            elif what == "resume":
+                self.proxy.do(f"resume @{worker.link}")
+            elif worker.process is not None:
+                worker.process.send_signal(signal.SIGCONT)
+        for item in [item for item in self._robbed if item[0] <= now]:
+            self._robbed.remove(item)
+            lease_version = self.thief.lease_version(item[1])
+            if lease_version is not None:
+                self._ask(Release(0, (Target(item[1], lease_version),)))
+
+    def _ask(self, message: Acquire | Release) -> None:
+        if self.thief.ready:
+            self.thief.submit(message)
+
+    def _poll(self) -> None:
+        """Keeps our own clients alive, looks after the processes, notes memory once a second."""
+        self.director.poll(0.01)
+        self.thief.poll(0.0)
+        now = time.monotonic()
+        if now < self._next_sample_s:
+            return
+        self._next_sample_s = now + 1.0
+        if self.server.poll() is not None:
+            raise SystemExit(f"the session ended: {self._read('serve.out')[-2000:]}")
+        for worker in self.workers:
+            if worker.process is not None and worker.process.poll() is not None:
+                self._problem(f"worker {worker.number} ended with status {worker.process.returncode}")
+                worker.process, worker.undo = None, (now, "spawn")
+        for process in (psutil.Process(self.server.pid), *psutil.Process(self.server.pid).children()):
+            line = " ".join(process.cmdline())
+            name = "front" if "front.main" in line else "recorder" if "recording.process" in line else "authority"
+            if name == "authority" and process.pid != self.server.pid:
+                continue  # the live view and other helpers
+            self.result.rss.setdefault(name, []).append((now, process.memory_info().rss / 2**20))
+
+    def _everybody_works(self) -> bool:
+        mirror, state = self.director.mirror, self.director.scene.state
+        if state is None:
+            return False
+        connected = {p.name: p.id for p in mirror.participants.values() if p.connected}
+        names = {spec.name for worker in self.workers for spec in worker.specs}
+        if not names <= set(connected):
+            return False
+        fresh = {
+            a.robot: a.participant for a in state.header.applied if state.header.session_time - a.step_ns < 500_000_000
+        }
+        mine = {s.robot: connected[s.name] for worker in self.workers for s in worker.specs if s.robot}
+        return all(fresh.get(robot) == holder for robot, holder in mine.items())
+
+    def _everybody_knows_the_end(self) -> bool:
+        ends = [e.event_seq for e in self.events if isinstance(e.body, MarkerAdded) and e.body.text == END]
+        return bool(ends) and all(
+            self._event_seq(worker, spec.name) >= ends[0] for worker in self.workers for spec in worker.specs
+        )
+
+    def _event_seq(self, worker: Worker, name: str) -> int:
+        try:
+            return int(json.loads(self._read(f"worker{worker.number}-{worker.lives}-{name}.json"))["event_seq"])
+        except ValueError:
+            return 0
+
+    def _run_until(self, condition: Callable[[], bool], seconds: float, what: str) -> bool:
+        """False, and a problem noted, when `condition` does not hold in time."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            self._poll()
+            if time.monotonic() > deadline:
+                connected = sorted(p.name for p in self.director.mirror.participants.values() if p.connected)
+                self._problem(f"not within {seconds:g} s: {what}; connected: {', '.join(connected)}")
+                return False
+        return True
+
+    # --- the end ------------------------------------------------------------------------------------------------------
+
+    def finish(self) -> None:
+        """Ends everything in order, then checks events, memory and the recording."""
+        result = self.result
+        for worker in self.workers:
+            if worker.process is not None:
+                worker.process.send_signal(signal.SIGTERM)
+        for worker in self.workers:
+            if worker.process is not None and worker.process.wait(20.0) != 0:
+                self._problem(f"worker {worker.number} ended with status {worker.process.returncode}")
+        result.details["proxy"] = self.proxy.do("stats")["links"]
+        self.server.send_signal(signal.SIGINT)
+        if self.server.wait(60.0) != 0:
+            self._problem(f"the session ended with status {self.server.returncode}")
+        status = json.loads(self._read("serve.json") or "{}")
+        result.details["late_tick_share"] = status.get("lateness", {}).get("late_share")
+        result.details["session_drops"] = status.get("drops")
+        result.details["restarts"] = status.get("restarts")
+        if any((status.get("restarts") or {}).values()):
+            self._problem(f"processes were replaced: {status['restarts']}")
+        verified = subprocess.run(
+            [*COMMAND, "verify", "--json", str(self.recording)], capture_output=True, text=True, check=False
+        )
+        result.details["verified"] = verified.returncode == 0
+        if verified.returncode != 0:
+            self._problem(f"verify: {(verified.stdout + verified.stderr)[-1000:]}")
+        events, problems = check_events(self.recording, self.folder)
+        result.details["events"] = events
+        (self.folder / "rss.json").write_text(json.dumps(result.rss))
+        memory, growing = check_memory(result.rss)
+        result.details["memory"] = memory
+        result.problems += problems + growing
+        for worker in self.workers:
+            for spec in worker.specs:
+                report = self._read(f"worker{worker.number}-{worker.lives}-{spec.name}.json")
+                if report and json.loads(report)["failed"]:
+                    self._problem(f"{spec.name} failed: {json.loads(report)['failed']}")
+
+    def _problem(self, text: str) -> None:
+        self.result.problems.append(text)
+        print(f"problem: {text}", file=sys.stderr, flush=True)
+
+    def _kill(self, worker: Worker) -> None:
+        if worker.process is not None and worker.process.poll() is None:
+            worker.process.kill()
+            worker.process.wait()
+
+    def _end_server(self) -> None:
+        if self.server.poll() is None:
+            children = psutil.Process(self.server.pid).children(recursive=True)
+            self.server.kill()
+            self.server.wait()
+            psutil.wait_procs(children, 10.0)
+
+    def _log(self, name: str) -> int:
+        return self.stack.enter_context((self.folder / name).open("ab")).fileno()
+
+    def _read(self, name: str) -> str:
+        path = self.folder / name
+        return path.read_text(errors="replace") if path.exists() else ""
+
+    def _wait(self, condition: Callable[[], Any], what: str) -> Any:
+        deadline = time.monotonic() + 30.0
+        while not (found := condition()):
+            if time.monotonic() > deadline or self.server.poll() is not None:
+                raise SystemExit(f"not within 30 s: {what}\n{self._read('serve.out')}")
+            time.sleep(0.05)
+        return found
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+
+
+#: Growth of the second half that is noise: allocators, caches that fill.
+NOISE_MIB: Final = 6.0
+
+
+def check_events(recording: Path, folder: Path) -> tuple[dict[str, int], list[str]]:
+    """Compares the logs `*.events` in `folder` with the recording. Figures, and a line per problem."""
+    problems: list[str] = []
+    with Recording.open(recording) as opened:
+        recorded = {event.event_seq: fingerprint(event) for event in opened.events()}
+    if list(recorded) != list(range(1, len(recorded) + 1)):
+        problems.append(f"the recording's {len(recorded)} events are not numbered without a gap")
+    logs = sorted(folder.glob("*.events"))
+    handed = filled = 0
+    for log in logs:
+        data = log.read_bytes()
+        whole = len(data) - len(data) % RECORD.size  # a killed process may leave half a record
+        handed += whole // RECORD.size
+        gaps, problem = check_log(log.name, list(struct.iter_unpack(RECORD.format, data[:whole])), recorded)
+        filled += gaps
+        problems += problem
+    return {"recorded": len(recorded), "logs": len(logs), "handed_out": handed, "filled_by_snapshots": filled}, problems
+
+
+def check_log(name: str, records: list[tuple[Any, ...]], recorded: dict[int, int]) -> tuple[int, list[str]]:
+    """One client's events (generation, times that it was told of missed ones, event_seq, CRC): none is missed without
+    being told, all in order, each as recorded. A client whose link takes nothing loses events, and is given a snapshot
+    in their place: how often, on connections that went on."""
+    last_generation = last_told = last_seq = -1
+    filled = 0
+    for generation, told, seq, crc in records:
+        if last_seq >= 0 and seq != last_seq + 1:
+            if told == last_told:
+                return filled, [f"{name}: event {seq} came after {last_seq}, and nobody told of those between"]
+            filled += generation == last_generation
+        if seq <= last_seq:
+            return filled, [f"{name}: event {seq} came after {last_seq}"]
+        if recorded.get(seq) != crc:
+            return filled, [f"{name}: event {seq} is not that of the recording"]
+        last_generation, last_told, last_seq = generation, told, seq
+    return filled, []
+
+
+def check_memory(rss: dict[str, list[tuple[float, float]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Per process, of its resident memory over the second half of the run [MiB]: beginning, end, slope per hour."""
+    figures: dict[str, dict[str, float]] = {}
+    problems: list[str] = []
+    for name, series in rss.items():
+        half = np.array(series[len(series) // 2 :])
+        if len(half) < 4:
+            continue
+        slope = float(np.polyfit(half[:, 0] - half[0, 0], half[:, 1], 1)[0])
+        growth = slope * float(half[-1, 0] - half[0, 0])
+        figures[name] = {
+            "mib": round(float(half[-1, 1]), 1),
+            "mib_at_half": round(float(half[0, 1]), 1),
+            "mib_per_hour": round(slope * 3600.0, 1),
+        }
+        if growth > NOISE_MIB:
+            problems.append(f"memory of {name} grew by {growth:.1f} MiB more than it may in the second half")
+    return figures, problems
+
+
+# --- command ----------------------------------------------------------------------------------------------------------
 
 
 def soak(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -59,7 +477,7 @@ def main() -> int:
     parser.add_argument(
         "--per-process", type=int, default=2, help="people who share a process, and a link (%(default)s)"
     )
-    parser.add_argument("--profile", default="busy-wifi", help="of every link: docs/links.md (%(default)s)")
+    parser.add_argument("--profile", default="busy-wifi", help="of every link: docs/evidence/links.md (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of disturbances, people and weather")
     parser.add_argument("--keep", type=Path, help="folder for recording and logs (default: a temporary one)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")

@@ -10,15 +10,16 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-from iris_session.link.config import MILLISECOND
 from iris_session.protocol.assets import (
     MAX_ASSET_CHUNK_BYTES,
     MAX_ASSET_REQUESTS,
     MAX_ASSET_WINDOW_BYTES,
     AssetRequest,
 )
+from iris_session.protocol.limits import TokenBucket
 from iris_session.protocol.names import AssetRefusal
-from iris_session.protocol.token_bucket import TokenBucket
+
+MILLISECOND: Final = 1_000_000  # [ns]
 
 #: Requests of one reader: 1000 chunks of half a MiB are more than a gigabit link carries in a second.
 REQUESTS_PER_S: Final = 1000.0

@@ -1,10 +1,21 @@
-"""`AssetStore`: assets as files below one folder, named by the SHA-256 of their bytes.
+"""`AssetStore`: assets as files below one folder, named by the SHA-256 of their bytes. Sessions and clients use it.
 
-Layout: `<root>/<first two hex>/<hash>`; `<root>/index/<two hex>/<key>` remembers what was built from which raw content
-(`build`), `<root>/holds/` what running processes use. Several processes may share a folder: files appear whole (rename)
-and never change. When the files exceed `limit_bytes`, those used longest ago go, but nothing that a process holds and
-nothing used within `GRACE_S`. What a process that was killed left half done goes when the next one opens the store.
-Files and folders of others below the root are never touched.
+Layout below the root, where `<hash>` and `<key>` are 64 lower-case hex digits:
+
+    <hash[:2]>/<hash>               an asset; the name is given only after its bytes were hashed, and it never changes
+    <hash[:2]>/<hash>.part          a partial download, locked while it is written; the next download resumes it
+    <hash[:2]>/<hash>.<word>.part   a file that one process writes; nothing resumes it
+    index/<key[:2]>/<key>           what was built from the raw content with this key (`scene.build`)
+    holds/                          addresses that running processes hold
+
+Any number of processes and threads may share a folder. Above `max_bytes` the files that were used longest ago are
+removed, but none that a process holds and none used within `GRACE_S`. Other files below the root are never touched.
+
+Sessions and clients have separate default folders. Nothing but verified content could get from a client into the
+folder of a session, so they may share one (`client.assets.cache = AssetStore()`), and an asset then lies on disk once.
+It is not the default because a hostile session that a client joins could fill the shared folder, so that assets this
+machine's own session does not hold at the moment are removed and have to be built again, and could find out which
+assets are there by watching what the client does not fetch.
 """
 
 from __future__ import annotations
@@ -12,9 +23,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import mmap
 import os
 import re
 import tempfile
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -22,30 +35,52 @@ from typing import Final
 
 from filelock import FileLock, Timeout
 
-from iris_session.scene.errors import AssetMissingError
+from iris_session.assets.errors import AssetMissingError, AssetStoreError
+from iris_session.protocol.assets import is_address
 
-DEFAULT_LIMIT: Final = 4 << 30
+try:
+    import fcntl
+except ImportError:  # a system without these locks: every process writes parts of its own
+    fcntl = None  # type: ignore[assignment]
+
+DEFAULT_MAX_BYTES: Final = 4 << 30
 #: A file used this short ago [s] stays: another process may be about to hold it.
 GRACE_S: Final = 600.0
-_ADDRESS: Final = re.compile(r"[0-9a-f]{64}")
-_PART: Final = re.compile(r"tmp\w+\.part")
+#: Downloads beyond this multiple of `max_bytes` are refused: a session cannot fill the disk by naming ever more assets.
+MAX_OVERFILL: Final = 2
+#: A resumable part that was not written for so long [s] is removed. Others are removed after `GRACE_S`.
+STALE_PART_S: Final = 7 * 86_400.0
+#: The folder is scanned after so many bytes were written, since other processes write to it too.
+SCAN_EVERY_BYTES: Final = 64 << 20
+#: Files that `ServedAssets` maps at once. Chunks on their way to a reader keep their file mapped until they have left.
+MAX_MAPPED_FILES: Final = 256
+
+_PART: Final = re.compile(r"([0-9a-f]{64})(\.\w[\w-]*)?\.part")
 #: Of a hold: its note before it has its name, and a lock, which is of no use without the note.
-_HALF_HELD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
+_HALF_MADE_HOLD: Final = re.compile(r"(tmp\w+\.new)(\.hold\.lock)?")
 _INDEX: Final = "index"
 _HOLDS: Final = "holds"
+_ADVICE: Final = "use another folder (client.assets.cache = AssetStore(folder)), or set XDG_CACHE_HOME"
 
 
-def default_root() -> Path:
-    """`~/.cache/iris-session/assets`, or below `XDG_CACHE_HOME`. Raises `OSError` where there is no home."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
+def default_root(name: str = "assets") -> Path:
+    """Return `$XDG_CACHE_HOME/iris-session/<name>`, by default below `~/.cache`.
+
+    Args:
+        name: "assets" for sessions, "client-assets" for clients.
+
+    Raises:
+        OSError: This user has no home folder.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     try:
-        return (Path(base) if base else Path.home() / ".cache") / "iris-session" / "assets"
+        return Path(base).expanduser() / "iris-session" / name
     except RuntimeError:  # a user without an entry, as in containers
         raise OSError(errno.ENOENT, "this user has no home folder: set XDG_CACHE_HOME, or name a folder") from None
 
 
 class Hold:
-    """Assets that stay in the store until `release`, or until this process ends however it ends."""
+    """Assets that stay in the store until `release`, or until this process ends, however it ends."""
 
     def __init__(self, folder: Path, addresses: Iterable[str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -56,15 +91,16 @@ class Hold:
             with os.fdopen(handle, "w") as file:
                 file.write("\n".join(sorted(set(addresses))))
             self._lock.acquire()
-            os.replace(name, self._path)  # whoever sees it finds it whole, and locked
+            os.replace(name, self._path)  # from the moment others can see it, it is complete and locked
         except BaseException as error:
             Path(name).unlink(missing_ok=True)
             self.release()
-            if isinstance(error, NotImplementedError):  # what filelock says of a file system
+            if isinstance(error, NotImplementedError):  # raised by filelock on some file systems
                 raise OSError(errno.ENOLCK, f"{folder} is on a file system without locks") from error
             raise
 
     def release(self) -> None:
+        """Allow the store to remove these assets again."""
         self._path.unlink(missing_ok=True)
         self._lock.release()
         Path(self._lock.lock_file).unlink(missing_ok=True)
@@ -77,83 +113,133 @@ class Hold:
 
 
 class AssetStore:
-    """See the module. `evicted`: files that this process removed to make room. Thread-safe, as renames are."""
+    """A folder of assets, created with the first write. Safe for several threads and processes.
 
-    def __init__(self, root: Path | str | None = None, limit_bytes: int = DEFAULT_LIMIT) -> None:
+    Attributes:
+        root: The folder.
+        max_bytes: Size above which files that were used longest ago are removed.
+        evicted: Number of files that this object removed to make room.
+    """
+
+    def __init__(self, root: str | os.PathLike[str] | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        """Name the folder; nothing is read or written yet.
+
+        Args:
+            root: The folder; by default `~/.cache/iris-session/assets`.
+            max_bytes: Size of the store [bytes].
+        """
         self.root = Path(root) if root is not None else default_root()
-        self.limit_bytes = limit_bytes
+        self.max_bytes = max_bytes
         self.evicted = 0
-        self.root.mkdir(parents=True, exist_ok=True)
-        self._total = self._tidied()
-        self._look_at = limit_bytes
+        self._lock = threading.Lock()  # of the three below
+        self._total = 0
+        self._scan_above = -1  # the first write scans the folder
+        self._unscanned = 0
 
-    # --- assets -------------------------------------------------------------------------------------------------------
+    # --- reading ------------------------------------------------------------------------------------------------------
+
+    def path(self, address: str) -> Path:
+        """Return the path of an asset, present or not.
+
+        Raises:
+            ValueError: `address` is not 64 lower-case hex digits.
+        """
+        if not is_address(address):
+            raise ValueError(f"{address[:80]!r} is no address of an asset: expected 64 digits 0-9, a-f")
+        return self.root / address[:2] / address
+
+    def __contains__(self, address: object) -> bool:
+        return isinstance(address, str) and is_address(address) and self.path(address).is_file()
+
+    def size(self, address: str) -> int:
+        """Return the size of an asset [bytes].
+
+        Raises:
+            AssetMissingError: The store does not have it.
+        """
+        try:
+            return self.path(address).stat().st_size
+        except OSError as error:
+            raise self._missing_error(address) from error
+
+    def get(self, address: str) -> bytes:
+        """Return the verified bytes of an asset. A damaged file is removed.
+
+        Raises:
+            AssetMissingError: The store does not have it, or its file was damaged.
+        """
+        try:
+            view = self._read_verified(address)
+        except OSError as error:
+            raise self._missing_error(address) from error
+        if view is None:
+            raise AssetMissingError(
+                f"asset {address} was damaged on disk and was removed: build the scene again", address
+            )
+        return bytes(view)
+
+    def find(self, address: str) -> memoryview | None:
+        """Return the verified bytes of an asset, mapped, and mark it as used; `None` without it.
+
+        A damaged file is removed.
+
+        Raises:
+            AssetStoreError: The folder cannot be used.
+        """
+        try:
+            view = self._read_verified(address)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise self._unusable_error(error) from error
+        if view is not None:
+            _touch(self.path(address))
+        return view
+
+    def view(self, address: str) -> memoryview:
+        """Return the bytes of an asset, mapped and not hashed again.
+
+        Raises:
+            AssetMissingError: The store does not have it.
+        """
+        try:
+            return map_file(self.path(address))[0]
+        except OSError as error:
+            raise self._missing_error(address) from error
+
+    # --- writing ------------------------------------------------------------------------------------------------------
 
     def put(self, data: bytes | bytearray | memoryview) -> str:
-        """Keeps `data`; returns its address. Costs a hash when the store has it already."""
+        """Store bytes and return their address. Costs one hash when the store has them already.
+
+        Raises:
+            OSError: The folder cannot be written.
+        """
         view = memoryview(data).cast("B")
         address = hashlib.sha256(view).hexdigest()
-        if not self.used(address, len(view)):
+        if not self.mark_used(address, len(view)):
             self._write(self.path(address), view)
         return address
 
-    def get(self, address: str) -> bytes:
-        """The bytes. Raises `AssetMissingError`; a file that was damaged on the disk is removed too."""
+    def open_part(self, address: str) -> AssetPart:
+        """Return the part of an asset to write to; it may have bytes of an earlier download.
+
+        Raises:
+            AssetStoreError: The folder cannot be used.
+        """
         path = self.path(address)
         try:
-            data = path.read_bytes()
-        except OSError:
-            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again") from None
-        if hashlib.sha256(data).hexdigest() != address:
-            with contextlib.suppress(OSError):  # a disk that cannot be written: `put` says so
-                path.unlink()
-            raise AssetMissingError(f"asset {address} was damaged on the disk and is gone: build the scene again")
-        return data
+            try:
+                return AssetPart(self, address, *_open_part_file(path))
+            except FileNotFoundError:  # the first asset that begins with these digits
+                path.parent.mkdir(parents=True, exist_ok=True)
+                return AssetPart(self, address, *_open_part_file(path))
+        except OSError as error:
+            raise self._unusable_error(error) from error
 
-    def path(self, address: str) -> Path:
-        """Where an asset lies, or would. Raises `ValueError` for what is no address."""
-        if not _ADDRESS.fullmatch(address):
-            raise ValueError(f"{address!r} is no address of an asset: 64 hex digits, lower case")
-        return self.root / address[:2] / address
-
-    def size(self, address: str) -> int:
-        """Bytes of an asset. Raises `AssetMissingError`."""
-        try:
-            return self.path(address).stat().st_size
-        except OSError:
-            raise AssetMissingError(f"asset {address} is not in {self.root}: build the scene again") from None
-
-    def __contains__(self, address: object) -> bool:
-        return isinstance(address, str) and _ADDRESS.fullmatch(address) is not None and self.path(address).is_file()
-
-    def used_at(self, address: str) -> int:
-        """When an asset was used last [ns since 1970], for `discard`; 0 when it is not there."""
-        try:
-            return self.path(address).stat().st_mtime_ns
-        except OSError:
-            return 0
-
-    def discard(self, address: str, used_at: int) -> bool:
-        """Removes an asset that is of no use any more, unless somebody holds it, or has used it since. Whether it
-        did."""
-        path = self.path(address)
-        with contextlib.suppress(OSError):
-            status = path.stat()
-            if status.st_mtime_ns == used_at and address not in self._held():
-                path.unlink()
-                self._total -= status.st_size
-                return True
-        return False
-
-    def hold(self, addresses: Iterable[str]) -> Hold:
-        """Keeps these from being removed, by any process. For as long as a scene is shared."""
-        return Hold(self.root / _HOLDS, addresses)
-
-    # --- what was built from what -------------------------------------------------------------------------------------
-
-    def recall(self, key: str) -> bytes | None:
-        """What `remember` was told for `key`, a SHA-256 in hex; marks it as used."""
-        path = self._index(key)
+    def read_index(self, key: str) -> bytes | None:
+        """Return the note stored under `key`, a SHA-256 in hex, and mark it as used; `None` without one."""
+        path = self._index_path(key)
         try:
             note = path.read_bytes()
         except OSError:
@@ -161,27 +247,106 @@ class AssetStore:
         _touch(path)
         return note
 
-    def remember(self, key: str, note: bytes) -> None:
-        self._write(self._index(key), note)
+    def write_index(self, key: str, note: bytes) -> None:
+        """Store a note under `key`, a SHA-256 in hex.
 
-    def used(self, address: str, n_bytes: int) -> bool:
-        """Marks an asset as used now; false when it is not there, or has not its length: cut off by a crash."""
+        Raises:
+            OSError: The folder cannot be written.
+        """
+        self._write(self._index_path(key), note)
+
+    # --- use and removal ----------------------------------------------------------------------------------------------
+
+    def hold(self, addresses: Iterable[str]) -> Hold:
+        """Keep assets from being removed by any process, for as long as a scene is shared.
+
+        Raises:
+            OSError: The folder cannot be written, or its file system has no locks.
+        """
+        return Hold(self.root / _HOLDS, addresses)
+
+    def mark_used(self, address: str, size: int) -> bool:
+        """Mark an asset as used now. False without it, and when it has another size: a crash truncated it."""
         path = self.path(address)
         with contextlib.suppress(FileNotFoundError):
-            return path.stat().st_size == n_bytes and _touch(path)
+            return path.stat().st_size == size and _touch(path)
         return False
+
+    def last_used_ns(self, address: str) -> int:
+        """Return when an asset was last used [ns since 1970], for `discard`; 0 without it."""
+        try:
+            return self.path(address).stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def discard(self, address: str, last_used_ns: int) -> bool:
+        """Remove an asset that is of no more use, and return whether it was removed.
+
+        It stays when a process holds it, or has used it after `last_used_ns`.
+        """
+        path = self.path(address)
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            if status.st_mtime_ns == last_used_ns and address not in self._read_holds():
+                path.unlink()
+                with self._lock:
+                    self._total -= status.st_size
+                return True
+        return False
+
+    def trim(self) -> int:
+        """Remove stale parts, and files beyond `max_bytes`. Return the bytes that remain."""
+        with self._lock:
+            self._scan(0)
+            return self._total
+
+    def reserve(self, n_bytes: int) -> None:
+        """Make room for a download, which has its bytes written to an `AssetPart` next.
+
+        Raises:
+            AssetStoreError: `MAX_OVERFILL * max_bytes` are in use already.
+        """
+        limit = MAX_OVERFILL * self.max_bytes
+        with self._lock:
+            if not self._make_room(n_bytes) and self._total > limit:
+                self._scan(n_bytes)  # files may have been removed, or aged, since the last scan
+            if self._total > limit:
+                self._total -= n_bytes
+                raise AssetStoreError(
+                    f"asset store {self.root} is full: {self._total >> 20} MiB were used in the last minutes; "
+                    f"{_ADVICE}, or allow more than {self.max_bytes >> 20} MiB: AssetStore(max_bytes=...)"
+                )
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _index(self, key: str) -> Path:
-        if not _ADDRESS.fullmatch(key):
-            raise ValueError(f"{key!r} is no key: 64 hex digits")
+    def _missing_error(self, address: str) -> AssetMissingError:
+        return AssetMissingError(f"asset {address} is not in {self.root}: build the scene or fetch it again", address)
+
+    def _unusable_error(self, error: OSError | ValueError) -> AssetStoreError:
+        reason = getattr(error, "strerror", None) or error
+        return AssetStoreError(f"asset store {self.root} cannot be used: {reason}; {_ADVICE}")
+
+    def _read_verified(self, address: str) -> memoryview | None:
+        """Return the bytes of an asset; remove its file and return `None` when they have another hash."""
+        path = self.path(address)
+        view, status = map_file(path)
+        if hashlib.sha256(view).hexdigest() == address:
+            return view
+        with contextlib.suppress(OSError):  # a disk that cannot be written
+            if os.path.samestat(status, os.stat(path)):  # not replaced by a good one meanwhile
+                path.unlink()
+        return None
+
+    def _index_path(self, key: str) -> Path:
+        if not is_address(key):
+            raise ValueError(f"{key[:80]!r} is no key: expected 64 digits 0-9, a-f")
         return self.root / _INDEX / key[:2] / key
 
     def _write(self, path: Path, data: bytes | bytearray | memoryview) -> None:
-        self._make_room(len(data))
+        with self._lock:
+            self._make_room(len(data))
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(data)
@@ -189,78 +354,269 @@ class AssetStore:
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
-        self._total += len(data)
 
-    def _files(self) -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
-        """Files of assets and of the index, and parts that a crash left. No holds, nothing that is not ours."""
+    def _make_room(self, n_bytes: int) -> bool:
+        """Count `n_bytes` as stored, and scan the folder when it may be too full. Return whether it was scanned.
+
+        Where everything is in use, only every 64th part of `max_bytes` that is written causes a scan.
+        """
+        self._total += n_bytes
+        self._unscanned += n_bytes
+        full = self._total > self._scan_above or self._unscanned >= SCAN_EVERY_BYTES
+        if full:
+            self._scan(n_bytes)
+        return full
+
+    def _scan(self, n_bytes: int) -> None:
+        """Remove what processes left half-made, then the files used longest ago until `n_bytes` more fit."""
+        held, now = self._read_holds(), time.time()
+        self._remove_half_made_holds(now)
+        files: list[tuple[float, int, os.DirEntry[str]]] = []
+        for entry, status in self._iterate_files():
+            age_s = now - status.st_mtime
+            part = _PART.fullmatch(entry.name)
+            if part and age_s > (GRACE_S if part[2] else STALE_PART_S) and _remove_part(entry.path):
+                continue
+            files.append((status.st_mtime, status.st_size, entry))
+        total = n_bytes + sum(size for _, size, _ in files)
+        for used, size, entry in sorted(files, key=lambda item: item[0]):
+            if total <= self.max_bytes or now - used < GRACE_S:
+                break
+            if entry.name in held:
+                continue
+            with contextlib.suppress(OSError):
+                if os.stat(entry.path, follow_symlinks=False).st_mtime != used:  # used meanwhile
+                    continue
+                if _PART.fullmatch(entry.name):
+                    if not _remove_part(entry.path):
+                        continue
+                else:
+                    os.unlink(entry.path)
+                total -= size
+                self.evicted += 1
+        self._total = total
+        self._unscanned = 0
+        self._scan_above = max(self.max_bytes, total + self.max_bytes // 64)
+
+    def _iterate_files(self) -> Iterator[tuple[os.DirEntry[str], os.stat_result]]:
+        """Yield the files of assets, of the index, and parts. No holds, and no files of others."""
         for folder in (self.root, self.root / _INDEX):
-            for sub in _entries(folder):
+            for sub in _list_entries(folder):
                 if len(sub.name) == 2 and sub.is_dir(follow_symlinks=False):
-                    for entry in _entries(sub.path):
-                        ours = _ADDRESS.fullmatch(entry.name) and entry.name[:2] == sub.name
-                        if (ours or _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
-                            with contextlib.suppress(FileNotFoundError):  # taken by another process meanwhile
+                    for entry in _list_entries(sub.path):
+                        ours = is_address(entry.name) or _PART.fullmatch(entry.name)
+                        if ours and entry.name[:2] == sub.name and entry.is_file(follow_symlinks=False):
+                            with contextlib.suppress(FileNotFoundError):  # removed by another process meanwhile
                                 yield entry, entry.stat(follow_symlinks=False)
 
-    def _tidied(self) -> int:
-        """Takes away what processes that are gone left half done; what is young may be somebody's at work. Bytes of
-        all files."""
-        with contextlib.suppress(OSError):  # a folder that we may only read
-            self._held()
-        old = time.time() - GRACE_S
-        found, total = [], 0
-        for entry, status in self._files():
-            total += status.st_size
-            if _PART.fullmatch(entry.name):
-                found.append(entry)
-        holds = self.root / _HOLDS
-        for entry in _entries(holds):
-            half = _HALF_HELD.fullmatch(entry.name)
-            if half and not (holds / f"{half[1]}.hold").exists():
-                found.append(entry)
-        for entry in found:
-            with contextlib.suppress(OSError):
-                if entry.stat(follow_symlinks=False).st_mtime < old:
-                    os.unlink(entry.path)
-        return total  # with the parts: the next time that room is made it is counted anew
-
-    def _make_room(self, n_bytes: int) -> None:
-        if self._total + n_bytes <= self._look_at:
-            return
-        held, now = self._held(), time.time()
-        found = [(status.st_mtime, status.st_size, entry) for entry, status in self._files()]
-        self._total = sum(size for _, size, _ in found)
-        for used, size, entry in sorted(found, key=lambda item: item[0]):
-            if self._total + n_bytes <= self.limit_bytes or now - used < GRACE_S:
-                break
-            if entry.name not in held:
-                with contextlib.suppress(FileNotFoundError):
-                    if os.stat(entry.path, follow_symlinks=False).st_mtime == used:  # nobody has used it meanwhile
-                        os.unlink(entry.path)
-                        self._total -= size
-                        self.evicted += 1
-        # Where everything is in use, not every file is looked at again for each that comes.
-        self._look_at = max(self.limit_bytes, self._total + n_bytes + self.limit_bytes // 64)
-
-    def _held(self) -> set[str]:
-        """Addresses that a living process holds. Notes of dead ones are removed."""
+    def _read_holds(self) -> set[str]:
+        """Return addresses that a living process holds. Notes of dead processes are removed."""
         held: set[str] = set()
         for path in (self.root / _HOLDS).glob("*.hold"):
             lock = FileLock(f"{path}.lock")
             try:
                 lock.acquire(blocking=False)
-            except (Timeout, OSError, NotImplementedError):  # or nobody can tell: then it counts
+            except (Timeout, OSError, NotImplementedError):  # held, or unknown: then it counts as held
                 with contextlib.suppress(OSError):
                     held.update(path.read_text().split())
                 continue
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder that this user may only read
+                path.unlink(missing_ok=True)
             lock.release()
-            Path(lock.lock_file).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                Path(lock.lock_file).unlink(missing_ok=True)
         return held
+
+    def _remove_half_made_holds(self, now: float) -> None:
+        """Remove what dead processes left of holds. Young files may belong to a process at work."""
+        holds = self.root / _HOLDS
+        for entry in _list_entries(holds):
+            half = _HALF_MADE_HOLD.fullmatch(entry.name)
+            if half and not (holds / f"{half[1]}.hold").exists():
+                with contextlib.suppress(OSError):
+                    if now - entry.stat(follow_symlinks=False).st_mtime > GRACE_S:
+                        os.unlink(entry.path)
+
+
+class AssetPart:
+    """The bytes of one asset that have come so far. Belongs to one thread.
+
+    Attributes:
+        offset: Number of bytes present.
+    """
+
+    def __init__(self, store: AssetStore, address: str, path: Path, descriptor: int) -> None:
+        self._store = store
+        self._address = address
+        self._path = path
+        self._file = os.fdopen(descriptor, "r+b", buffering=0)
+        self._hash = hashlib.sha256()
+        self.offset = 0
+        if os.fstat(descriptor).st_size:
+            while block := self._file.read(1 << 20):
+                self._hash.update(block)
+                self.offset += len(block)
+
+    def append(self, data: bytes | memoryview) -> None:
+        """Write the next bytes.
+
+        Raises:
+            AssetStoreError: They cannot be written, or the store is full.
+        """
+        self._store.reserve(len(data))
+        rest = memoryview(data)
+        while rest:
+            try:
+                written = self._file.write(rest)
+            except OSError as error:
+                raise self._store._unusable_error(error) from error
+            self._hash.update(rest[:written])
+            self.offset += written
+            rest = rest[written:]
+
+    def finish(self) -> bool:
+        """Give the asset its name. False when the bytes have another hash: they are thrown away.
+
+        Raises:
+            AssetStoreError: The folder cannot be used.
+        """
+        if self._hash.hexdigest() != self._address:
+            self.restart()
+            return False
+        try:
+            os.replace(self._path, self._store.path(self._address))
+            self._file.close()
+        except OSError as error:
+            raise self._store._unusable_error(error) from error
+        return True
+
+    def restart(self) -> None:
+        """Throw away the bytes that are present.
+
+        Raises:
+            AssetStoreError: The folder cannot be used.
+        """
+        try:
+            self._file.seek(0)
+            self._file.truncate()
+        except OSError as error:
+            raise self._store._unusable_error(error) from error
+        self._hash = hashlib.sha256()
+        self.offset = 0
+
+    def close(self) -> None:
+        """Keep a resumable part for the next download; remove an empty one, and one that cannot be resumed."""
+        if not self.offset or self._path.name != f"{self._address}.part":
+            with contextlib.suppress(OSError):
+                self._path.unlink(missing_ok=True)
+        self._file.close()
+
+
+class ServedAssets:
+    """Assets that a session serves, mapped: every reader is sent the same pages. Belongs to one thread.
+
+    Assets are looked up in a table by address: no path is ever made of what a client sends.
+    """
+
+    def __init__(self) -> None:
+        self._roots: dict[str, str] = {}
+        self._mapped: dict[str, memoryview] = {}
+
+    def serve(self, stores: Iterable[tuple[str, Iterable[str]]]) -> None:
+        """Serve these assets and no others from now on.
+
+        Args:
+            stores: Roots of stores, with addresses in each.
+        """
+        self._roots = {address: root for root, addresses in stores for address in addresses if is_address(address)}
+        for address in [address for address in self._mapped if address not in self._roots]:
+            del self._mapped[address]
+
+    def size(self, address: str) -> int | None:
+        """Return the size of an asset [bytes]; `None` when it is not served, or its file cannot be read."""
+        view = self._view(address)
+        return None if view is None else len(view)
+
+    def chunk(self, address: str, offset: int, length: int) -> memoryview | None:
+        """Return bytes of an asset; `None` as in `size`, or when it ends before `offset + length`."""
+        view = self._view(address)
+        return None if view is None or offset + length > len(view) else view[offset : offset + length]
+
+    def _view(self, address: str) -> memoryview | None:
+        view = self._mapped.get(address)
+        if view is not None:
+            return view
+        root = self._roots.get(address)
+        if root is None:
+            return None
+        try:
+            view, _ = map_file(Path(root) / address[:2] / address)
+        except OSError:
+            return None
+        while len(self._mapped) >= MAX_MAPPED_FILES:
+            del self._mapped[next(iter(self._mapped))]
+        self._mapped[address] = view
+        return view
+
+
+def map_file(path: Path) -> tuple[memoryview, os.stat_result]:
+    """Return the bytes of a file, mapped, and its status. Processes that map the same file share its pages.
+
+    Raises:
+        OSError: It cannot be read, or is a symbolic link.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
+    descriptor = os.open(path, flags)
+    try:
+        status = os.fstat(descriptor)
+        size = status.st_size
+        return memoryview(mmap.mmap(descriptor, size, access=mmap.ACCESS_READ) if size else b""), status
+    finally:
+        os.close(descriptor)
+
+
+def _open_part_file(path: Path) -> tuple[Path, int]:
+    """Open a part that no other process writes: the resumable one, or else a new one. Raises `OSError`."""
+    resumable = path.with_name(f"{path.name}.part")
+    if fcntl is not None:
+        descriptor = -1
+        try:
+            descriptor = os.open(resumable, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # It may have been finished, and so renamed, between opening and locking.
+            if os.path.samestat(os.fstat(descriptor), os.stat(resumable)):
+                return resumable, descriptor
+        except FileNotFoundError:
+            if descriptor < 0:
+                raise  # there is no such folder
+        except OSError:
+            pass  # written by another process, or a file system without locks
+        if descriptor >= 0:
+            os.close(descriptor)
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".part")
+    if fcntl is not None:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return Path(name), descriptor
+
+
+def _remove_part(path: str) -> bool:
+    """Remove a part unless a process holds its lock, and return whether it was removed."""
+    try:
+        if fcntl is not None:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            finally:
+                os.close(descriptor)
+        os.unlink(path)
+    except OSError:
+        return False
+    return True
 
 
 def _touch(path: Path) -> bool:
-    """Marks a file as used now; false when it is not there. Where that is not allowed, what is there can be read."""
+    """Mark a file as used now; false without it. A file that may only be read counts as present."""
     try:
         os.utime(path)
     except FileNotFoundError:
@@ -270,8 +626,8 @@ def _touch(path: Path) -> bool:
     return True
 
 
-def _entries(folder: Path | str) -> list[os.DirEntry[str]]:
-    """What is in a folder; nothing where it is not there, or not ours to read."""
+def _list_entries(folder: Path | str) -> list[os.DirEntry[str]]:
+    """Return the entries of a folder; none where it is missing or may not be read."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         return list(entries)
     return []

@@ -33,6 +33,7 @@ from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, Participant, State
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
+from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.entries import HOST, URGENT, Entry
 from iris_session.protocol.names import (
@@ -40,9 +41,8 @@ from iris_session.protocol.names import (
     RejectReason,
     Role,
 )
-from iris_session.protocol.scene_patch import PatchOp
-from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import Gap, MarkerAdded, Reply
+from iris_session.protocol.scene import PatchOp
+from iris_session.protocol.server_messages import Audited, Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView

@@ -7,11 +7,11 @@ from typing import Final
 from iris_session.authority import anchoring, assignment, corrections, engagement, leases
 from iris_session.authority.context import Context
 from iris_session.authority.state import HOST_ID, NO_CONNECTION, Participant
+from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Alignment, Denial
 from iris_session.protocol.entries import HOST, Join
 from iris_session.protocol.names import AlignmentKind, AuditKind, DenialReason, HoldReason, RefusalCode, Role
-from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import AlignmentRun, ParticipantJoined, ParticipantLeft, Snapshot
+from iris_session.protocol.server_messages import AlignmentRun, Audited, ParticipantJoined, ParticipantLeft, Snapshot
 from iris_session.protocol.steps import Admitted, Dropped
 
 NOT_NEEDED: Final = Alignment(0, AlignmentKind.NOT_NEEDED, IDENTITY)

@@ -12,7 +12,7 @@ from iris_session.authority.state import HOST_ID, KEPT, LeaseState, Pending
 from iris_session.protocol.common import Denial
 from iris_session.protocol.entries import SceneLoaded, ScenePatched
 from iris_session.protocol.names import DenialReason, LeaseMode, TargetKind
-from iris_session.protocol.scene_patch import merged
+from iris_session.protocol.scene import merged
 from iris_session.protocol.server_messages import SceneChanged
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 

@@ -12,7 +12,7 @@ import msgspec
 from iris_session.protocol.common import IDENTITY, Alignment, Pose, Vec3
 from iris_session.protocol.entries import SceneLoaded
 from iris_session.protocol.names import HoldReason
-from iris_session.protocol.scene_patch import PatchOp
+from iris_session.protocol.scene import PatchOp
 from iris_session.protocol.server_messages import EpisodeChanged, Feedback
 from iris_session.protocol.steps import CommandSource
 

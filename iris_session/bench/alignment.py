@@ -16,12 +16,131 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
-from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, quat_from_yaw
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply
+from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, quat_from_yaw
 from anchors.touch import Touch, register
 from anchors.uncertainty import length_p95
-from iris_session.bench.alignment_world import TIP_SIGMA_M, Headset, Reported
-from iris_session.bench.contract import Bar, BenchReport, bar
+from iris_session.bench.report import Bar, BenchReport, make_bar
+from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
+
+# --- simulated headsets -----------------------------------------------------------------------------------------------
+
+PER_VIEWPOINT: Final = 20  # 2 s at 10 Hz
+PERIOD_S: Final = 0.1
+WALK_S: Final = 3.0  # from one viewpoint to the next
+DISTANCE_M: Final = (0.4, 1.2)
+ELEVATION_DEG: Final = (40.0, 80.0)
+NOISE: Final = SheetNoise()
+TILT_SIGMA_RAD: Final = math.radians(0.2)
+DRIFT_M_PER_S: Final = 0.003 / 60.0
+HEAD_SIGMA_M: Final = 0.0005  # a headset's tracking of its own head from frame to frame; our assumption
+TIP_SIGMA_M: Final = 0.0015
+HOLDER_SIGMA_RAD: Final = math.radians(
+    0.3
+)  # our assumption: a tracked controller is turned as well as a sheet at 0.5 m
+
+
+@dataclass(frozen=True)
+class ReportedObservation:
+    """One observation as a headset reports it."""
+
+    anchor_id: str
+    pose: PoseTuple
+    p_head: Vec3
+    capture_ns: int
+    viewpoint_id: int
+
+
+@dataclass
+class SimulatedHeadset:
+    """The truth about one headset, and what it has reported. `now_s` is where its run has come to."""
+
+    rng: np.random.Generator
+    now_s: float = 0.0
+    viewpoints: int = 0
+    q0: Array = field(init=False)
+    p0: Array = field(init=False)
+    velocity: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        yaw = quat_exp(np.array([0.0, 0.0, self.rng.uniform(-math.pi, math.pi)]))
+        tilt = quat_exp(np.append(self.rng.normal(0.0, TILT_SIGMA_RAD, 2), 0.0))
+        self.q0 = quat_multiply(tilt, yaw)
+        self.p0 = np.append(self.rng.uniform(-3.0, 3.0, 2), self.rng.uniform(-1.5, 0.5))
+        way = self.rng.normal(size=3)
+        self.velocity = DRIFT_M_PER_S * way / np.linalg.norm(way)
+
+    def T_world_tracking(self, at_s: float) -> tuple[Array, Array]:
+        """The truth at a time."""
+        return self.p0 + at_s * self.velocity, self.q0
+
+    def observe_sheet(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[ReportedObservation]:
+        """2 s of observations from a new viewpoint: somewhere around the sheet, 0.4 to 1.2 m away."""
+        rng, n = self.rng, PER_VIEWPOINT
+        d = rng.uniform(*DISTANCE_M)
+        elevation, azimuth = math.radians(rng.uniform(*ELEVATION_DEG)), rng.uniform(-math.pi, math.pi)
+        e1 = -np.array(
+            [
+                math.cos(elevation) * math.cos(azimuth),
+                math.cos(elevation) * math.sin(azimuth),
+                math.sin(elevation),
+            ]
+        )
+        e2 = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        axes = np.stack([e1, e2, np.cross(e1, e2)])
+        noise = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        p, q = NOISE.seen(p_anchor, q_anchor, axes, d, np.hstack([noise, turns]), rng.normal())
+        for i in np.flatnonzero(rng.random(n) < NOISE.wrong_share):
+            p[i], q[i] = NOISE.wrong(p[i], q[i], e1, rng)
+        heads = p_anchor - d * e1 + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
+        return self._report(anchor_id, p, q, heads)
+
+    def observe_controller(self, anchor_id: str, p_anchor: Array, q_anchor: Array) -> list[ReportedObservation]:
+        """2 s of a tracked controller in its holder."""
+        rng, n = self.rng, PER_VIEWPOINT
+        noise = TIP_SIGMA_M * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        turns = HOLDER_SIGMA_RAD * of_viewpoint(rng.normal(size=3), rng.normal(size=(n, 3)))
+        q = quat_multiply(quat_exp(turns), np.broadcast_to(q_anchor, (n, 4)))
+        return self._report(anchor_id, p_anchor + noise, q, np.broadcast_to(p_anchor, (n, 3)))
+
+    def touch_mark(self, p_mark: Array, sigma_m: float) -> list[Vec3]:
+        """The tip of a controller on a mark, once."""
+        p = p_mark + self.rng.normal(0.0, sigma_m, (1, 3))
+        origin, q = self.T_world_tracking(self.now_s)
+        return [_to_vec3(v) for v in ((p - origin) @ quat_matrix(q)).tolist()]
+
+    def _report(self, anchor_id: str, p: Array, q: Array, heads: Array) -> list[ReportedObservation]:
+        """World to tracking at the time of each, then on to the next place."""
+        times = self.now_s + PERIOD_S * np.arange(len(p))
+        q_inv = quat_conjugate(self.q0)
+        R = quat_matrix(q_inv)
+        origin = self.p0 + times[:, None] * self.velocity
+        p_tracking, head_tracking = (p - origin) @ R.T, (heads - origin) @ R.T
+        q_tracking = quat_multiply(q_inv, q)
+        out = [
+            ReportedObservation(anchor_id, (_to_vec3(a), _to_quat(b)), _to_vec3(h), round(t * 1e9), self.viewpoints)
+            for a, b, h, t in zip(
+                p_tracking.tolist(), q_tracking.tolist(), head_tracking.tolist(), times.tolist(), strict=True
+            )
+        ]
+        self.viewpoints += 1
+        self.now_s = float(times[-1]) + PERIOD_S
+        return out
+
+    def walk(self) -> None:
+        self.now_s += WALK_S
+
+
+def _to_vec3(v: list[float]) -> Vec3:
+    return (v[0], v[1], v[2])
+
+
+def _to_quat(v: list[float]) -> Quat:
+    return (v[0], v[1], v[2], v[3])
+
+
+# --- benchmark --------------------------------------------------------------------------------------------------------
 
 #: Three sheets, 1.5 m from each other, each turned its own way.
 TRIANGLE: Final[dict[str, PoseTuple]] = {
@@ -49,7 +168,7 @@ BOUNDS: Final = (
 _TIMED: Final = 8  # headsets, at most, whose updates are timed one by one
 
 
-class Offset(NamedTuple):
+class HeadsetError(NamedTuple):
     """Where a headset puts what is really at X: at R X + t; `S(X)` is the covariance that it states."""
 
     R: Array
@@ -59,7 +178,7 @@ class Offset(NamedTuple):
 
 
 @dataclass
-class Tally:
+class CaseStatistics:
     """What all pairs of one case came to."""
 
     errors: dict[str, list[float]] = field(default_factory=dict)
@@ -75,22 +194,22 @@ def run_alignment(pairs: int = 2000, seed: int = 0, progress: Callable[[str], No
     for k, case in enumerate(CASES):
         progress(f"{case}, {pairs} pairs")
         rngs = [np.random.default_rng(s) for s in np.random.SeedSequence((seed, k)).spawn(3 * pairs)]
-        results[case] = _case(case, rngs)
-    results |= _timing(seed, min(_TIMED, pairs))
+        results[case] = _run_case(case, rngs)
+    results |= _measure_update_times(seed, min(_TIMED, pairs))
     for case, key, bound in BOUNDS:
-        bars.append(bar(results, f"{case}.{key}", "<=", bound))
+        bars.append(make_bar(results, f"{case}.{key}", "<=", bound))
     for case in CASES:
-        bars.append(bar(results, f"{case}.refused_share", "<=", 0.02))
-        bars.append(bar(results, f"{case}.coverage_share", ">=", 0.93))
-        bars.append(bar(results, f"{case}.coverage_share", "<=", 0.97))
-    bars += [bar(results, f"{load}update_us_p50", "<=", 200.0) for load in ("", "loaded_")]
+        bars.append(make_bar(results, f"{case}.refused_share", "<=", 0.02))
+        bars.append(make_bar(results, f"{case}.coverage_share", ">=", 0.93))
+        bars.append(make_bar(results, f"{case}.coverage_share", "<=", 0.97))
+    bars += [make_bar(results, f"{load}update_us_p50", "<=", 200.0) for load in ("", "loaded_")]
     return BenchReport("alignment", {"pairs": pairs, "seed": seed}, results, tuple(bars))
 
 
-def _case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float]:
+def _run_case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float]:
     anchors: dict[str, PoseTuple] = TRIANGLE if case.startswith("three") else ONE
     hull = [np.array(p) for p in MARKS.values()] if case == "touch" else [np.array(p) for p, _ in anchors.values()]
-    ours, last, mean = Tally(), Tally(), Tally()
+    ours, last, mean = CaseStatistics(), CaseStatistics(), CaseStatistics()
     for a, b, free in zip(rngs[::3], rngs[1::3], rngs[2::3], strict=True):
         turn = free.uniform(-math.pi, math.pi)
         centre = np.mean(hull, axis=0)
@@ -100,44 +219,51 @@ def _case(case: str, rngs: Sequence[np.random.Generator]) -> dict[str, float]:
             "at_1m": centre + way,
             "at_2m": centre + 2.0 * way,
         }
-        found = [_touching(rng) if case == "touch" else _looking(case, rng, anchors) for rng in (a, b)]
+        found = [
+            _simulate_touching_headset(rng) if case == "touch" else _simulate_looking_headset(case, rng, anchors)
+            for rng in (a, b)
+        ]
         for tally, (x, y) in zip((ours, last, mean), zip(*found, strict=True), strict=False):
-            _judge(tally, x, y, points, hull)
-    out = _summary(ours, "", len(hull) > 1)
+            _evaluate_pair(tally, x, y, points, hull)
+    out = _summarize(ours, "", len(hull) > 1)
     if case != "touch":
-        out |= _summary(last, "naive_last_", len(hull) > 1) | _summary(mean, "naive_mean_", len(hull) > 1)
+        out |= _summarize(last, "naive_last_", len(hull) > 1) | _summarize(mean, "naive_mean_", len(hull) > 1)
     return out
 
 
-def _looking(case: str, rng: np.random.Generator, anchors: dict[str, PoseTuple]) -> tuple[Offset, Offset, Offset]:
+def _simulate_looking_headset(
+    case: str, rng: np.random.Generator, anchors: dict[str, PoseTuple]
+) -> tuple[HeadsetError, HeadsetError, HeadsetError]:
     """One headset's run: our estimate, that of its last observation, and the mean of all."""
-    headset = Headset(rng)
+    headset = SimulatedHeadset(rng)
     estimator = AlignmentEstimator(anchors)
-    seen = _run(case, headset, anchors)
+    seen = _simulate_observations(case, headset, anchors)
     for o in seen:
-        _add(estimator, case, o)
+        _add_observation(estimator, case, o)
     now = headset.T_world_tracking(seen[-1].capture_ns * 1e-9)
     estimate = estimator.estimate()
-    p, q = _each(seen, anchors)
+    p, q = _align_each_observation(seen, anchors)
     return (
-        _offset(_arrays(estimate.T_world_tracking), now, estimate),
-        _offset((p[-1], q[-1]), now, None),
-        _offset(_mean(seen, anchors, q), now, None),
+        _compute_error(_to_arrays(estimate.T_world_tracking), now, estimate),
+        _compute_error((p[-1], q[-1]), now, None),
+        _compute_error(_average_alignments(seen, anchors, q), now, None),
     )
 
 
-def _run(case: str, headset: Headset, anchors: dict[str, PoseTuple]) -> list[Reported]:
+def _simulate_observations(
+    case: str, headset: SimulatedHeadset, anchors: dict[str, PoseTuple]
+) -> list[ReportedObservation]:
     """Three viewpoints of every sheet (`quick`: one), of the controller in its holder as many."""
-    seen: list[Reported] = []
+    seen: list[ReportedObservation] = []
     for name, (p, q) in anchors.items():
         for _ in range(1 if case == "three_sheets_quick" else 3):
-            look = headset.hold if case == "holder" else headset.look
+            look = headset.observe_controller if case == "holder" else headset.observe_sheet
             seen += look(name, np.array(p), np.array(q))
             headset.walk()
     return seen
 
 
-def _add(estimator: AlignmentEstimator, case: str, o: Reported) -> None:
+def _add_observation(estimator: AlignmentEstimator, case: str, o: ReportedObservation) -> None:
     """What a headset reports, and nothing else."""
     if case == "holder":
         estimator.add(o.anchor_id, o.pose, o.capture_ns, 0, o.viewpoint_id, covariance=controller_covariance())
@@ -145,20 +271,20 @@ def _add(estimator: AlignmentEstimator, case: str, o: Reported) -> None:
         estimator.add(o.anchor_id, o.pose, o.capture_ns, 0, o.viewpoint_id, p_tracking_head=o.p_head)
 
 
-def _touching(rng: np.random.Generator) -> tuple[Offset]:
+def _simulate_touching_headset(rng: np.random.Generator) -> tuple[HeadsetError]:
     """One headset's wearer touches every mark once."""
-    headset = Headset(rng)
+    headset = SimulatedHeadset(rng)
     touches = []
     for name, p in MARKS.items():
-        (tip,) = headset.touch(np.array(p), TIP_SIGMA_M)
+        (tip,) = headset.touch_mark(np.array(p), TIP_SIGMA_M)
         touches.append(Touch(name, tip))
         at = headset.now_s
         headset.walk()
     estimate = register(MARKS, touches, sigma_m=TIP_SIGMA_M).estimate
-    return (_offset(_arrays(estimate.T_world_tracking), headset.T_world_tracking(at), estimate),)
+    return (_compute_error(_to_arrays(estimate.T_world_tracking), headset.T_world_tracking(at), estimate),)
 
 
-def _each(seen: Sequence[Reported], anchors: dict[str, PoseTuple]) -> tuple[Array, Array]:
+def _align_each_observation(seen: Sequence[ReportedObservation], anchors: dict[str, PoseTuple]) -> tuple[Array, Array]:
     """`T_world_tracking` as every single observation has it."""
     pw = np.array([anchors[o.anchor_id][0] for o in seen])
     qw = np.array([anchors[o.anchor_id][1] for o in seen])
@@ -166,7 +292,9 @@ def _each(seen: Sequence[Reported], anchors: dict[str, PoseTuple]) -> tuple[Arra
     return pw - np.einsum("nij,nj->ni", quat_matrix(q), np.array([o.pose[0] for o in seen])), q
 
 
-def _mean(seen: Sequence[Reported], anchors: dict[str, PoseTuple], q: Array) -> tuple[Array, Array]:
+def _average_alignments(
+    seen: Sequence[ReportedObservation], anchors: dict[str, PoseTuple], q: Array
+) -> tuple[Array, Array]:
     """Plain mean in 6 degrees of freedom: of the rotations (Markley 2007), then of the positions turned by it."""
     q_mean = np.linalg.eigh(q.T @ q)[1][:, -1]
     p = np.array([o.pose[0] for o in seen])
@@ -174,17 +302,21 @@ def _mean(seen: Sequence[Reported], anchors: dict[str, PoseTuple], q: Array) -> 
     return np.mean(pw - p @ quat_matrix(q_mean).T, axis=0), q_mean
 
 
-def _arrays(T: PoseTuple) -> tuple[Array, Array]:
+def _to_arrays(T: PoseTuple) -> tuple[Array, Array]:
     return np.array(T[0]), np.array(T[1])
 
 
-def _offset(found: tuple[Array, Array], true: tuple[Array, Array], estimate: AlignmentEstimate | None) -> Offset:
+def _compute_error(
+    found: tuple[Array, Array], true: tuple[Array, Array], estimate: AlignmentEstimate | None
+) -> HeadsetError:
     q = quat_multiply(found[1], quat_conjugate(true[1]))
     R = quat_matrix(q)
-    return Offset(R, found[0] - R @ true[0], q, estimate)
+    return HeadsetError(R, found[0] - R @ true[0], q, estimate)
 
 
-def _judge(tally: Tally, a: Offset, b: Offset, points: dict[str, Array], hull: list[Array]) -> None:
+def _evaluate_pair(
+    tally: CaseStatistics, a: HeadsetError, b: HeadsetError, points: dict[str, Array], hull: list[Array]
+) -> None:
     """One pair: errors at the points and at the worst place within the hull (a corner: the error is affine)."""
     tally.pairs += 1
     stated = [o.estimate for o in (a, b) if o.estimate is not None]
@@ -206,7 +338,7 @@ def _judge(tally: Tally, a: Offset, b: Offset, points: dict[str, Array], hull: l
     tally.errors.setdefault("turn", []).append(math.degrees(float(np.linalg.norm(turn))))
 
 
-def _summary(tally: Tally, prefix: str, hull: bool) -> dict[str, float]:
+def _summarize(tally: CaseStatistics, prefix: str, hull: bool) -> dict[str, float]:
     names = ("sheet", "at_1m", "at_2m", *(("hull",) if hull else ()))
     out = {f"{prefix}{name}_mm_p95": _p95(tally.errors.get(name, []), 1e3) for name in names}
     out[f"{prefix}sheet_deg_p95"] = _p95(tally.errors.get("turn", []), 1.0)
@@ -223,20 +355,22 @@ def _p95(values: Sequence[float], scale: float) -> float:
     return round(float(np.quantile(values, 0.95)) * scale, 3) if len(values) else float("inf")
 
 
-def _timing(seed: int, headsets: int) -> dict[str, float]:
+def _measure_update_times(seed: int, headsets: int) -> dict[str, float]:
     """Processor time, as the server spends it: with one sheet and up to three viewpoints, and `loaded`: with three
     sheets and the last of 15 viewpoints."""
     few: dict[str, list[float]] = {"update": [], "add": [], "estimate": []}
     many: dict[str, list[float]] = {"update": [], "add": [], "estimate": []}
     for k, rng in enumerate(np.random.default_rng(s) for s in np.random.SeedSequence((seed, 99)).spawn(headsets + 2)):
         one, three = AlignmentEstimator(ONE), AlignmentEstimator(TRIANGLE)
-        seen = _run("one_sheet", Headset(rng), ONE)
-        headset = Headset(rng)
-        before = [o for _ in range(4) for o in _run("three_sheets_quick", headset, TRIANGLE)]
-        _time(three, before, {name: [] for name in many})
-        last = _run("three_sheets_quick", headset, TRIANGLE)
+        seen = _simulate_observations("one_sheet", SimulatedHeadset(rng), ONE)
+        headset = SimulatedHeadset(rng)
+        before = [o for _ in range(4) for o in _simulate_observations("three_sheets_quick", headset, TRIANGLE)]
+        _time_estimator(three, before, {name: [] for name in many})
+        last = _simulate_observations("three_sheets_quick", headset, TRIANGLE)
         for estimator, looks, spent in ((one, seen, few), (three, last, many)):
-            _time(estimator, looks, spent if k >= 2 else {name: [] for name in spent})  # the first two warm up
+            _time_estimator(
+                estimator, looks, spent if k >= 2 else {name: [] for name in spent}
+            )  # the first two warm up
     return {
         f"{prefix}{name}_us_p50": round(float(np.median(ns)) * 1e-3, 1)
         for prefix, spent in (("", few), ("loaded_", many))
@@ -244,13 +378,15 @@ def _timing(seed: int, headsets: int) -> dict[str, float]:
     }
 
 
-def _time(estimator: AlignmentEstimator, seen: Sequence[Reported], spent: dict[str, list[float]]) -> None:
+def _time_estimator(
+    estimator: AlignmentEstimator, seen: Sequence[ReportedObservation], spent: dict[str, list[float]]
+) -> None:
     """The server takes every observation, and renews the estimate at most five times a second, which is with every
     second observation at 10 Hz. An update is one observation with its half of an estimate."""
     for first, second in zip(seen[::2], seen[1::2], strict=True):
         start = time.thread_time_ns()
-        _add(estimator, "one_sheet", first)
-        _add(estimator, "one_sheet", second)
+        _add_observation(estimator, "one_sheet", first)
+        _add_observation(estimator, "one_sheet", second)
         middle = time.thread_time_ns()
         estimator.estimate()
         end = time.thread_time_ns()

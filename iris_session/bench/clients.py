@@ -100,7 +100,7 @@ class BenchClient:
         self.ticks.append(state.header.tick)
         self.state_ns.append(state.header.session_time)
         self.published_ns.append(state.header.published_ns)
-        self.applied_seq.append(_seq_of(state.header.applied, self.spec.robot))
+        self.applied_seq.append(_find_applied_seq(state.header.applied, self.spec.robot))
         if self._job.keep_poses:
             self.poses[len(self.ticks) - 1] = state.poses
 
@@ -143,7 +143,7 @@ class BenchClient:
         return self._next_ns if self.spec.samples else 2**63 - 1
 
 
-def _seq_of(applied: tuple[Applied, ...], robot: str) -> int:
+def _find_applied_seq(applied: tuple[Applied, ...], robot: str) -> int:
     return next((a.seq for a in applied if a.robot == robot), -1) if robot else -1
 
 
@@ -161,8 +161,8 @@ def run(job: Job) -> None:
     group = ClientGroup([c.client for c in clients])
     begin = end = 0
     cpu_s = time.process_time()
-    while not end or _now(job) < end:
-        now = _now(job)
+    while not end or _session_time_ns(job) < end:
+        now = _session_time_ns(job)
         if not end and selector.select(0):
             begin, end = map(int, sys.stdin.readline().split())
             for client in clients:
@@ -172,19 +172,19 @@ def run(job: Job) -> None:
             client.recording = bool(end) and begin <= now < end
             client.step(now)
         wake = min(now + 20_000_000, *(c.next_ns for c in clients))
-        group.poll(max(0.0, (wake - _now(job)) * 1e-9))
+        group.poll(max(0.0, (wake - _session_time_ns(job)) * 1e-9))
     cpu_share = (time.process_time() - cpu_s) / ((end - begin) * 1e-9)
-    _write(job, clients, cpu_share)
+    _write_log(job, clients, cpu_share)
     for client in clients:
         with contextlib.suppress(Exception):  # the session may have ended first
             client.client.close()
 
 
-def _now(job: Job) -> int:
+def _session_time_ns(job: Job) -> int:
     return time.monotonic_ns() - job.origin_ns
 
 
-def _write(job: Job, clients: list[BenchClient], cpu_share: float) -> None:
+def _write_log(job: Job, clients: list[BenchClient], cpu_share: float) -> None:
     columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.int64 | np.float64]]] = {}
     for client in clients:
         name = client.spec.name

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from iris_session.bench.contract import BenchError
+from iris_session.bench.report import BenchError
 
 HZ: Final = 60
 SECONDS: Final = 6
@@ -71,7 +71,7 @@ class ClothMotion:
     def n_vertices(self) -> int:
         return int(self.nodes.shape[1])
 
-    def index(self, frame: int) -> int:
+    def frame_index(self, frame: int) -> int:
         """Of the recorded frame to show as the `frame`-th: the motion runs to its end and back again."""
         period = 2 * (len(self.nodes) - 1)
         return min(frame % period, period - frame % period)
@@ -82,9 +82,9 @@ class ClothMotion:
         return p_world
 
 
-def cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
     """The recording of a cloth of `side` x `side` vertices: from the cache, or made now and kept there."""
-    path = _folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
+    path = _cache_folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
     try:
         with path.open("rb") as file, np.load(file) as kept:  # numpy leaves a damaged file open
             return ClothMotion(kept["nodes"], kept["origin"], float(kept["scale"]), kept["faces"])
@@ -92,7 +92,7 @@ def cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda 
         pass
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         progress(f"{path} cannot be read ({error}): made anew")
-    motion = simulate(side, seed, progress)
+    motion = simulate_cloth(side, seed, progress)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")  # numpy insists on the ending
     try:
@@ -106,15 +106,15 @@ def cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda 
     return motion
 
 
-def simulate(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
     """`SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
     spacing = EDGE_M / (side - 1)
     hands = _Hands(seed)
-    left, right = (" ".join(map(str, p)) for p in hands.at(0.0))
+    left, right = (" ".join(map(str, p)) for p in hands.positions_at(0.0))
     progress(f"simulating a cloth of {side} x {side} vertices, this once: some minutes for 100 x 100")
     model = mujoco.MjModel.from_xml_string(
         _SCENE.format(
-            grips=_grips(side),
+            grips=_format_grips(side),
             timestep=TIMESTEP_S,
             top=TOP_M,
             left=left,
@@ -129,7 +129,7 @@ def simulate(side: int, seed: int, progress: Callable[[str], None] = lambda _: N
         if frame % (HZ // 2) == 0:
             progress(f"{frame / HZ:g} s of {SECONDS} s are simulated")
         for _ in range(STEPS_PER_FRAME):
-            data.mocap_pos[:] = hands.at(data.time)
+            data.mocap_pos[:] = hands.positions_at(data.time)
             mujoco.mj_step(model, data)
         frames[frame] = data.flexvert_xpos
     if not np.isfinite(frames).all():
@@ -140,7 +140,7 @@ def simulate(side: int, seed: int, progress: Callable[[str], None] = lambda _: N
     return ClothMotion(nodes, origin, scale, np.array(model.flex_elem, np.int32).reshape(-1, 3))
 
 
-def _grips(side: int) -> str:
+def _format_grips(side: int) -> str:
     """The hands hold the ends of the first row."""
     held = max(1, round(_GRIP * side))
     ends = (("left", range(held)), ("right", range(side - held, side)))
@@ -157,7 +157,7 @@ class _Hands:
         self._phase = rng.uniform(0.0, 2.0 * math.pi, (2, 3))
         self._hz = rng.uniform(1.2, 2.2, (2, 3))
 
-    def at(self, t: float) -> npt.NDArray[np.float64]:
+    def positions_at(self, t: float) -> npt.NDArray[np.float64]:
         """(2, 3) [m]: left and right at time `t` [s]."""
         ramp = min(1.0, t)
         turn = 2.0 * math.pi * t / SECONDS
@@ -169,5 +169,5 @@ class _Hands:
         return np.asarray(base + shake)
 
 
-def _folder() -> Path:
+def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iris-session" / "bench"

@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 import zstandard
 
-from iris_session.bench.arena import Log, Measured, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.cloth_motion import HZ, ClothMotion, cloth_motion
-from iris_session.bench.contract import NO_BARS, BenchError, BenchReport, bar
+from iris_session.bench.cloth_motion import HZ, ClothMotion, load_cloth_motion
 from iris_session.bench.deformable_clients import DeformableJob
+from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
+from iris_session.bench.report import NO_BARS, BenchError, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
@@ -50,42 +50,42 @@ def run_deformable(
     side = math.isqrt(vertices)
     if side * side != vertices:
         raise BenchError(f"--vertices {vertices}: the cloth is square, take {side * side} or {(side + 1) ** 2}")
-    motion = cloth_motion(side, seed, progress)
+    motion = load_cloth_motion(side, seed, progress)
     topology = DeformableTopology(motion.n_vertices, motion.faces)
-    specs, links = linked([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
-    source = _Source(motion, topology)
+    specs, links = assign_links([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
+    source = _ClothSource(motion, topology)
     with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
         file = Path(folder) / "topology"
         file.write_bytes(topology.to_bytes())
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            grouped(specs),
+            group_clients(specs),
             seconds,
             links=links,
             seed=seed,
             curve=curve,
             module="iris_session.bench.deformable_clients",
             make_job=functools.partial(DeformableJob, stream=STREAM, topology=str(file)),
-            beside=source.publish,
+            on_tick=source.publish,
             progress=progress,
         )
     progress("comparing every delivered frame with the motion")
-    results = {**_results(got, source), **_offline(motion, topology)}
+    results = {**_summarize(got, source), **_measure_offline(motion, topology)}
     bars = [
-        bar(results, "encode_ms_p50", "<=", 1.0),
-        bar(results, "encode_ms_p99", "<=", 1.0),
-        bar(results, "mbit_per_s", "<=", 20.0),
-        bar(results, "max_error_mm", "<=", 0.5),
-        bar(results, "delivered_hz_min", ">=", 59.0),
+        make_bar(results, "encode_ms_p50", "<=", 1.0),
+        make_bar(results, "encode_ms_p99", "<=", 1.0),
+        make_bar(results, "mbit_per_s", "<=", 20.0),
+        make_bar(results, "max_error_mm", "<=", 0.5),
+        make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
     params: dict[str, Any] = {"vertices": vertices, "clients": clients, "seconds": seconds, "seed": seed}
     params |= {"curve": curve, "hz": HZ, "bound_mm": BOUND_M * 1e3}
     if profile:
         params |= {"profile": profile, "bars": NO_BARS}
-    return BenchReport("deformable", params, results, () if profile else tuple(bars), _reference(motion))
+    return BenchReport("deformable", params, results, () if profile else tuple(bars), _measure_reference(motion))
 
 
-class _Source:
+class _ClothSource:
     """Publishes the motion from the session's loop, 60 frames a second, as `runtime` does with what physics bends.
 
     `frames`: index into the motion by `capture_ns`. `encoded`: of every frame session time, what it
@@ -110,7 +110,7 @@ class _Source:
         if due < self._next:
             return
         self._next = due + 1  # what the loop had no time for is left out
-        index = self.motion.index(due)
+        index = self.motion.frame_index(due)
         vertices = self.motion.vertices(index)
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         made = self._encoder.encode(vertices)
@@ -122,7 +122,7 @@ class _Source:
             self.refused += not session.publish_media(STREAM, made, capture_ns=now_ns)
 
 
-def _results(got: Measured, source: _Source) -> dict[str, Any]:
+def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     """Figures of the window. Bits are those of the messages that were sent to a client, with topic and header."""
     end_ns = got.begin_ns + got.seconds * 1e9
     rows = np.array([row[1:] for row in source.encoded if got.begin_ns <= row[0] < end_ns]).reshape(-1, 3)
@@ -138,7 +138,7 @@ def _results(got: Measured, source: _Source) -> dict[str, Any]:
         "encode_ms_p50": _percentile(spent[:, 0], 50),
         "encode_ms_p99": _percentile(spent[:, 0], 99),
         "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
-        "max_error_mm": round(_max_error_m(got.logs, source) * 1e3, 5),
+        "max_error_mm": round(_compute_max_error_m(got.logs, source) * 1e3, 5),
         "delivered_hz_min": round(min(len(log["handed_ns"]) for log in logs) / got.seconds, 2),
         "encode_cpu_ms_p50": _percentile(spent[:, 1], 50),
         "encode_cpu_ms_p99": _percentile(spent[:, 1], 99),
@@ -159,13 +159,13 @@ def _results(got: Measured, source: _Source) -> dict[str, Any]:
     }
 
 
-def _max_error_m(logs: dict[str, Log], source: _Source) -> float:
+def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
     """Over all vertices of all frames that were delivered. Also checks that clients decoded them as we do here."""
     decoder = DeformableDecoder(source.topology)
     errors: dict[tuple[int, int], float] = {}  # by capture and checksum: the same frame goes to every client
     worst = 0.0
     for name, log in logs.items():
-        for capture_ns, checksum, payload in _payloads(log):
+        for capture_ns, checksum, payload in _iterate_payloads(log):
             key = (capture_ns, checksum)
             if key not in errors:
                 decoded = decoder.decode(payload)
@@ -177,7 +177,7 @@ def _max_error_m(logs: dict[str, Log], source: _Source) -> float:
     return worst
 
 
-def _payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
+def _iterate_payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
     """`capture_ns`, checksum and bytes of every frame that one client took."""
     end = np.cumsum(log["sizes"])
     for i, capture_ns in enumerate(log["capture_ns"]):
@@ -185,7 +185,7 @@ def _payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
         yield int(capture_ns), int(log["checksums"][i]), payload
 
 
-def _offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:
+def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:
     """What the coarser classes would cost at 60 Hz, and what of the motion it is measured on."""
     found: dict[str, Any] = {}
     for name in (BudgetClass.HALF, BudgetClass.QUARTER):
@@ -206,7 +206,7 @@ def _offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any
     return found
 
 
-def _reference(motion: ClothMotion) -> dict[str, float]:
+def _measure_reference(motion: ClothMotion) -> dict[str, float]:
     """The same frames without a codec of their own: float32, and float32 through zstd, level 1."""
     compressor = zstandard.ZstdCompressor(level=1)
     sizes, spent_ns = [], []

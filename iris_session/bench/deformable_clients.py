@@ -60,7 +60,7 @@ class DeformableClient:
         self.checksums: list[int] = []
         self.overflow = 0
 
-    def take(self, recording: bool) -> None:
+    def decode_newest(self, recording: bool) -> None:
         """Decodes the newest frame, as an application does before it draws."""
         frame = self.feed.pop_newest()
         if frame is None:
@@ -79,7 +79,7 @@ class DeformableClient:
         self.decode_ns.append(spent_ns)
         self.checksums.append(zlib.crc32(vertices.data))
 
-    def columns(self) -> dict[str, np.ndarray[Any, Any]]:
+    def to_columns(self) -> dict[str, np.ndarray[Any, Any]]:
         """The log. `sizes`: bytes of each payload. The last of `counts`: bytes of topics and headers."""
         topic = len(media_topic(self.client.connection.connection_epoch, self.feed.stream))
         heads = sum(topic + len(f.header.budget_class) + len(encode_media_header(f.header)) for f in self.frames)
@@ -114,8 +114,8 @@ def run(job: DeformableJob) -> None:
         group.poll(0.02)
         recording = bool(end) and begin <= time.monotonic_ns() - job.origin_ns < end
         for client in clients:
-            client.take(recording)
-    log = {f"{c.spec.name}.{key}": column for c in clients for key, column in c.columns().items()}
+            client.decode_newest(recording)
+    log = {f"{c.spec.name}.{key}": column for c in clients for key, column in c.to_columns().items()}
     np.savez(job.log, allow_pickle=False, **log)
     for client in clients:
         with contextlib.suppress(Exception):  # the session may have ended first

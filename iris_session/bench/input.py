@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from iris_session.bench.arena import Measured, grouped, linked, measure
-from iris_session.bench.bare import bare
+from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import NO_BARS, BenchReport, bar
+from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
+from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device
@@ -38,11 +38,11 @@ def run_input(
     arms = arm_names(robots)
     specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
     specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
-    specs, links = linked(specs, profile)
+    specs, links = assign_links(specs, profile)
     progress("the machine by itself: an empty loop that publishes to as many receivers")
-    reference = None if profile else bare(operators + observers)
-    got = measure(model, grouped(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
-    responses = response_ms(got, [spec.name for spec in specs if spec.robot])
+    reference = None if profile else measure_baseline(operators + observers)
+    got = measure(model, group_clients(specs), seconds, links=links, seed=seed, curve=curve, progress=progress)
+    responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))
     results: dict[str, Any] = {
@@ -63,10 +63,10 @@ def run_input(
     bound = 2.0 * tick_ms + STATE_PERIOD_MS + (6.0 if curve else STATE_BAR_MS)
     sent = 3 * 72.0 * operators
     bars = [
-        bar(results, "response_ms_p99", "<=", round(bound, 3)),
-        bar(results, "late_tick_share", "<", 0.001),
-        bar(results, "samples_per_s", ">=", 0.98 * sent),
-        bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
+        make_bar(results, "response_ms_p99", "<=", round(bound, 3)),
+        make_bar(results, "late_tick_share", "<", 0.001),
+        make_bar(results, "samples_per_s", ">=", 0.98 * sent),
+        make_bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
     ]
     params: dict[str, Any] = {
         "operators": operators,
@@ -80,7 +80,7 @@ def run_input(
     return BenchReport("input", params, results, () if profile else tuple(bars), reference)
 
 
-def response_ms(got: Measured, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def compute_response_ms(got: Measurement, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
     """For every sample of a driving device: handed-out time of the first frame whose `applied` has it or a newer one,
     minus its receipt. Samples of the last half second, whose frame may come after the window, are left out."""
     out: list[np.ndarray[Any, np.dtype[np.float64]]] = []

@@ -19,13 +19,13 @@ import numpy as np
 import zmq
 
 from iris_session.assets.store import AssetStore
-from iris_session.bench.arena import Log, grouped, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import BenchError, BenchReport, bar
-from iris_session.bench.join_clients import Copied, Joined, JoinJob
-from iris_session.bench.join_scene import Ready, join_model
+from iris_session.bench.harness import Log, group_clients, measure
+from iris_session.bench.join_clients import CopyInterval, JoinJob, JoinResult
+from iris_session.bench.join_scene import PreparedScene, make_join_model
+from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.session.session import Session
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess, child_environment, module_command
 
 #: From the beginning of the window: what the others are used to is measured first.
 BEGIN_S: Final = 4.0
@@ -44,35 +44,35 @@ def run_join(
     """One client joins while `clients` observers watch. References, in the same run: the same bytes in one message, and
     the others' state while memory is copied at the priority at which a client takes assets."""
     progress("compiling the scene")
-    model = join_model(objects, assets_mb, seed).compile()
+    model = make_join_model(objects, assets_mb, seed).compile()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
         file = folder / "model.mjb"
         mujoco.mj_saveModel(model, str(file), None)
         store = AssetStore(folder / "store")
         progress("encoding its assets, cache cold")
-        cold = _made_ready(file, store.root)
+        cold = _prepare_scene(file, store.root)
         progress("and warm")
-        ready = _made_ready(file, store.root)
+        ready = _prepare_scene(file, store.root)
         if ready.built:
             raise BenchError(f"with a warm cache {ready.built} pieces were encoded anew")
         paths = [store.path(address) for address in ready.sizes]
-        joiner = stack.enter_context(_Joiner(folder, stack.enter_context(_Bare(paths)).port))
+        joiner = stack.enter_context(_Joiner(folder, stack.enter_context(_BulkServer(paths)).port))
         got = measure(
             model,
-            grouped([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)]),
+            group_clients([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)]),
             seconds,
-            actions=[(BEGIN_S, lambda _: joiner.go())],
+            actions=[(BEGIN_S, lambda _: joiner.start_join())],
             assets=store.root,
-            beside=joiner.prepare,
+            on_tick=joiner.prepare,
             seed=seed,
             progress=progress,
         )
-        first, second, copied, bare_s = joiner.result()
+        first, second, copied, bare_s = joiner.read_result()
     results = {
-        **_results(cold, ready, first, second),
-        "others_age_ms_p99": _p99(got.logs, first.begin_ns, second.end_ns),
-        "others_age_ms_p99_baseline": _p99(got.logs, got.begin_ns, first.begin_ns),
+        **_summarize(cold, ready, first, second),
+        "others_age_ms_p99": _compute_age_p99_ms(got.logs, first.begin_ns, second.end_ns),
+        "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, first.begin_ns),
         "late_tick_share": round(got.stats.late_share, 6),
         "scheduling": got.scheduling,
         "drops": got.drops,
@@ -80,12 +80,12 @@ def run_join(
     params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
     reference = {
         "bare_transfer_s": round(bare_s, 3),
-        "others_age_ms_p99_memory_copied": _p99(got.logs, copied.begin_ns, copied.end_ns),
+        "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, copied.begin_ns, copied.end_ns),
     }
-    return BenchReport("join", params, results, tuple(_bars(results, first.bytes)), reference)
+    return BenchReport("join", params, results, tuple(_make_bars(results, first.bytes)), reference)
 
 
-def _results(cold: Ready, ready: Ready, first: Joined, second: Joined) -> dict[str, Any]:
+def _summarize(cold: PreparedScene, ready: PreparedScene, first: JoinResult, second: JoinResult) -> dict[str, Any]:
     return {
         "ready_s": round(ready.seconds, 3),
         "server_rss_mib": round(ready.rss_mib, 1),
@@ -101,25 +101,25 @@ def _results(cold: Ready, ready: Ready, first: Joined, second: Joined) -> dict[s
     }
 
 
-def _bars(results: dict[str, Any], sent: int) -> list[Any]:
+def _make_bars(results: dict[str, Any], sent: int) -> list[Any]:
     return [
-        bar(results, "ready_s", "<=", 2.0),
-        bar(results, "server_rss_mib", "<=", 150.0),
-        bar(results, "complete_s", "<=", 1.0),
-        bar(results, "warm_bytes", "<=", WARM_SHARE * sent),
-        bar(results, "others_age_ms_p99", "<=", 3.0),
+        make_bar(results, "ready_s", "<=", 2.0),
+        make_bar(results, "server_rss_mib", "<=", 150.0),
+        make_bar(results, "complete_s", "<=", 1.0),
+        make_bar(results, "warm_bytes", "<=", WARM_SHARE * sent),
+        make_bar(results, "others_age_ms_p99", "<=", 3.0),
     ]
 
 
-def _made_ready(model: Path, store: Path) -> Ready:
-    command = children.command("iris_session.bench.join_scene", str(model), str(store))
-    done = subprocess.run(command, stdout=subprocess.PIPE, env=children.environment(), check=False)
+def _prepare_scene(model: Path, store: Path) -> PreparedScene:
+    command = module_command("iris_session.bench.join_scene", str(model), str(store))
+    done = subprocess.run(command, stdout=PIPE, env=child_environment(), check=False)
     if done.returncode:
         raise BenchError(f"the scene could not be made ready: status {done.returncode}")
-    return msgspec.json.decode(done.stdout, type=Ready)
+    return msgspec.json.decode(done.stdout, type=PreparedScene)
 
 
-def _p99(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
+def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
     """99th percentile of the age of state at everybody [ms], of frames handed out between two session times."""
     ages = [
         (log["handed_ns"] - log["state_ns"])[(log["handed_ns"] >= begin_ns) & (log["handed_ns"] < end_ns)]
@@ -138,59 +138,48 @@ class _Joiner:
 
     def __init__(self, folder: Path, bare_port: int) -> None:
         self._cache, self._bare_port = str(folder / "cache"), bare_port
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None) -> None:
         if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+            self._process.close()
 
     def prepare(self, session: Session) -> None:
         """Starts the process. Once, in the warm-up."""
         if self._process is not None:
             return
         job = JoinJob(session.address, session.origin_ns, self._cache, self._bare_port)
-        self._process = subprocess.Popen(
-            children.command("iris_session.bench.join_clients"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=children.environment(),
-        )
-        self._say(msgspec.json.encode(job))
+        self._process = ChildProcess("iris_session.bench.join_clients", stdout=PIPE)
+        self._write_line(msgspec.json.encode(job))
 
-    def go(self) -> None:
+    def start_join(self) -> None:
         """Lets it join."""
-        self._say(b"go")
+        self._write_line(b"go")
 
-    def _say(self, line: bytes) -> None:
+    def _write_line(self, line: bytes) -> None:
         assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + b"\n")
-        self._process.stdin.flush()
+        self._process.write(line + b"\n")
 
-    def result(self) -> tuple[Joined, Joined, Copied, float]:
+    def read_result(self) -> tuple[JoinResult, JoinResult, CopyInterval, float]:
         """The first time, the second time, when memory was copied, and the seconds of the bare transfer, made now."""
+        self._read_line()
+        first, second = (msgspec.json.decode(self._read_line(), type=JoinResult) for _ in range(2))
+        copied = msgspec.json.decode(self._read_line(), type=CopyInterval)
+        self._write_line(b"bare")
+        return first, second, copied, float(self._read_line())
+
+    def _read_line(self) -> bytes:
         assert self._process is not None
-        assert self._process.stdout is not None
-        self._process.stdout.readline()
-        first, second = (msgspec.json.decode(self._line(), type=Joined) for _ in range(2))
-        copied = msgspec.json.decode(self._line(), type=Copied)
-        self._say(b"bare")
-        return first, second, copied, float(self._line())
-
-    def _line(self) -> bytes:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise BenchError("the client that joined failed; it has said why")
-        return line
+        try:
+            return self._process.read_line()
+        except EOFError:
+            raise BenchError("the client that joined failed; it has said why") from None
 
 
-class _Bare:
+class _BulkServer:
     """All assets in one message to whoever asks, from a thread."""
 
     def __init__(self, paths: list[Path]) -> None:

@@ -20,10 +20,10 @@ import msgspec
 import numpy as np
 import zmq
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import AssetStore, Client
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
 from iris_session.scene import decode_image, decode_mesh
-from iris_session.system.priority import give_way
+from iris_session.system.priority import lower_thread_priority
 
 JOIN_S: Final = 60.0
 #: Memory is copied for so long, after a pause in which the machine has nothing to do with joining any more; by as many
@@ -43,7 +43,7 @@ class JoinJob(msgspec.Struct, frozen=True):
     bare_port: int
 
 
-class Joined(msgspec.Struct, frozen=True):
+class JoinResult(msgspec.Struct, frozen=True):
     """Times from `connect` on [s]. `first_picture_s`: specification and the coarsest shape of everything, decoded.
     `complete_s`: all assets, verified by hash and decoded. `begin_ns`, `end_ns`: session time."""
 
@@ -56,17 +56,17 @@ class Joined(msgspec.Struct, frozen=True):
     end_ns: int
 
 
-def join(job: JoinJob) -> Joined:
+def join(job: JoinJob) -> JoinResult:
     """One client, from nothing to a whole scene. Raises what the client raises."""
     begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
     with Client(job.address, role="observer", name="joiner", alignment="not_needed") as client:
-        client.assets.cache = AssetCache(job.cache)
+        client.assets.cache = AssetStore(job.cache)
         scene = client.connection.mirror.scene_hash
         first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
         client.wait_for(lambda _: first.done, JOIN_S)
         first.check()
         spec: SceneSpec = first.decoded[scene]
-        sizes, decode = asset_addresses(spec), _decoder(spec)
+        sizes, decode = asset_addresses(spec), _make_decoder(spec)
         shapes = {mesh.levels[-1].address for mesh in spec.meshes} | {field.address for field in spec.hfields}
         rest = client.assets.fetch(sizes, decode=decode)
         client.wait_for(lambda _: shapes.isdisjoint(rest.pending), JOIN_S)
@@ -75,7 +75,7 @@ def join(job: JoinJob) -> Joined:
         end_ns = time.monotonic_ns()
         rest.check()
         assert len(rest.decoded) == len(sizes)
-        return Joined(
+        return JoinResult(
             (picture_ns - begin_ns) * 1e-9,
             (end_ns - begin_ns) * 1e-9,
             first.bytes_received + rest.bytes_received,
@@ -86,14 +86,14 @@ def join(job: JoinJob) -> Joined:
         )
 
 
-class Copied(msgspec.Struct, frozen=True):
+class CopyInterval(msgspec.Struct, frozen=True):
     """When memory was copied: session time."""
 
     begin_ns: int
     end_ns: int
 
 
-def copy_memory(origin_ns: int) -> Copied:
+def copy_memory(origin_ns: int) -> CopyInterval:
     """As low as a client's threads for assets, and without any of their work: what every program costs the others that
     leaves no core idle. numpy copies without Python's lock."""
     time.sleep(PAUSE_S)
@@ -101,7 +101,7 @@ def copy_memory(origin_ns: int) -> Copied:
     end_ns = begin_ns + round(COPY_S * 1e9)
 
     def work() -> None:
-        give_way()
+        lower_thread_priority()
         source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
         while time.monotonic_ns() < end_ns:
             np.copyto(target, source)
@@ -111,10 +111,10 @@ def copy_memory(origin_ns: int) -> Copied:
         thread.start()
     for thread in threads:
         thread.join()
-    return Copied(begin_ns - origin_ns, end_ns - origin_ns)
+    return CopyInterval(begin_ns - origin_ns, end_ns - origin_ns)
 
 
-def _decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
+def _make_decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
     """What a viewer makes of every asset, by what the scene says of it: this one has meshes and images."""
     meshes = {level.address for mesh in spec.meshes for level in mesh.levels}
     images = {level.address: level.encoding for texture in spec.textures for level in texture.levels}
@@ -127,7 +127,7 @@ def _decoder(spec: SceneSpec) -> Callable[[str, memoryview], Any]:
     return decode
 
 
-def bare(port: int) -> float:
+def transfer_in_bulk(port: int) -> float:
     """Seconds for all bytes in one message of ZeroMQ, asked for once: nothing checked, stored or decoded."""
     with zmq.Context() as context, context.socket(zmq.REQ) as asking:
         asking.linger = 0
@@ -148,7 +148,7 @@ def main() -> None:
         print(msgspec.json.encode(join(job)).decode(), flush=True)
     print(msgspec.json.encode(copy_memory(job.origin_ns)).decode(), flush=True)
     sys.stdin.readline()
-    print(bare(job.bare_port), flush=True)
+    print(transfer_in_bulk(job.bare_port), flush=True)
 
 
 if __name__ == "__main__":

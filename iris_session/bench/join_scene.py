@@ -28,7 +28,7 @@ _LEVELS: Final = 1.228
 _VERTEX_BYTES: Final = 35.5
 
 
-class Ready(msgspec.Struct, frozen=True):
+class PreparedScene(msgspec.Struct, frozen=True):
     """`seconds`: from the compiled model to assets that can be fetched. `rss_mib`: most memory meanwhile, beyond that
     of the process with the model. `scene`: address of the specification; `sizes`: bytes of all assets by address."""
 
@@ -39,7 +39,7 @@ class Ready(msgspec.Struct, frozen=True):
     sizes: dict[str, int]
 
 
-def join_model(objects: int, assets_mb: float, seed: int) -> Any:
+def make_join_model(objects: int, assets_mb: float, seed: int) -> Any:
     """An `mujoco.MjSpec`: `objects` moving bodies with 60 meshes and 60 textures between them, about `assets_mb` MB."""
     import mujoco
 
@@ -60,7 +60,7 @@ def join_model(objects: int, assets_mb: float, seed: int) -> Any:
         material = spec.add_material(name=f"material{i}")
         material.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = f"texture{i}"
     for i in range(MESHES):
-        points, faces, uv = _stone(rng, vertices)
+        points, faces, uv = _make_stone(rng, vertices)
         spec.add_mesh(
             name=f"mesh{i}",
             uservert=points.ravel().tolist(),
@@ -76,7 +76,7 @@ def join_model(objects: int, assets_mb: float, seed: int) -> Any:
     return spec
 
 
-def _stone(
+def _make_stone(
     rng: np.random.Generator, vertices: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Points [m] of a rough ball of 6 cm, triangles and texture coordinates."""
@@ -97,7 +97,7 @@ def _stone(
     return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
-def make_ready(model_path: str, store_path: str) -> Ready:
+def prepare_scene(model_path: str, store_path: str) -> PreparedScene:
     """What a server does at its start with a compiled model."""
     from iris_session.assets.store import AssetStore
     from iris_session.physics.load import load_model
@@ -115,14 +115,14 @@ def make_ready(model_path: str, store_path: str) -> Ready:
     scene = store.put(data)
     seconds = time.perf_counter() - began_s
     sizes = {scene: len(data), **asset_addresses(parsed.spec)}
-    return Ready(seconds, (_peak() - before) / 2**20, parsed.built, scene, sizes)
+    return PreparedScene(seconds, (_read_peak_rss() - before) / 2**20, parsed.built, scene, sizes)
 
 
-def _peak() -> int:
+def _read_peak_rss() -> int:
     """Most resident memory of this process [bytes] since it was last asked to count anew."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) * 1024
 
 
 if __name__ == "__main__":
-    sys.stdout.buffer.write(msgspec.json.encode(make_ready(sys.argv[1], sys.argv[2])))
+    sys.stdout.buffer.write(msgspec.json.encode(prepare_scene(sys.argv[1], sys.argv[2])))

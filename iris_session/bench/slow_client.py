@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.arena import CLIENTS_PER_PROCESS, Action, Arena, Log, grouped, linked, measure
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import NO_BARS, BenchReport, bar
+from iris_session.bench.harness import CLIENTS_PER_PROCESS, Action, BenchRun, Log, assign_links, group_clients, measure
+from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.netsim.session_link import link_address
 
@@ -33,7 +33,7 @@ STOPPED, STALLED, BASELINE = "stopped", "stalled", "baseline"
 REFERENCE: Final = {"resume_first_age_ms": 2980.0, "resume_fresh_after_ms": 4400.0}
 
 
-class Stretch(NamedTuple):
+class StallInterval(NamedTuple):
     """One stretch of the window, in seconds from its beginning."""
 
     kind: str
@@ -49,12 +49,12 @@ class Stretch(NamedTuple):
         return self.stall_s + STALL_S
 
 
-def stretches(seconds: float) -> list[Stretch]:
+def plan_intervals(seconds: float) -> list[StallInterval]:
     """Baseline, stopped, stalled; as often as there is room for, at most `ROUNDS` times."""
     rounds = max(1, min(ROUNDS, int(seconds / (3 * SHORTEST_S))))
     length_s = max(SHORTEST_S, seconds / (3 * rounds))
     kinds = (BASELINE, STOPPED, STALLED) * rounds
-    return [Stretch(kind, i * length_s, (i + 1) * length_s) for i, kind in enumerate(kinds)]
+    return [StallInterval(kind, i * length_s, (i + 1) * length_s) for i, kind in enumerate(kinds)]
 
 
 def run_slow_client(
@@ -71,23 +71,23 @@ def run_slow_client(
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS) for i in range(clients - 2)]
     names = [spec.name for spec in specs]
-    specs, links = linked([*specs, ClientJob(STOPPED, "observer"), ClientJob(STALLED, "observer")], profile)
+    specs, links = assign_links([*specs, ClientJob(STOPPED, "observer"), ClientJob(STALLED, "observer")], profile)
     stalled = link_address(clients - 1)
     specs[-1] = msgspec.structs.replace(specs[-1], link=stalled)
     links[stalled] = profile or "none"
-    groups = [*grouped(specs[:-2]), *((spec,) for spec in specs[-2:])]
-    plan = stretches(seconds)
+    groups = [*group_clients(specs[:-2]), *((spec,) for spec in specs[-2:])]
+    plan = plan_intervals(seconds)
     total_s = plan[-1].end_s
-    resumed: dict[Stretch, int] = {}  # session time [ns] at which the stall ended
-    actions = _actions(plan, stalled, resumed)
+    resumed: dict[StallInterval, int] = {}  # session time [ns] at which the stall ended
+    actions = _plan_actions(plan, stalled, resumed)
     got = measure(model, groups, total_s, links=links, seed=seed, actions=actions, curve=curve, progress=progress)
     results: dict[str, Any] = {}
     for kind, prefix in ((STOPPED, ""), (STALLED, "link_")):
-        after = [after_stall(got.logs[kind], got.begin_ns, s, resumed[s]) for s in plan if s.kind == kind]
+        after = [measure_after_stall(got.logs[kind], got.begin_ns, s, resumed[s]) for s in plan if s.kind == kind]
         results[f"{prefix}resume_first_age_ms"] = round(max(first for first, _ in after), 3)
         results[f"{prefix}resume_fresh_after_ms"] = round(max(fresh for _, fresh in after), 3)
     for kind, key in ((STOPPED, ""), (STALLED, "_link"), (BASELINE, "_baseline")):
-        p99s = [others_p99(got.logs, names, got.begin_ns, s) for s in plan if s.kind == kind]
+        p99s = [measure_others_p99(got.logs, names, got.begin_ns, s) for s in plan if s.kind == kind]
         results[f"others_age_ms_p99{key}"] = round(float(np.median(p99s)), 3)
         results[f"others_age_ms_p99{key}_runs"] = {str(i + 1): round(p99, 3) for i, p99 in enumerate(p99s)}
     results |= {"late_tick_share": round(got.stats.late_share, 6), "scheduling": got.scheduling, "drops": got.drops}
@@ -95,17 +95,17 @@ def run_slow_client(
     params |= {"rounds": len(plan) // 3, "seed": seed, "curve": curve}
     if profile:
         params |= {"profile": profile, "bars": NO_BARS}
-    bars = () if profile else tuple(_bars(results))
+    bars = () if profile else tuple(_make_bars(results))
     return BenchReport("slow-client", params, results, bars, REFERENCE)
 
 
-def after_stall(log: Log, begin_ns: int, stretch: Stretch, resumed_ns: int) -> tuple[float, float]:
+def measure_after_stall(log: Log, begin_ns: int, stretch: StallInterval, resumed_ns: int) -> tuple[float, float]:
     """Age of the first frame handed out after the stall, and time from its end to the first fresh one [ms].
 
     Infinite when none came within the stretch.
     """
     handed, ages = log["handed_ns"], log["handed_ns"] - log["state_ns"]
-    before = _between(log, begin_ns, stretch.begin_s, stretch.stall_s)
+    before = _select_between(log, begin_ns, stretch.begin_s, stretch.stall_s)
     usual_ns = float(np.median(ages[before])) if before.any() else 0.0
     after = (handed >= resumed_ns) & (handed < begin_ns + stretch.end_s * 1e9)
     if not after.any():
@@ -115,49 +115,49 @@ def after_stall(log: Log, begin_ns: int, stretch: Stretch, resumed_ns: int) -> t
     return first_ms, float(handed[fresh][0] - resumed_ns) * 1e-6 if fresh.any() else float("inf")
 
 
-def others_p99(logs: dict[str, Log], names: list[str], begin_ns: int, stretch: Stretch) -> float:
+def measure_others_p99(logs: dict[str, Log], names: list[str], begin_ns: int, stretch: StallInterval) -> float:
     """99th percentile of the age at `names` from the stall on [ms]: a stretch of the baseline has the same part."""
     ages = [
-        (log["handed_ns"] - log["state_ns"])[_between(log, begin_ns, stretch.stall_s, stretch.end_s)]
+        (log["handed_ns"] - log["state_ns"])[_select_between(log, begin_ns, stretch.stall_s, stretch.end_s)]
         for log in (logs[name] for name in names)
     ]
     return float(np.percentile(np.concatenate(ages), 99)) * 1e-6
 
 
-def _between(log: Log, begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:
+def _select_between(log: Log, begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:
     handed = log["handed_ns"] - begin_ns
     return (handed >= from_s * 1e9) & (handed < to_s * 1e9)
 
 
-def _actions(plan: list[Stretch], link: str, resumed: dict[Stretch, int]) -> list[Action]:
+def _plan_actions(plan: list[StallInterval], link: str, resumed: dict[StallInterval, int]) -> list[Action]:
     """Stops and stalls, and what ends them; notes in `resumed` when they ended [session time, ns]."""
     actions: list[Action] = []
     for stretch in plan:
         if stretch.kind == STOPPED:
-            actions.append((stretch.stall_s, lambda arena: arena.by_client[STOPPED].signal(signal.SIGSTOP)))
+            actions.append((stretch.stall_s, lambda arena: arena.by_client[STOPPED].send_signal(signal.SIGSTOP)))
         elif stretch.kind == STALLED:
-            actions.append((stretch.stall_s, lambda arena: _link(arena, "stall", link)))
+            actions.append((stretch.stall_s, lambda arena: _post_link_command(arena, "stall", link)))
         if stretch.kind != BASELINE:
-            actions.append((stretch.resume_s, lambda arena, s=stretch: _resume(arena, s, link, resumed)))  # type: ignore[misc]
+            actions.append((stretch.resume_s, lambda arena, s=stretch: _end_stall(arena, s, link, resumed)))  # type: ignore[misc]
     return actions
 
 
-def _resume(arena: Arena, stretch: Stretch, link: str, resumed: dict[Stretch, int]) -> None:
+def _end_stall(arena: BenchRun, stretch: StallInterval, link: str, resumed: dict[StallInterval, int]) -> None:
     resumed[stretch] = arena.session.clock()
     if stretch.kind == STOPPED:
-        arena.by_client[STOPPED].signal(signal.SIGCONT)
+        arena.by_client[STOPPED].send_signal(signal.SIGCONT)
     else:
-        _link(arena, "resume", link)
+        _post_link_command(arena, "resume", link)
 
 
-def _link(arena: Arena, command: str, link: str) -> None:
+def _post_link_command(arena: BenchRun, command: str, link: str) -> None:
     assert arena.proxy is not None
     arena.proxy.post(f"{command} @{link}")
 
 
-def _bars(results: dict[str, Any]) -> list[Any]:
+def _make_bars(results: dict[str, Any]) -> list[Any]:
     baseline = results["others_age_ms_p99_baseline"]
     bound = round(baseline + max(0.2 * baseline, 1.0), 3)
     keys = ("resume_first_age_ms", "resume_fresh_after_ms", "link_resume_first_age_ms", "link_resume_fresh_after_ms")
-    bars = [bar(results, key, "<=", 100.0) for key in keys]
-    return [*bars, *(bar(results, key, "<=", bound) for key in ("others_age_ms_p99", "others_age_ms_p99_link"))]
+    bars = [make_bar(results, key, "<=", 100.0) for key in keys]
+    return [*bars, *(make_bar(results, key, "<=", bound) for key in ("others_age_ms_p99", "others_age_ms_p99_link"))]

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from iris_session.bench.arena import Measured, grouped, linked, measure
-from iris_session.bench.bare import bare
+from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.contract import NO_BARS, BenchReport, bar
+from iris_session.bench.harness import Measurement, assign_links, group_clients, measure
+from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar is stated under input: of the clients, so many send 3 devices x 72 Hz of samples meanwhile.
@@ -33,16 +33,16 @@ def run_state(
     """
     model = free_bodies_scene(bodies, seed).compile()
     specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
-    specs, links = linked(specs, profile)
+    specs, links = assign_links(specs, profile)
     progress("the machine by itself: an empty loop that publishes to as many receivers")
-    reference = None if profile else bare(clients)
+    reference = None if profile else measure_baseline(clients)
     got = measure(
-        model, grouped(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
+        model, group_clients(specs), seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress
     )
     progress("comparing every delivered frame with the state at its tick")
     ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
     inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
-    position_mm, rotation_deg = errors(got)
+    position_mm, rotation_deg = compute_errors(got)
     messages = sum(int(log["counts"][3]) for log in got.logs.values())
     total = sum(int(log["counts"][4]) for log in got.logs.values())
     results: dict[str, Any] = {
@@ -68,12 +68,12 @@ def run_state(
         "drops": got.drops,
     }
     bars = [
-        bar(results, "age_ms_p99", "<=", 6.0 if curve else 3.0),
-        bar(results, "late_tick_share", "<", 0.001),
-        bar(results, "max_position_error_mm", "<=", 0.1),
-        bar(results, "max_rotation_error_deg", "<=", 0.05),
-        bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
-        bar(results, "delivered_hz_min", ">=", 59.0),
+        make_bar(results, "age_ms_p99", "<=", 6.0 if curve else 3.0),
+        make_bar(results, "late_tick_share", "<", 0.001),
+        make_bar(results, "max_position_error_mm", "<=", 0.1),
+        make_bar(results, "max_rotation_error_deg", "<=", 0.05),
+        make_bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
+        make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
     params: dict[str, Any] = {
         "clients": clients,
@@ -88,18 +88,18 @@ def run_state(
     return BenchReport("state", params, results, () if profile else tuple(bars), reference)
 
 
-def errors(got: Measured) -> tuple[float, float]:
+def compute_errors(got: Measurement) -> tuple[float, float]:
     """Worst position [mm] and rotation [deg] error over all bodies of every delivered frame of every client."""
     position = rotation = 0.0
     for log in got.logs.values():
         for tick, poses in zip(log["ticks"], log["poses"], strict=True):
             truth = got.truth[int(tick)]
             position = max(position, float(np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()))
-            rotation = max(rotation, _worst_angle(poses[:, 3:], truth[:, 3:]))
+            rotation = max(rotation, _max_angle(poses[:, 3:], truth[:, 3:]))
     return position * 1e3, float(np.degrees(rotation))
 
 
-def _worst_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
+def _max_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
     """Largest angle between two sets of unit quaternions (n, 4); by the chord, which keeps digits near zero."""
     chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return float(4.0 * np.arcsin(np.minimum(chord.max() / 2.0, 1.0)))

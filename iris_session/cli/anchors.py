@@ -1,24 +1,41 @@
-"""`iris-session anchors`: print a sheet, an anchors file to edit, and where a camera stands.
+"""`iris-session anchors`: print anchor sheets, calibrate cameras.
 
-What concerns sessions lies in `anchors_live` (one that runs) and `anchors_solve` (a recorded one).
+Commands on sessions, running or recorded, are in `anchors_session`.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.anchors_live import register_live
-from iris_session.cli.anchors_solve import register_solve
-from iris_session.cli.common import CommandError, add_json, open_scene, print_json
-from iris_session.cli.poses import pose
+from iris_session.cli.anchors_session import (
+    register_align,
+    register_move,
+    register_place,
+    register_solve,
+    register_status,
+)
+from iris_session.cli.common import (
+    CommandError,
+    add_json_option,
+    open_scene,
+    parse_length,
+    parse_pose,
+    pose_to_dict,
+    print_json,
+)
 
 if TYPE_CHECKING:
+    pass
+    from anchors.camera import Camera
+    from anchors.detection import Sighting
     from anchors.pose import PoseTuple
-
-_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+    from anchors.sheet import Sheet
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -40,9 +57,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
-    register_live(actions)
+    register_status(actions)
+    register_align(actions)
+    register_place(actions)
+    register_move(actions)
     register_solve(actions)
-    _register_calibrate(actions)
+    register_calibrate(actions)
 
 
 def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -52,11 +72,11 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         description="Writes a sheet of exact size: a QR code with the anchor's id between four markers that cameras "
         "find from afar, and a ruler that shows whether the printer kept the size.",
     )
-    one.add_argument("--size", type=length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
+    one.add_argument("--size", type=parse_length, default=0.160, metavar="LENGTH", help="edge of the QR code (160mm)")
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_print)
 
 
@@ -74,83 +94,8 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
         default="",
         help="name of a scene (see `iris-session serve --help`); default: the usual sheet",
     )
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_example)
-
-
-def _register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = actions.add_parser(
-        "calibrate-camera",
-        help="find out where a camera stands",
-        description="T_base_camera from pictures: of a sheet on the robot's hand while the hand moves (--poses), or of "
-        "sheets of known place (--at). Says how well it fits, and refuses what does not determine the result.",
-        epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
-        "  image,x,y,z,qw,qx,qy,qz\n"
-        "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
-        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
-    one.add_argument(
-        "--sheet",
-        type=_named_length,
-        action="append",
-        required=True,
-        metavar="ID=LENGTH",
-        help="a sheet that may be seen and the edge of its code, as printed: table=160mm; repeatable",
-    )
-    one.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
-        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
-    )
-    one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
-    one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the hand carries the camera, the sheet lies still"
-    )
-    one.add_argument(
-        "--in-hand",
-        type=pose,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
-    )
-    one.add_argument(
-        "--at",
-        type=_named_pose,
-        action="append",
-        default=[],
-        metavar="ID=X,Y,Z,QW,QX,QY,QZ",
-        help="the place of a sheet is known, T_base_sheet; repeatable",
-    )
-    one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json(one)
-    one.set_defaults(run=run_calibrate)
-
-
-def length(text: str) -> float:
-    """Type of lengths, with their unit so that nobody prints a sheet of 160 m: metres."""
-    found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
-    if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a length: a number with its unit, for example 160mm")
-    return float(found[1]) * _UNITS[found[2]]
-
-
-def _named_length(text: str) -> tuple[str, float]:
-    name, _, rest = text.rpartition("=")
-    return _named(name, text), length(rest)
-
-
-def _named_pose(text: str) -> tuple[str, PoseTuple]:
-    name, _, rest = text.rpartition("=")
-    return _named(name, text), pose(rest)
-
-
-def _named(name: str, text: str) -> str:
-    if not name:
-        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
-    return name
 
 
 def run_print(arguments: argparse.Namespace) -> int:
@@ -204,21 +149,450 @@ def run_example(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def run_calibrate(arguments: argparse.Namespace) -> int:
-    from anchors.robot_world import CalibrationError
-    from iris_session.cli.anchors_calibrate import calibrate, lines_of, to_toml
+# --- calibrate-camera -------------------------------------------------------------------------------------------------
+
+
+PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+COLUMNS: Final = ("image", "x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture, and what was found in it. `camera_name`: the folder it lies in."""
+
+    path: Path
+    camera_name: str
+    camera: Camera
+    sightings: tuple[Sighting, ...]
+
+
+def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The result as it is printed with `--json`. Raises `CommandError`, and `CalibrationError` where the pictures do
+    not determine a result."""
+    sheets = _parse_sheets(arguments)
+    _check_options(arguments, sheets)
+    if arguments.at:
+        return _solve_from_known_sheets(_read_pictures(arguments.folder, arguments.intrinsics, sheets), arguments)
+    poses = read_poses(arguments.poses)
+    pictures = _read_pictures(arguments.folder, arguments.intrinsics, sheets)
+    if len({picture.camera_name for picture in pictures}) > 1:
+        raise CommandError("--poses calibrates one camera at a time: give the folder of that camera")
+    return _solve_from_robot_poses(pictures, poses, arguments)
+
+
+def _parse_sheets(arguments: argparse.Namespace) -> list[Sheet]:
+    from anchors.sheet import Sheet, SheetError
 
     try:
-        told = calibrate(arguments)
+        sheets = [Sheet(name, edge) for name, edge in arguments.sheet]
+    except SheetError as error:
+        raise CommandError(str(error)) from error
+    if len({sheet.anchor_id for sheet in sheets}) != len(sheets):
+        raise CommandError("--sheet names the same sheet twice")
+    return sheets
+
+
+def _check_options(arguments: argparse.Namespace, sheets: list[Sheet]) -> None:
+    if (arguments.poses is None) == (not arguments.at):
+        raise CommandError("give --poses CSV (the robot's hand moves) or --at ID=POSE (sheets of known place)")
+    if arguments.at and (arguments.in_hand or arguments.camera_on_hand):
+        raise CommandError("--in-hand and --camera-on-hand belong to --poses")
+    if arguments.in_hand and arguments.camera_on_hand:
+        raise CommandError("--in-hand is the place of the sheet on the hand: not with --camera-on-hand")
+    if arguments.poses is not None and len(sheets) != 1:
+        raise CommandError(
+            "with --poses exactly one --sheet: the one on the hand, or with --camera-on-hand in the room"
+        )
+    unknown = {name for name, _ in arguments.at} - {sheet.anchor_id for sheet in sheets}
+    if unknown:
+        raise CommandError(f"--at {sorted(unknown)[0]}: its size is missing, add --sheet {sorted(unknown)[0]}=160mm")
+
+
+# --- input ------------------------------------------------------------------------------------------------------------
+
+
+def read_poses(path: Path) -> dict[str, PoseTuple]:
+    """`T_base_ee` by the name of the picture."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), skipinitialspace=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CommandError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
+        raise CommandError(f"{path}: the first line must be {','.join(COLUMNS)}")
+    poses: dict[str, PoseTuple] = {}
+    for number, row in enumerate(rows[1:], 2):
+        if not any(word.strip() for word in row):
+            continue
+        try:
+            name, x, y, z, *q = row[0].strip(), *map(float, row[1:])
+        except ValueError:
+            q = []
+        if len(q) != 4 or not all(map(math.isfinite, (x, y, z, *q))) or abs(math.hypot(*q) - 1.0) > 0.01:
+            raise CommandError(
+                f"{path}, line {number}: wanted are the name of a picture, x,y,z in metres, and a unit quaternion "
+                "with w first"
+            )
+        if name in poses:
+            raise CommandError(f"{path}, line {number}: a second pose for {name}")
+        n = math.hypot(*q)
+        poses[name] = ((x, y, z), (q[0] / n, q[1] / n, q[2] / n, q[3] / n))
+    return poses
+
+
+def _read_pictures(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+    """Every picture of the folder, or of the folders in it, looked through for sheets."""
+    if not folder.is_dir():
+        raise CommandError(f"{folder} is not a folder")
+    folders = [folder] if _list_pictures(folder) else [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
+    found = [picture for one in folders for picture in _read_camera_folder(one, intrinsics, sheets)]
+    if not found:
+        raise CommandError(f"no pictures in {folder}: files that end in {', '.join(PICTURES)}")
+    return found
+
+
+def _list_pictures(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+
+
+def _read_camera_folder(folder: Path, intrinsics: Path | None, sheets: list[Sheet]) -> list[Picture]:
+    import cv2
+
+    from anchors.detection import DetectionError, SheetDetector
+
+    pictures: list[Picture] = []
+    detectors: dict[tuple[int, int], SheetDetector] = {}
+    for path in _list_pictures(folder):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise CommandError(f"{path} is not a picture that can be read")
+        height, width = image.shape
+        if (width, height) not in detectors:
+            detectors[width, height] = SheetDetector(sheets, _read_camera(folder, intrinsics, width, height))
+        detector = detectors[width, height]
+        try:
+            pictures.append(Picture(path, folder.name, detector.camera, tuple(detector.detect(image))))
+        except DetectionError as error:
+            raise CommandError(f"{path}: {error}") from error
+    return pictures
+
+
+def _read_camera(folder: Path, intrinsics: Path | None, width: int, height: int) -> Camera:
+    from anchors.camera import CameraError, parse_camera
+
+    places = [intrinsics] if intrinsics is not None else [folder / "intrinsics.toml", folder / "intrinsics.txt"]
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise CommandError(
+            f"no intrinsics at {places[0]}: a TOML file with width, height, fx, fy, cx, cy [pixels] and distortion, "
+            "from the maker of the camera or a calibration; name it with --intrinsics"
+        )
+    try:
+        return parse_camera(path.read_text(encoding="utf-8"), width, height)
+    except (CameraError, OSError, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: {error}") from error
+
+
+# --- solving ----------------------------------------------------------------------------------------------------------
+
+
+def _solve_from_robot_poses(
+    pictures: list[Picture], poses: dict[str, PoseTuple], arguments: argparse.Namespace
+) -> dict[str, Any]:
+    from anchors.pose import compose, inverse
+    from anchors.robot_world import CalibrationError, camera_on_hand, solve
+
+    missing = [picture.path.name for picture in pictures if picture.path.name not in poses]
+    if missing:
+        raise CommandError(f"{arguments.poses} has no line for {missing[0]} ({len(missing)} pictures without a pose)")
+    seen = [picture for picture in pictures if picture.sightings]
+    if not seen:
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
+    robot = [poses[picture.path.name] for picture in seen]
+    if arguments.in_hand is not None:
+        return _solve_with_known_hand_pose(pictures, seen, robot, arguments.in_hand)
+    found = [picture.sightings[0] for picture in seen]
+    solver = camera_on_hand if arguments.camera_on_hand else solve
+    solved = solver(robot, [one.T_camera_sheet for one in found], [one.covariance for one in found])
+    X, Y = solved.T_base_camera, solved.T_ee_marker
+    result: dict[str, Any]
+    if arguments.camera_on_hand:
+        expected = [compose(inverse(compose(T, Y)), X) for T in robot]
+        result = {"T_ee_camera": pose_to_dict(Y), "T_base_sheet": pose_to_dict(X)}
+    else:
+        expected = [compose(inverse(X), compose(T, Y)) for T in robot]
+        result = {
+            "T_base_camera": pose_to_dict(X),
+            "T_ee_sheet": pose_to_dict(Y),
+            **_estimate_error(solved.covariance, X),
+        }
+    left_out = {str(seen[k].path) for k in solved.left_out}
+    rows = _compute_residuals(pictures, {p.path: [T] for p, T in zip(seen, expected, strict=True)}, left_out)
+    return {
+        "mode": "camera-on-hand" if arguments.camera_on_hand else "sheet-on-hand",
+        **result,
+        **_summarize_fit(rows),
+        "turned_deg": math.degrees(solved.spread_rad),
+        "pictures": rows,
+    }
+
+
+def _solve_with_known_hand_pose(
+    pictures: list[Picture], seen: list[Picture], robot: list[PoseTuple], T_ee_sheet: PoseTuple
+) -> dict[str, Any]:
+    """The place of the sheet on the hand is known, so in every picture it is a sheet of known place."""
+    from anchors.camera_rig import View, solve_rig
+    from anchors.pose import compose, inverse
+
+    known = {str(p.path): compose(T, T_ee_sheet) for p, T in zip(seen, robot, strict=True)}
+    views = [View("camera", str(p.path), p.sightings[0].T_camera_sheet, p.sightings[0].covariance) for p in seen]
+    rig = solve_rig(views, known)
+    at = rig.cameras["camera"]
+    rows = _compute_residuals(pictures, {p.path: [compose(inverse(at), known[str(p.path)])] for p in seen}, set())
+    return {
+        "mode": "sheet-in-hand",
+        "T_base_camera": pose_to_dict(at),
+        **_estimate_error(rig.covariances["camera"], at),
+        **_summarize_fit(rows),
+        "pictures": rows,
+    }
+
+
+def _solve_from_known_sheets(pictures: list[Picture], arguments: argparse.Namespace) -> dict[str, Any]:
+    from anchors.camera_rig import View, solve_rig
+    from anchors.pose import compose, inverse
+    from anchors.robot_world import CalibrationError
+
+    views = [
+        View(picture.camera_name, one.anchor_id, one.T_camera_sheet, one.covariance)
+        for picture in pictures
+        for one in picture.sightings
+        if not one.ambiguous
+    ]
+    if not views:
+        raise CalibrationError(_format_no_sheet_found(len(pictures)))
+    blind = {picture.camera_name for picture in pictures} - {view.camera for view in views}
+    if blind:
+        raise CalibrationError(f"camera {', '.join(sorted(blind))} saw no sheet: {_NO_SHEET_HINT}")
+    rig = solve_rig(views, dict(arguments.at))
+    expected = {
+        p.path: [compose(inverse(rig.cameras[p.camera_name]), rig.sheets[one.anchor_id]) for one in p.sightings]
+        for p in pictures
+    }
+    rows = _compute_residuals(pictures, expected, set())
+    cameras = {
+        name: {"T_base_camera": pose_to_dict(at), **_estimate_error(rig.covariances[name], at)}
+        for name, at in rig.cameras.items()
+    }
+    return {
+        "mode": "sheets-of-known-place",
+        **(next(iter(cameras.values())) if len(cameras) == 1 else {"cameras": cameras}),
+        "sheets": {name: {"T_base_sheet": pose_to_dict(at)} for name, at in rig.sheets.items()},
+        **_summarize_fit(rows),
+        "pictures": rows,
+    }
+
+
+_NO_SHEET_HINT: Final = (
+    "are --sheet and its size those of the print, are the pictures sharp, is the whole sheet in them?"
+)
+
+
+def _format_no_sheet_found(n: int) -> str:
+    return f"no sheet was found in {n} picture{'s' * (n != 1)}: {_NO_SHEET_HINT}"
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def _compute_residuals(
+    pictures: list[Picture], expected: dict[Path, list[PoseTuple]], left_out: set[str]
+) -> list[dict[str, Any]]:
+    """Per picture and sheet: how far the sheet is seen from where the result puts it, in space and in the picture."""
+    import numpy as np
+
+    from anchors.pose import distance, quat_angle
+    from anchors.sheet import Sheet
+
+    rows: list[dict[str, Any]] = []
+    for picture in pictures:
+        if not picture.sightings:
+            rows.append({"file": picture.path.name, "camera": picture.camera_name, "found": False})
+        for one, T in zip(picture.sightings, expected.get(picture.path, []), strict=False):
+            corners = Sheet(one.anchor_id, one.edge_m).marker_corners.reshape(-1, 3)
+            off = picture.camera.project(corners, one.T_camera_sheet) - picture.camera.project(corners, T)
+            rows.append(
+                {
+                    "file": picture.path.name,
+                    "camera": picture.camera_name,
+                    "found": True,
+                    "sheet": one.anchor_id,
+                    "used": str(picture.path) not in left_out,
+                    "residual_mm": 1e3 * distance(one.T_camera_sheet[0], T[0]),
+                    "residual_deg": math.degrees(quat_angle(one.T_camera_sheet[1], T[1])),
+                    "residual_px": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+                    "markers": one.markers,
+                }
+            )
+    return rows
+
+
+def _summarize_fit(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    used = [row for row in rows if row.get("used")]
+
+    def rms(key: str) -> float:
+        return math.sqrt(sum(row[key] ** 2 for row in used) / max(len(used), 1))
+
+    fit = {f"{key}_rms": rms(key) for key in ("residual_mm", "residual_deg", "residual_px")}
+    return {"used": len(used), "left_out": sum(row.get("used") is False for row in rows), **fit}
+
+
+def _estimate_error(covariance: tuple[float, ...], at: PoseTuple) -> dict[str, float]:
+    """95 % bound of the position, standard deviation of the rotation, from what the pictures scatter."""
+    from anchors.alignment import position_error_p95
+
+    turn = math.sqrt(covariance[21] + covariance[28] + covariance[35])
+    return {"error_mm_p95": 1e3 * position_error_p95(covariance, at[0], at[0]), "sigma_deg": math.degrees(turn)}
+
+
+def format_calibration(result: dict[str, Any]) -> list[str]:
+    """The result for people."""
+    lines = []
+    for row in result["pictures"]:
+        name = row["file"] if row["camera"] in ("", row["file"]) else f"{row['camera']}/{row['file']}"
+        if not row["found"]:
+            lines.append(f"{name}  no sheet found")
+            continue
+        note = "" if row["used"] else "  LEFT OUT: contradicts the others"
+        lines.append(
+            f"{name}  {row['sheet']}  {row['residual_mm']:.2f} mm  {row['residual_deg']:.3f} deg  "
+            f"{row['residual_px']:.2f} px{note}"
+        )
+    lines.append(
+        f"{result['used']} used, {result['left_out']} left out; residual rms {result['residual_mm_rms']:.2f} mm, "
+        f"{result['residual_deg_rms']:.3f} deg, {result['residual_px_rms']:.2f} px"
+    )
+    for name, value in _list_poses(result):
+        p, q = value["position_m"], value["quaternion_wxyz"]
+        place = ", ".join(f"{v:.5f}" for v in p)
+        lines.append(f"{name}  p = [{place}] m  q = [{', '.join(f'{v:.6f}' for v in q)}]")
+    for name, part in [("", result), *result.get("cameras", {}).items()]:
+        if "error_mm_p95" in part:
+            said = f"stated error {part['error_mm_p95']:.2f} mm (95 %), {part['sigma_deg']:.3f} deg (sigma)"
+            lines.append(f"{name + ': ' if name else ''}{said}")
+    return lines
+
+
+def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]]]]:
+    found = [(key, value) for key, value in result.items() if key.startswith("T_")]
+    for kind in ("cameras", "sheets"):
+        for name, part in result.get(kind, {}).items():
+            found += [(f"{key} of {name}", value) for key, value in part.items() if key.startswith("T_")]
+    return found
+
+
+def calibration_to_toml(result: dict[str, Any]) -> str:
+    """The result as a file: poses with their names, and how well they fit."""
+    lines = ["# Written by iris-session anchors calibrate-camera. Metres; quaternions w first."]
+    lines += [f'mode = "{result["mode"]}"']
+    lines += [f"{key} = {result[key]!r}" for key in ("residual_mm_rms", "residual_deg_rms", "residual_px_rms")]
+    lines += [f"{key} = {result[key]!r}" for key in ("error_mm_p95", "sigma_deg") if key in result]
+    for key, value in result.items():
+        if key.startswith("T_"):
+            lines += ["", f"[{key}]", *_format_toml_pose(value)]
+    for kind in ("cameras", "sheets"):
+        for name, part in result.get(kind, {}).items():
+            for key, value in part.items():
+                if key.startswith("T_"):
+                    quoted = name.replace("\\", "\\\\").replace('"', '\\"')
+                    lines += ["", f'[{kind}."{quoted}".{key}]', *_format_toml_pose(value)]
+    return "\n".join([*lines, ""])
+
+
+def _format_toml_pose(value: dict[str, list[float]]) -> list[str]:
+    return [f"{key} = [{', '.join(repr(v) for v in value[key])}]" for key in ("position_m", "quaternion_wxyz")]
+
+
+def register_calibrate(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "calibrate-camera",
+        help="find out where a camera stands",
+        description="T_base_camera from pictures: of a sheet on the robot's hand while the hand moves (--poses), or of "
+        "sheets of known place (--at). Says how well it fits, and refuses what does not determine the result.",
+        epilog="poses.csv, metres and unit quaternions, one line per picture:\n"
+        "  image,x,y,z,qw,qx,qy,qz\n"
+        "  0001.png,0.412,0.031,0.388,0.0012,0.9998,0.0131,0.0021\n\n"
+        "Several cameras at once: one folder each below FOLDER, with its own intrinsics.toml.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("folder", type=Path, metavar="FOLDER", help="with the pictures")
+    one.add_argument(
+        "--sheet",
+        type=_parse_named_length,
+        action="append",
+        required=True,
+        metavar="ID=LENGTH",
+        help="a sheet that may be seen and the edge of its code, as printed: table=160mm; repeatable",
+    )
+    one.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
+        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
+    )
+    one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
+    one.add_argument(
+        "--camera-on-hand", action="store_true", help="with --poses: the hand carries the camera, the sheet lies still"
+    )
+    one.add_argument(
+        "--in-hand",
+        type=parse_pose,
+        metavar="X,Y,Z,QW,QX,QY,QZ",
+        help="with --poses: the place of the sheet on the hand is known, T_ee_sheet; one picture is enough",
+    )
+    one.add_argument(
+        "--at",
+        type=_parse_named_pose,
+        action="append",
+        default=[],
+        metavar="ID=X,Y,Z,QW,QX,QY,QZ",
+        help="the place of a sheet is known, T_base_sheet; repeatable",
+    )
+    one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
+    add_json_option(one)
+    one.set_defaults(run=run_calibrate)
+
+
+def _parse_named_length(text: str) -> tuple[str, float]:
+    name, _, rest = text.rpartition("=")
+    return _check_sheet_id(name, text), parse_length(rest)
+
+
+def _parse_named_pose(text: str) -> tuple[str, PoseTuple]:
+    name, _, rest = text.rpartition("=")
+    return _check_sheet_id(name, text), parse_pose(rest)
+
+
+def _check_sheet_id(name: str, text: str) -> str:
+    if not name:
+        raise argparse.ArgumentTypeError(f"{text!r}: the id of the sheet is missing, for example table=160mm")
+    return name
+
+
+def run_calibrate(arguments: argparse.Namespace) -> int:
+    from anchors.robot_world import CalibrationError
+
+    try:
+        told = calibrate_cameras(arguments)
     except CalibrationError as error:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
         try:
-            arguments.out.write_text(to_toml(told), encoding="utf-8")
+            arguments.out.write_text(calibration_to_toml(told), encoding="utf-8")
         except OSError as error:
             raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from error
     if arguments.json:
         print_json(told)
     else:
-        print("\n".join(lines_of(told)))
+        print("\n".join(format_calibration(told)))
     return 0

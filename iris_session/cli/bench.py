@@ -7,10 +7,10 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_json, positive_seconds, print_json
+from iris_session.cli.common import CommandError, add_json_option, parse_seconds, print_json
 
 if TYPE_CHECKING:
-    from iris_session.bench.contract import BenchReport
+    from iris_session.bench.report import BenchReport
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -45,19 +45,19 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--objects", type=int, default=300, help="join: bodies with meshes (default: %(default)s)")
     parser.add_argument("--assets-mb", type=float, default=200.0, help="join: MB after compression (default: 200)")
-    parser.add_argument("--seconds", type=positive_seconds, help="measured part (default: 20; slow-client: 50)")
+    parser.add_argument("--seconds", type=parse_seconds, help="measured part (default: 20; slow-client: 50)")
     parser.add_argument(
         "--profile",
         default="",
         metavar="NAME",
-        help="everybody joins over a link like this (docs/links.md); no bars then",
+        help="everybody joins over a link like this (docs/evidence/links.md); no bars then",
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
     crypto = parser.add_mutually_exclusive_group()
     crypto.add_argument("--curve", action="store_true", help="encrypted and authenticated")
     crypto.add_argument("--plain", action="store_true", help="unencrypted loopback (default)")
     parser.add_argument("--check", action="store_true", help="exit status 1 when a bar is missed")
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -69,27 +69,27 @@ def run(arguments: argparse.Namespace) -> int:
     def progress(text: str) -> None:
         print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
 
-    from iris_session.bench.contract import BenchError
+    from iris_session.bench.report import BenchError
 
     if arguments.clients is None:
         arguments.clients = 4 if arguments.bench in ("deformable", "join") else 16
-    _check(arguments)
+    _check_sizes(arguments)
     if arguments.bench == "slow-client" and arguments.clients < 3:
         raise CommandError(f"--clients {arguments.clients}: slow-client needs two that are slow and one other, so 3")
     if arguments.profile:
         load_profile(arguments.profile)  # before anything is started
     try:
-        report = _report(arguments, progress)
+        report = _run_benchmark(arguments, progress)
     except BenchError as error:
         raise CommandError(str(error), 1) from error
     if arguments.json:
         print_json(report.as_dict())
     else:
-        print(report.lines())
+        print(report.format())
     return 0 if report.ok or not arguments.check else 1
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_sizes(arguments: argparse.Namespace) -> None:
     """Numbers that a scene or a session cannot have."""
     limits = {"clients": (1, 64), "bodies": (1, 2000)}
     if arguments.bench == "input":
@@ -110,7 +110,7 @@ def _check(arguments: argparse.Namespace) -> None:
             )
 
 
-def _report(arguments: argparse.Namespace, progress: Callable[[str], None]) -> BenchReport:
+def _run_benchmark(arguments: argparse.Namespace, progress: Callable[[str], None]) -> BenchReport:
     if arguments.bench == "alignment":
         from iris_session.bench.alignment import run_alignment
 

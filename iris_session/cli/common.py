@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import socket
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +17,7 @@ from iris_session.protocol.names import AssignmentPolicy, LeaseMode
 if TYPE_CHECKING:
     import mujoco
 
+    from anchors.pose import PoseTuple
     from iris_session.demo.named_scenes import Scene
 
 
@@ -30,8 +33,9 @@ class CommandError(Exception):
         self.status = status
 
 
-def expected_errors() -> tuple[type[Exception], ...]:
+def list_expected_errors() -> tuple[type[Exception], ...]:
     """Errors whose text is made for the user. Anything else is a defect and keeps its traceback."""
+    from iris_session.assets.errors import AssetStoreError
     from iris_session.client import ClientError
     from iris_session.control import ControlError
     from iris_session.link import FrontError
@@ -46,6 +50,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
     return (
         SessionError,
         SceneBuildError,
+        AssetStoreError,
         PhysicsError,
         ControlError,
         FrontError,
@@ -57,7 +62,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
     )
 
 
-def positive_seconds(text: str) -> float:
+def parse_seconds(text: str) -> float:
     """Type of options that take a duration [s]."""
     try:
         seconds = float(text)
@@ -68,18 +73,18 @@ def positive_seconds(text: str) -> float:
     return seconds
 
 
-def port_base(text: str) -> int:
+def parse_port_base(text: str) -> int:
     """Type of `--port-base`."""
     if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 65529:
         raise argparse.ArgumentTypeError(f"{text!r} is not the first of seven ports: 1 to 65529, for example 7730")
     return int(text)
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
+def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
 
-def add_way_to_session(
+def add_address_options(
     parser: argparse.ArgumentParser,
     *,
     option: bool = False,
@@ -96,7 +101,7 @@ def add_way_to_session(
     parser.add_argument("--code", default="", help=code)
 
 
-def expect_session(arguments: argparse.Namespace) -> None:
+def check_session_reachable(arguments: argparse.Namespace) -> None:
     """Raises `CommandError` within `CONNECT_S` where nothing listens at the address that was given: a client would wait
     for it to begin. A session by its name has no address yet."""
     from iris_session.client.address import Address
@@ -119,11 +124,12 @@ def expect_session(arguments: argparse.Namespace) -> None:
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
-            f"(TCP port {address.port}: {error.strerror or error}){'' if arguments.address else own_sessions()}"
+            f"(TCP port {address.port}: {error.strerror or error})"
+            f"{'' if arguments.address else describe_own_sessions()}"
         ) from None
 
 
-def own_sessions() -> str:
+def describe_own_sessions() -> str:
     """Where the encrypted sessions of this user are, for who has typed no address."""
     from iris_session.security import KeyHome, KeysError
 
@@ -157,7 +163,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--port-base",
-        type=port_base,
+        type=parse_port_base,
         default=None,
         metavar="N",
         help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
@@ -193,7 +199,7 @@ def open_scene(scene: str) -> Scene:
     return scene_by_name(scene)
 
 
-def scene_names() -> str:
+def format_scene_names() -> str:
     """The scenes that can be named, a line each."""
     from iris_session.demo.scene_names import SCENE_NAMES
 
@@ -201,7 +207,7 @@ def scene_names() -> str:
     return "\n".join(f"  {name:<{width}}  {what}" for name, what in SCENE_NAMES.items())
 
 
-def no_robots(model: mujoco.MjModel) -> str:
+def explain_no_robots(model: mujoco.MjModel) -> str:
     """One line about a model in which no robot was found: why, and what helps."""
     from iris_session.physics.robots import MIN_JOINTS
 
@@ -212,6 +218,68 @@ def no_robots(model: mujoco.MjModel) -> str:
     )
 
 
+def to_printable(text: str) -> str:
+    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def print_json(value: dict[str, Any]) -> None:
     """Exactly one JSON object on standard output."""
     print(json.dumps(value, allow_nan=False), flush=True)
+
+
+_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+POSE_FORMAT: Final = "X,Y,Z,QW,QX,QY,QZ"
+#: Numbers with a comma between them, the first negative: no option looks like that.
+_BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
+
+
+def parse_pose(text: str) -> PoseTuple:
+    """Type of poses: position [m] and unit quaternion, w first."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or abs(math.hypot(*numbers[3:]) - 1.0) > 0.01:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a pose: x,y,z in metres and a unit quaternion qw,qx,qy,qz, for example 0,-0.45,0,1,0,0,0"
+        )
+    x, y, z, *q = numbers
+    norm = math.hypot(*q)
+    return (x, y, z), (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def pose_to_dict(T: PoseTuple) -> dict[str, list[float]]:
+    """Return a pose as a JSON object."""
+    return {"position_m": list(T[0]), "quaternion_wxyz": list(T[1])}
+
+
+def join_negative_poses(arguments: Sequence[str]) -> list[str]:
+    """Words of a command line, where a pose that begins with a minus is joined to its option: alone it would be read as
+    an option itself."""
+    out: list[str] = []
+    for word in arguments:
+        if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
+    """`--pose`, which must be given."""
+    parser.add_argument(
+        "--pose",
+        type=parse_pose,
+        required=True,
+        metavar=POSE_FORMAT,
+        help=f"{description}: metres, unit quaternion with w first",
+    )
+
+
+def parse_length(text: str) -> float:
+    """Type of lengths, with their unit so that nobody prints a sheet of 160 m: metres."""
+    found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length: a number with its unit, for example 160mm")
+    return float(found[1]) * _UNITS[found[2]]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import add_json, add_session_options, positive_seconds, print_json
+from iris_session.cli.common import add_json_option, add_session_options, parse_seconds, print_json
 
 if TYPE_CHECKING:
     from iris_session.demo.run import DemoResult
@@ -42,21 +42,27 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random in the emulated people")
     parser.add_argument(
-        "--timeout", type=positive_seconds, default=150.0, metavar="S", help="give up after this many seconds"
+        "--timeout", type=parse_seconds, default=150.0, metavar="S", help="give up after this many seconds"
     )
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
-        "--profile", default="", metavar="NAME", help="people join over links like this (docs/links.md), e.g. busy-wifi"
+        "--profile",
+        default="",
+        metavar="NAME",
+        help="links of the operators (docs/evidence/links.md), e.g. busy-wifi",
     )
     link.add_argument(
-        "--latency", type=milliseconds, metavar="MS", help="people join over links that delay by this much each way"
+        "--latency",
+        type=parse_milliseconds,
+        metavar="MS",
+        help="people join over links that delay by this much each way",
     )
     add_session_options(parser)
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run, control_port=0, state_port=0)
 
 
-def milliseconds(text: str) -> float:
+def parse_milliseconds(text: str) -> float:
     """Type of an option that takes a delay [ms]."""
     try:
         delay = float(text)
@@ -72,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     import msgspec
 
     from iris_session.cli.live import LiveView
-    from iris_session.cli.serve import session_config
+    from iris_session.cli.serve import make_session_config
     from iris_session.demo.plays import make_play
     from iris_session.demo.run import run_demo
     from iris_session.netsim.profiles import load_profile
@@ -81,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     if profile:
         load_profile(profile)  # before anything is started
     play = make_play(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
-    config = session_config(arguments, arguments.demo)
+    config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
     def show(session: Session) -> AbstractContextManager[Callable[[], None]]:
@@ -91,11 +97,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(msgspec.to_builtins(result))
     else:
-        print(summary(result))
+        print(format_summary(result))
     return 130 if result.interrupted else 0 if result.ok else 1
 
 
-def summary(result: DemoResult) -> str:
+def format_summary(result: DemoResult) -> str:
     """The result as a few lines of text."""
     outcome = "ok" if result.ok else "interrupted" if result.interrupted else "FAILED"
     lines = [f"demo {result.demo}: {outcome} after {result.seconds:.1f} s"]

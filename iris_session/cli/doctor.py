@@ -8,14 +8,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_json, add_way_to_session, print_json
-from iris_session.cli.live import printable
+from iris_session.cli.common import add_address_options, add_json_option, print_json, to_printable
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
     from iris_session.doctor.findings import Finding
 
-BAD: Final = ("failed", "warning", "skipped")
+PROBLEM_STATES: Final = ("failed", "warning", "skipped")
 MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "skipped": "-      "}
 
 
@@ -32,7 +31,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session doctor --server             the machine that is to serve",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_way_to_session(parser, code="a join code to try; it is used up")
+    add_address_options(parser, code="a join code to try; it is used up")
     parser.add_argument(
         "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
     )
@@ -40,7 +39,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--identity", default="", metavar="DIR", help="home of keys (default: as for every command)")
     parser.add_argument("--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: of recordings")
     parser.add_argument("--all", action="store_true", help="also print the checks that were not possible")
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -48,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Examines, prints one screen (or one JSON object); exit status 1 when a check failed."""
     import os
 
-    from iris_session.doctor.examination import Examination, examine, examine_server
+    from iris_session.doctor.runner import DoctorReport, run_checks, run_host_checks
 
     if arguments.identity:
         os.environ["IRIS_HOME"] = arguments.identity
@@ -58,38 +57,40 @@ def run(arguments: argparse.Namespace) -> int:
         if progress:
             print(f"... {what}", file=sys.stderr, flush=True)
 
-    result: Examination
+    result: DoctorReport
     if arguments.server:
-        result = examine_server(arguments.address, arguments.record, told=told)
+        result = run_host_checks(arguments.address, arguments.record, on_progress=told)
     else:
-        result = examine(
-            arguments.address, session=arguments.session, code=arguments.code, role=arguments.role, told=told
+        result = run_checks(
+            arguments.address, session=arguments.session, code=arguments.code, role=arguments.role, on_progress=told
         )
     if arguments.json:
         print_json(result.as_dict())
     else:
-        print("\n".join(lines(result.findings, show_skipped=arguments.all)))
-        print(verdict(result.findings))
+        print("\n".join(format_findings(result.findings, show_skipped=arguments.all)))
+        print(format_verdict(result.findings))
     return 0 if result.ok else 1
 
 
-def lines(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[str]:
+def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> list[str]:
     """One line per check; why and what to do below those that are not well. Printable: texts hold strangers' names."""
     found = []
     for one in findings:
         if one.state == "skipped" and not show_skipped:
             continue
-        found.append(printable(f"{MARKS[one.state]} {one.check:12s} {one.text}"))
+        found.append(to_printable(f"{MARKS[one.state]} {one.check:12s} {one.text}"))
         if one.state in ("warning", "failed"):
             found += [
-                printable(f"{'':20s} {label}: {text}") for label, text in (("why", one.why), ("do", one.advice)) if text
+                to_printable(f"{'':20s} {label}: {text}")
+                for label, text in (("why", one.why), ("do", one.advice))
+                if text
             ]
     return found
 
 
-def verdict(findings: Iterable[Finding]) -> str:
+def format_verdict(findings: Iterable[Finding]) -> str:
     """The last line: which checks to read above."""
-    failed, warned, skipped = ([one.check for one in findings if one.state == state] for state in BAD)
+    failed, warned, skipped = ([one.check for one in findings if one.state == state] for state in PROBLEM_STATES)
     look = f"to look at: {', '.join(warned)}" if warned else ""
     if failed:
         left = f"{len(skipped)} not possible" if skipped else ""

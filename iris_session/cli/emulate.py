@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from iris_session.cli.common import CommandError, add_way_to_session, expect_session, positive_seconds
+from iris_session.cli.common import CommandError, add_address_options, check_session_reachable, parse_seconds
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +25,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session emulate --drift 30 --bump-at 20 --glance-every 5   a headset that loses its place",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_way_to_session(parser, code="join code of `iris-session pair`, the first time")
+    add_address_options(parser, code="join code of `iris-session pair`, the first time")
     parser.add_argument("--behaviour", default="wander", help="giver, receiver, wander, idle or observer")
     parser.add_argument("--robot", default="", help="robot to take (default: the policy of the session chooses)")
     parser.add_argument("--count", type=int, default=1, help="how many people with --behaviour")
@@ -39,7 +39,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--glance-every", type=float, default=0.0, metavar="S", help="while working they go and look at the sheet"
     )
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person in detail")
-    parser.add_argument("--seconds", type=positive_seconds, help="at most this long")
+    parser.add_argument("--seconds", type=parse_seconds, help="at most this long")
     parser.add_argument(
         "--join-timeout", type=float, default=15.0, metavar="S", help="give up when no session lets us in (%(default)s)"
     )
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     status = main(options, "iris-session")
     if status == 1:
         try:
-            expect_session(arguments)  # it may have begun while they waited: asked only now, to say more
+            check_session_reachable(arguments)  # it may have begun while they waited: asked only now, to say more
         except CommandError as error:
             print(f"iris-session: {error}", file=sys.stderr)
     return status

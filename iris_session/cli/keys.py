@@ -6,8 +6,8 @@ import argparse
 import os
 from pathlib import Path
 
-from iris_session.cli.common import CommandError, add_json, print_json
-from iris_session.cli.pair import add_role, roles_of
+from iris_session.cli.common import CommandError, add_json_option, print_json
+from iris_session.cli.pair import add_role_option, parse_roles
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,7 +26,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     one = actions.add_parser("list", help="keys that may join", description="Lists the keys that may join.")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_list)
     one = actions.add_parser("allow", help="let a key in", description="Puts a key on the list, or changes its roles.")
     one.add_argument("name", help="under which it is listed")
@@ -36,7 +36,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         default="",
         help="ZeroMQ certificate (*.key), or the public key itself: 40 characters of Z85 (default: this user's own)",
     )
-    add_role(one)
+    add_role_option(one)
     one.set_defaults(run=run_allow)
     one = actions.add_parser(
         "revoke", help="let a key in no more", description="Takes a key off the list; whoever uses it now is out."
@@ -44,7 +44,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     one.add_argument("name", help="name or fingerprint in the list")
     one.set_defaults(run=run_revoke)
     one = actions.add_parser("show", help="own fingerprints", description="Shows where keys are, and whose they are.")
-    add_json(one)
+    add_json_option(one)
     one.set_defaults(run=run_show)
     one = actions.add_parser(
         "forget", help="trust an address anew", description="Forgets the key that was stored for a session's address."
@@ -85,13 +85,13 @@ def run_allow(arguments: argparse.Namespace) -> int:
 
     home = KeyHome()
     given = arguments.key or home.identity().public
-    key = load_public(given) if _names_a_file(given) else given
-    entry = home.clients.allow(arguments.name, key, roles_of(arguments.role))
+    key = load_public(given) if _is_key_file(given) else given
+    entry = home.clients.allow(arguments.name, key, parse_roles(arguments.role))
     print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'anything'}")
     return 0
 
 
-def _names_a_file(text: str) -> bool:
+def _is_key_file(text: str) -> bool:
     return os.path.exists(text) or Path(text).suffix in (".key", ".key_secret")
 
 

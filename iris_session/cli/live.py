@@ -10,7 +10,6 @@ import json
 import os
 import select
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import msgspec
 
-from iris_session.system import children
+from iris_session.cli.common import to_printable
+from iris_session.system.process import ChildProcess
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -32,44 +32,39 @@ REFRESH_S: Final = 0.5
 #: Longest wait for the display at the end [s].
 END_S: Final = 3.0
 #: Event bodies that come in great numbers and say little to a person.
-QUIET: Final = frozenset({"engagement_changed", "samples_rejected"})
+HIDDEN_EVENTS: Final = frozenset({"engagement_changed", "samples_rejected"})
 
 
-def printable(text: str) -> str:
-    """`text` without anything that a terminal obeys: names and notes are strangers' words."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
-def rounded(value: Any) -> Any:
+def round_floats(value: Any) -> Any:
     """Floats, also within lists, to four digits; below a tenth of a thousandth they are nothing."""
     if isinstance(value, float):
         return float(f"{value:.4g}") if abs(value) >= 1e-4 else 0.0
-    return [rounded(one) for one in value] if isinstance(value, list | tuple) else value
+    return [round_floats(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-class Noteworthy:
+class EventFilter:
     """Which events are worth a line on a screen; the recording has them all."""
 
     def __init__(self) -> None:
         self._agreed: dict[tuple[str, str], bool] = {}  # by pair of headsets: whether they did
 
     def __call__(self, event: Event) -> bool:
-        from iris_session.doctor.headsets import BEYOND
+        from iris_session.doctor.headset_checks import MAX_ERROR_RATIO
         from iris_session.protocol.server_messages import HeadsetsCompared, ParticipantLeft
 
         body = event.body
         if isinstance(body, HeadsetsCompared):  # every five seconds for every pair
             pair = (min(body.a, body.b), max(body.a, body.b))
-            agreed = body.error_m <= BEYOND * body.expected_p95_m
+            agreed = body.error_m <= MAX_ERROR_RATIO * body.expected_p95_m
             changed = self._agreed.get(pair) is not agreed
             self._agreed[pair] = agreed
             return changed
         if isinstance(body, ParticipantLeft) and not body.grace:
             self._agreed = {pair: agreed for pair, agreed in self._agreed.items() if body.participant not in pair}
-        return body.__struct_config__.tag not in QUIET
+        return body.__struct_config__.tag not in HIDDEN_EVENTS
 
 
-def event_line(event: Event) -> str:
+def format_event(event: Event) -> str:
     """One event as one line of printable text."""
     body = msgspec.to_builtins(event.body)
     kind = body.pop("event")
@@ -85,8 +80,8 @@ def event_line(event: Event) -> str:
     if isinstance(body.get("lease"), dict):
         lease = body.pop("lease")
         body = {"target": lease["target"], "holder": lease["holder"] or "-", **body}
-    text = " ".join(f"{key}={rounded(value)}" for key, value in body.items() if value not in ("", None))
-    return printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
+    text = " ".join(f"{key}={round_floats(value)}" for key, value in body.items() if value not in ("", None))
+    return to_printable(f"{event.session_time * 1e-9:8.2f} s  {kind:20s} {text}")
 
 
 class LiveView:
@@ -99,7 +94,7 @@ class LiveView:
         self._title = title
         self._next_s = 0.0
         self._seen = 0
-        self._noteworthy = Noteworthy()
+        self._noteworthy = EventFilter()
         self._pipe = -1
         self._pending = b""  # of a refresh that did not fit into the pipe: its rest goes out before any other
         self.skipped = 0
@@ -108,14 +103,8 @@ class LiveView:
     def open(self) -> Iterator[Callable[[], None]]:
         """Starts the display, gives `update`, ends it after the last line."""
         self._out.flush()
-        child = subprocess.Popen(
-            children.command("iris_session.cli.live", self._title),
-            stdin=subprocess.PIPE,
-            stdout=self._out,
-            env=children.environment(),
-        )
-        assert child.stdin is not None
-        self._pipe = child.stdin.fileno()
+        child = ChildProcess("iris_session.cli.live", [self._title], stdout=self._out)
+        self._pipe = child.stdin_fd
         os.set_blocking(self._pipe, False)
         try:
             yield self.update
@@ -124,14 +113,9 @@ class LiveView:
             until = time.monotonic() + END_S
             ready = select.poll()  # `select.select` takes no descriptor above 1023
             ready.register(self._pipe, select.POLLOUT)
-            while not self._send() and child.poll() is None and time.monotonic() < until:
+            while not self._send() and child.is_running and time.monotonic() < until:
                 ready.poll(100)
-            child.stdin.close()
-            try:
-                child.wait(timeout=END_S)
-            except subprocess.TimeoutExpired:  # a terminal that takes nothing must not keep the session's end
-                child.kill()
-                child.wait()
+            child.close(exit_s=END_S)  # a terminal that reads nothing must not delay the end of the session
 
     def update(self, force: bool = False) -> None:
         """Sends what is new to the display."""
@@ -143,7 +127,7 @@ class LiveView:
             self.skipped += 1
             return
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
-        lines = [event_line(e) for e in fresh if self._noteworthy(e)]
+        lines = [format_event(e) for e in fresh if self._noteworthy(e)]
         status = self._session.status().as_dict()
         status["handovers"] = len(status.get("handovers", ()))  # the list grows as long as the session lasts
         self._pending = json.dumps({"status": status, "events": lines}).encode() + b"\n"
@@ -161,7 +145,7 @@ class LiveView:
         return True
 
 
-def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableType:
+def _render_table(title: str, status: dict[str, Any], events: list[str]) -> RenderableType:
     from rich.console import Group
     from rich.panel import Panel
     from rich.table import Table
@@ -175,7 +159,7 @@ def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableT
         delays = [f"{status['input_to_ctrl_ms'][r]:.0f} ms" for r in row["robots"] if r in status["input_to_ctrl_ms"]]
         name = f"{row['name']} ({row['id']})" + ("" if row["connected"] else " [lost]")
         cells = (name, row["role"], ", ".join(row["robots"]), row["alignment"] + error, ", ".join(delays))
-        table.add_row(*(Text(printable(cell)) for cell in cells))  # names are people's words, never markup
+        table.add_row(*(Text(to_printable(cell)) for cell in cells))  # names are people's words, never markup
     late = status["lateness"]
     state = "E-STOP" if status["estop"] else "paused" if status["paused"] else "running"
     footer = (
@@ -187,7 +171,7 @@ def _table(title: str, status: dict[str, Any], events: list[str]) -> RenderableT
     return Panel(Group(table, Text(footer), log), title=f"{title}  {status['session_time_s']:.1f} s")
 
 
-def _parsed(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
+def _parse_refreshes(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
     for line in lines:
         try:
             yield json.loads(line)
@@ -198,7 +182,7 @@ def _parsed(lines: Iterator[str]) -> Iterator[dict[str, Any]]:
 def main(title: str) -> int:
     """The display process: draws until its standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session's process decides when this ends
-    refreshes = _parsed(iter(sys.stdin))
+    refreshes = _parse_refreshes(iter(sys.stdin))
     if sys.stdout.isatty():
         try:
             from rich.live import Live
@@ -209,7 +193,7 @@ def main(title: str) -> int:
             with Live(auto_refresh=False) as live:
                 for refresh in refreshes:
                     events = (events + refresh["events"])[-8:]
-                    live.update(_table(title, refresh["status"], events), refresh=True)
+                    live.update(_render_table(title, refresh["status"], events), refresh=True)
             return 0
     for refresh in refreshes:
         for line in refresh["events"]:

@@ -23,8 +23,7 @@ from iris_session.cli import (
     status,
     verify,
 )
-from iris_session.cli.common import CommandError, expected_errors
-from iris_session.cli.poses import joined
+from iris_session.cli.common import CommandError, join_negative_poses, list_expected_errors
 
 _EPILOG = """examples:
   iris-session demo handover                 two emulated operators hand a hammer over
@@ -60,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit status."""
-    arguments = build_parser().parse_args(joined(sys.argv[1:] if argv is None else argv))
+    arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
     os.environ.setdefault("MUJOCO_GL", "disable")  # no command draws: MuJoCo need not load OpenGL, in no process
     from iris_session.physics import AmbiguousModelError
 
@@ -75,15 +74,15 @@ def main(argv: list[str] | None = None) -> int:
     except CommandError as error:
         print(f"iris-session: {error}", file=sys.stderr)
         return error.status
-    except expected_errors() as error:
-        print(f"iris-session: {error}{_option_for(error)}", file=sys.stderr)
+    except list_expected_errors() as error:
+        print(f"iris-session: {error}{_format_option_hint(error)}", file=sys.stderr)
         if isinstance(error, AmbiguousModelError):  # to standard output: `iris-session robots scene.xml > robots.toml`
             print(error.toml)
         return 2
     return status
 
 
-def _option_for(error: Exception) -> str:
+def _format_option_hint(error: Exception) -> str:
     """What the library says without naming options, which a script does not have."""
     in_use = str(error).startswith("port ") and "is in use" in str(error)
     return " (here: --port-base 7730, or --control-port 0 --state-port 0)" if in_use else ""

@@ -19,50 +19,50 @@ class Metric(NamedTuple):
     samples: Sequence[tuple[Mapping[str, str], float]]
 
 
-def exposition(report: StatusReport) -> str:
+def format_metrics(report: StatusReport) -> str:
     """The whole report, one metric after the other."""
-    return "".join(_metric(metric) for metric in metrics(report) if metric.samples)
+    return "".join(_format_metric(metric) for metric in list_metrics(report) if metric.samples)
 
 
-def metrics(report: StatusReport) -> Iterator[Metric]:
+def list_metrics(report: StatusReport) -> Iterator[Metric]:
     """Every measure of a report."""
-    yield from _of_session(report)
-    yield from _of_participants(report)
-    yield from _of_robots(report)
-    yield from _of_recorder(report)
+    yield from _list_session_metrics(report)
+    yield from _list_participant_metrics(report)
+    yield from _list_robot_metrics(report)
+    yield from _list_recorder_metrics(report)
 
 
-def _of_session(r: StatusReport) -> Iterator[Metric]:
-    yield _one("info", "gauge", "Names of the session.", 1, session=r.session_name, session_id=r.session_id)
-    yield _one("time_seconds", "counter", "Session time.", r.session_time * 1e-9)
-    yield _one("stalled", "gauge", "1 while the session does not step.", r.stalled)
-    yield _one("paused", "gauge", "1 while physics is paused.", r.paused)
-    yield _one("estop", "gauge", "1 while everything is stopped.", r.estop)
-    yield _one("realtime", "gauge", "1 when ticks run with real-time priority.", r.scheduling == "realtime")
-    yield _one("connections", "gauge", "Connections of the front.", r.connections)
-    yield _one("entries_per_second", "gauge", "Inputs handed to the authority.", r.entries_per_s)
-    yield _one("late_tick_share", "gauge", "Late ticks of the last ten seconds.", r.late_share)
-    yield _one("late_tick_share_total", "gauge", "Late ticks since the start.", r.late_share_total)
+def _list_session_metrics(r: StatusReport) -> Iterator[Metric]:
+    yield _make_metric("info", "gauge", "Names of the session.", 1, session=r.session_name, session_id=r.session_id)
+    yield _make_metric("time_seconds", "counter", "Session time.", r.session_time * 1e-9)
+    yield _make_metric("stalled", "gauge", "1 while the session does not step.", r.stalled)
+    yield _make_metric("paused", "gauge", "1 while physics is paused.", r.paused)
+    yield _make_metric("estop", "gauge", "1 while everything is stopped.", r.estop)
+    yield _make_metric("realtime", "gauge", "1 when ticks run with real-time priority.", r.scheduling == "realtime")
+    yield _make_metric("connections", "gauge", "Connections of the front.", r.connections)
+    yield _make_metric("entries_per_second", "gauge", "Inputs handed to the authority.", r.entries_per_s)
+    yield _make_metric("late_tick_share", "gauge", "Late ticks of the last ten seconds.", r.late_share)
+    yield _make_metric("late_tick_share_total", "gauge", "Late ticks since the start.", r.late_share_total)
     causes = [({"cause": cause}, float(n)) for cause, n in r.late_causes.items()]
     yield Metric("late_ticks", "gauge", "Late ticks of the last ten seconds by cause.", causes)
-    yield _quantiles("tick_lateness_seconds", "End of a tick after its deadline.", [({}, r.lateness)])
-    yield _quantiles("publish_delay_seconds", "End of a tick to the state socket.", [({}, r.step_to_publish)])
-    yield _one("cpu_share", "gauge", "Processor time of the authority, 1 for one processor.", r.cpu_share)
-    yield _one("memory_bytes", "gauge", "Resident memory of the authority.", r.memory_bytes)
-    yield _one("load", "gauge", "Load of the machine over a minute.", r.load)
-    yield _one("processors", "gauge", "Processors of the machine.", r.cpus)
+    yield _make_quantiles("tick_lateness_seconds", "End of a tick after its deadline.", [({}, r.lateness)])
+    yield _make_quantiles("publish_delay_seconds", "End of a tick to the state socket.", [({}, r.step_to_publish)])
+    yield _make_metric("cpu_share", "gauge", "Processor time of the authority, 1 for one processor.", r.cpu_share)
+    yield _make_metric("memory_bytes", "gauge", "Resident memory of the authority.", r.memory_bytes)
+    yield _make_metric("load", "gauge", "Load of the machine over a minute.", r.load)
+    yield _make_metric("processors", "gauge", "Processors of the machine.", r.cpus)
     dropped = [({"reason": reason}, float(n)) for reason, n in r.drops.items()]
     yield Metric("drops_total", "counter", "Thrown away, by reason.", dropped)
     if r.assets is not None:
-        yield _one("assets_served", "gauge", "Assets of the present scene.", r.assets.served)
-        yield _one("assets_bytes_total", "counter", "Bytes of assets handed to clients.", r.assets.bytes_sent)
-        yield _one("assets_requests_total", "counter", "Requests for chunks of assets.", r.assets.requests)
-        yield _one("assets_refusals_total", "counter", "Requests and connections refused.", r.assets.refusals)
+        yield _make_metric("assets_served", "gauge", "Assets of the present scene.", r.assets.served)
+        yield _make_metric("assets_bytes_total", "counter", "Bytes of assets handed to clients.", r.assets.bytes_sent)
+        yield _make_metric("assets_requests_total", "counter", "Requests for chunks of assets.", r.assets.requests)
+        yield _make_metric("assets_refusals_total", "counter", "Requests and connections refused.", r.assets.refusals)
     restarts = [({"process": name}, float(n)) for name, n in r.restarts.items()]
     yield Metric("restarts_total", "counter", "Processes that were started again.", restarts)
 
 
-def _of_participants(r: StatusReport) -> Iterator[Metric]:
+def _list_participant_metrics(r: StatusReport) -> Iterator[Metric]:
     people = [({"participant": p.id, "name": p.name, "role": p.role}, p) for p in r.participants]
     connected = [(labels, float(p.connected)) for labels, p in people]
     yield Metric("participant_connected", "gauge", "0 while a lost connection has its grace period.", connected)
@@ -83,37 +83,39 @@ def _of_participants(r: StatusReport) -> Iterator[Metric]:
     errors = [(labels, p.alignment_error_m) for labels, p in people if p.alignment == "measured"]
     yield Metric("participant_alignment_error_metres", "gauge", "Stated error (95 %) at the robot.", errors)
     ages = [(labels, p.state_age) for labels, p in people]
-    yield _quantiles("participant_state_age_seconds", "End of a tick to the application.", ages)
+    yield _make_quantiles("participant_state_age_seconds", "End of a tick to the application.", ages)
     ways = [(labels, p.capture_to_receive) for labels, p in people]
-    yield _quantiles("participant_capture_to_receive_seconds", "Device to front.", ways)
+    yield _make_quantiles("participant_capture_to_receive_seconds", "Device to front.", ways)
 
 
-def _of_robots(r: StatusReport) -> Iterator[Metric]:
+def _list_robot_metrics(r: StatusReport) -> Iterator[Metric]:
     held = [({"robot": one.name, "holder": one.holder_name or one.holder}, float(bool(one.holder))) for one in r.robots]
     yield Metric("robot_held", "gauge", "1 while somebody has it.", held)
     states = [({"robot": one.name, "state": one.state, "reason": one.hold_reason}, 1.0) for one in r.robots]
     yield Metric("robot_state", "gauge", "What it does, and why it holds.", states)
     waits = [({"robot": one.name}, one.receive_to_step) for one in r.robots]
-    yield _quantiles("robot_receive_to_step_seconds", "Front to the step that uses a sample.", waits)
+    yield _make_quantiles("robot_receive_to_step_seconds", "Front to the step that uses a sample.", waits)
 
 
-def _of_recorder(r: StatusReport) -> Iterator[Metric]:
+def _list_recorder_metrics(r: StatusReport) -> Iterator[Metric]:
     one = r.recorder
     if one is None or one.state == "off":
         return
-    yield _one("recorder_up", "gauge", "1 while the recording goes on.", one.state == "running", state=one.state)
-    yield _one("recorder_bytes", "gauge", "Size of the newest file.", one.bytes_written)
-    yield _one("recorder_lost_rows_total", "counter", "Steps that are missing in it.", one.lost_rows)
-    yield _one("recorder_waiting_bytes", "gauge", "Waits on the disk for the recorder.", one.spilled_bytes)
+    yield _make_metric(
+        "recorder_up", "gauge", "1 while the recording goes on.", one.state == "running", state=one.state
+    )
+    yield _make_metric("recorder_bytes", "gauge", "Size of the newest file.", one.bytes_written)
+    yield _make_metric("recorder_lost_rows_total", "counter", "Steps that are missing in it.", one.lost_rows)
+    yield _make_metric("recorder_waiting_bytes", "gauge", "Waits on the disk for the recorder.", one.spilled_bytes)
     if one.disk_free_bytes:
-        yield _one("recorder_disk_free_bytes", "gauge", "Room for the recording.", one.disk_free_bytes)
+        yield _make_metric("recorder_disk_free_bytes", "gauge", "Room for the recording.", one.disk_free_bytes)
 
 
-def _one(name: str, kind: str, text: str, value: float, **labels: str) -> Metric:
+def _make_metric(name: str, kind: str, text: str, value: float, **labels: str) -> Metric:
     return Metric(name, kind, text, [(labels, float(value))])
 
 
-def _quantiles(name: str, text: str, measured: Sequence[tuple[Mapping[str, str], Quantiles | None]]) -> Metric:
+def _make_quantiles(name: str, text: str, measured: Sequence[tuple[Mapping[str, str], Quantiles | None]]) -> Metric:
     """Gauges with a `quantile` label: a summary would need sums and counts since the start."""
     samples = [
         ({**labels, "quantile": quantile}, ms * 1e-3)
@@ -124,14 +126,14 @@ def _quantiles(name: str, text: str, measured: Sequence[tuple[Mapping[str, str],
     return Metric(name, "gauge", text, samples)
 
 
-def _metric(metric: Metric) -> str:
+def _format_metric(metric: Metric) -> str:
     name = f"iris_session_{metric.name}"
     lines = [f"# HELP {name} {metric.text}", f"# TYPE {name} {metric.kind}"]
     for labels, value in metric.samples:
-        inside = ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
+        inside = ",".join(f'{key}="{_escape_label(text)}"' for key, text in labels.items())
         lines.append(f"{name}{{{inside}}} {value:.9g}" if inside else f"{name} {value:.9g}")
     return "\n".join(lines) + "\n"
 
 
-def _escaped(text: str) -> str:
+def _escape_label(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from iris_session.cli.common import CommandError, add_json, print_json
+from iris_session.cli.common import CommandError, add_json_option, print_json
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
 from iris_session.security.files import KeysBusyError
@@ -20,7 +20,7 @@ ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
 MAX_MINUTES: Final = 24 * 60.0
 #: By the reason why nobody has paired.
-TEXTS: Final = {
+FAILURE_TEXTS: Final = {
     "void": "void after five wrong attempts: make another code",
     "expired": "expired: nobody used it",
     "not_listed": "used, but the key is not on the list: see the session's terminal, and make another code",
@@ -41,19 +41,21 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session pair --address 10.0.0.5:7721       as others reach this machine",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_role(parser)
-    parser.add_argument("--minutes", type=_minutes, default=10.0, metavar="M", help="how long it is good for (10)")
+    add_role_option(parser)
+    parser.add_argument(
+        "--minutes", type=_parse_minutes, default=10.0, metavar="M", help="how long it is good for (10)"
+    )
     parser.add_argument("--name", default="", help="name of the device in the list (default: what it says itself)")
     parser.add_argument("--session", default="", metavar="NAME", help="which session, when several run here")
     parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="the session's secret key, if not the user's")
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
-def add_role(parser: argparse.ArgumentParser) -> None:
+def add_role_option(parser: argparse.ArgumentParser) -> None:
     """`--role`, for `pair` and `keys allow`."""
     parser.add_argument(
         "--role",
@@ -64,9 +66,9 @@ def add_role(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def roles_of(given: list[str] | None) -> tuple[str, ...]:
+def parse_roles(names: list[str] | None) -> tuple[str, ...]:
     """Roles for the allow-list: empty for any."""
-    return DEFAULT_ROLES if given is None else () if ANY_ROLE in given else tuple(given)
+    return DEFAULT_ROLES if names is None else () if ANY_ROLE in names else tuple(names)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -76,8 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.server_key()
-    session, places = _places(arguments, home, key)
-    roles = roles_of(arguments.role)
+    session, places = _find_addresses(arguments, home, key)
+    roles = parse_roles(arguments.role)
     code, made = home.codes.make(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
@@ -85,19 +87,19 @@ def run(arguments: argparse.Namespace) -> int:
             "code": code,
             "uri": uri,
             "session": session,
-            "addresses": [_address(*place) for place in places],
+            "addresses": [_format_address(*place) for place in places],
             "fingerprint": key.fingerprint,
             "roles": list(roles),
             "expires": made.expires,
         }
-        _show(arguments, told)
-        return 0 if arguments.no_wait else _wait(home, made, arguments)
+        _print_invitation(arguments, told)
+        return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
     except BaseException:
         home.codes.cancel(made.id)  # who asked for it does not see any more what becomes of it
         raise
 
 
-def _minutes(text: str) -> float:
+def _parse_minutes(text: str) -> float:
     try:
         minutes = float(text)
     except ValueError:
@@ -107,7 +109,7 @@ def _minutes(text: str) -> float:
     return minutes
 
 
-def _places(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple[str, list[tuple[str, int]]]:
+def _find_addresses(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple[str, list[tuple[str, int]]]:
     """Name of the session, and host and port where others reach it, best first."""
     from iris_session.client.address import Address
 
@@ -117,11 +119,11 @@ def _places(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) -> tuple
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]
     if len(found) != 1:
-        raise CommandError(_which(arguments.session, here, found))
+        raise CommandError(_format_session_choice(arguments.session, here, found))
     return found[0].name, [(host, found[0].control) for host in found[0].hosts]
 
 
-def _which(wanted: str, here: list[SessionNote], found: list[SessionNote]) -> str:
+def _format_session_choice(name: str, here: list[SessionNote], found: list[SessionNote]) -> str:
     if not here:
         return (
             "no encrypted session of yours runs on this machine: start one with `iris-session serve SCENE "
@@ -129,38 +131,38 @@ def _which(wanted: str, here: list[SessionNote], found: list[SessionNote]) -> st
         )
     names = ", ".join(sorted(note.name for note in here))
     if not found:
-        return f"no session {wanted!r} runs here, there are: {names}"
+        return f"no session {name!r} runs here, there are: {names}"
     return f"{len(found)} sessions run here ({names}): choose with --session NAME or --address HOST:PORT"
 
 
-def _address(host: str, port: int) -> str:
+def _format_address(host: str, port: int) -> str:
     from iris_session.client.address import host_port
 
     return host_port(host, port)
 
 
-def _show(arguments: argparse.Namespace, told: dict[str, Any]) -> None:
+def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any]) -> None:
     import segno
 
-    qr = segno.make(told["uri"], micro=False, error="m")
+    qr = segno.make(invitation["uri"], micro=False, error="m")
     if arguments.png is not None:
         try:
             qr.save(str(arguments.png), kind="png", scale=10, border=4)
         except OSError as error:
             raise CommandError(f"{arguments.png} cannot be written: {error.strerror}") from error
     if arguments.json:
-        print_json(told)
+        print_json(invitation)
         return
     qr.terminal(out=sys.stdout, compact=True)
-    print(f"join code    {told['code']}    for {arguments.minutes:g} minutes, one device")
-    print(f"address      {'  or  '.join(told['addresses'])}")
-    print(f"fingerprint  {told['fingerprint']}")
-    print(f"roles        {', '.join(told['roles']) or 'any'}")
-    print(f"from Python  Client({told['addresses'][0]!r}, join_code={told['code']!r})")
-    print(f"or           {told['uri']}", flush=True)
+    print(f"join code    {invitation['code']}    for {arguments.minutes:g} minutes, one device")
+    print(f"address      {'  or  '.join(invitation['addresses'])}")
+    print(f"fingerprint  {invitation['fingerprint']}")
+    print(f"roles        {', '.join(invitation['roles']) or 'any'}")
+    print(f"from Python  Client({invitation['addresses'][0]!r}, join_code={invitation['code']!r})")
+    print(f"or           {invitation['uri']}", flush=True)
 
 
-def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
+def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
     """Until the code is used, void or expired."""
     seen: object = None
     while True:
@@ -183,9 +185,9 @@ def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
         told: dict[str, Any] = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": list(entry.roles)}
         text = f"paired: {entry.name} ({entry.fingerprint})"
     else:
-        reason = _reason(now)
+        reason = _find_failure_reason(now)
         told = {"paired": None, "reason": reason}
-        text = TEXTS[reason]
+        text = FAILURE_TEXTS[reason]
     if arguments.json:
         print_json(told)
     else:
@@ -193,7 +195,7 @@ def _wait(home: KeyHome, made: JoinCode, arguments: argparse.Namespace) -> int:
     return 0 if listed else 1
 
 
-def _reason(code: JoinCode | None) -> str:
+def _find_failure_reason(code: JoinCode | None) -> str:
     """Why nobody has paired."""
     if code is not None and code.attempts_left == 0:
         return "void"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from iris_session.cli.common import add_json, no_robots, open_scene, print_json
+from iris_session.cli.common import add_json_option, explain_no_robots, open_scene, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,7 +17,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     robots = find_robots(model)
     objects = find_objects(model)
     if not robots:
-        print(no_robots(model), file=sys.stderr)
+        print(explain_no_robots(model), file=sys.stderr)
     if arguments.json:
         print_json({"robots": msgspec.to_builtins(robots), "objects": msgspec.to_builtins(objects)})
     else:

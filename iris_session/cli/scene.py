@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from iris_session.cli.common import CommandError, add_json, open_scene, print_json
-from iris_session.cli.scene_files import (
-    add_file_options,
-    builder_of,
-    check_file_options,
-    file_of,
-    notes_on_model,
-    path_of,
-)
+from iris_session.cli.common import CommandError, add_json_option, open_scene, print_json
 
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
     from iris_session.scene import AssetStore
+    from iris_session.scene.compose import SceneBuilder
     from iris_session.scene.report import SceneReport
 
 
-class _Found(NamedTuple):
+class _ParsedScene(NamedTuple):
     """A scene. `skipped`: what clients will not see. `notes`: what looks like a mistake."""
 
     spec: SceneSpec
@@ -47,21 +42,21 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="tree, extent, sizes, what is heavy and why, what a headset will struggle with",
         description="Shows what clients are given of a scene, what is heavy in it, what a Quest 3 will struggle with.",
     )
-    _add_scene(inspect)
-    add_json(inspect)
+    _add_scene_arguments(inspect)
+    add_json_option(inspect)
     inspect.set_defaults(run=run_inspect)
     export = actions.add_parser(
         "export",
         help="write the scene as a GLB file",
         description="Writes the scene as it stands at first as GLB (glTF 2.0): meshes, textures and colours, y up.",
     )
-    _add_scene(export)
+    _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
-    add_json(export)
+    add_json_option(export)
     export.set_defaults(run=run_export)
 
 
-def _add_scene(parser: argparse.ArgumentParser) -> None:
+def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scene",
         metavar="FILE",
@@ -81,7 +76,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     from iris_session.scene.extent import extent_of
     from iris_session.scene.report import report
 
-    parsed, store = _parse(arguments)
+    parsed, store = _parse_scene(arguments)
     extent = extent_of(parsed.spec, store)
     found = report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     if arguments.json:
@@ -109,12 +104,13 @@ def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -
     for text in notes:
         print(f"note: {text}")
     print(
-        f"{_size(totals.asset_bytes)} of assets: {_size(totals.mesh_bytes)} meshes and {_size(totals.texture_bytes)} "
-        f"textures, the rest coarser levels; {_size(totals.texture_memory)} of textures on a graphics card"
+        f"{_format_size(totals.asset_bytes)} of assets: {_format_size(totals.mesh_bytes)} meshes and "
+        f"{_format_size(totals.texture_bytes)} textures, the rest coarser levels; "
+        f"{_format_size(totals.texture_memory)} of textures on a graphics card"
     )
     print("\nheaviest:")
     for heavy in found.heavy:
-        print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_size(heavy.bytes)}, {heavy.levels} levels")
+        print(f"  {heavy.kind} {heavy.name}: {heavy.why}; {_format_size(heavy.bytes)}, {heavy.levels} levels")
     for text in found.skipped:
         print(f"left out: {text}")
     for text in found.simplified:
@@ -127,23 +123,24 @@ def _print_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Writes the file and says how large it is, and what is not in it."""
+    from iris_session.assets.errors import AssetStoreError
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
     from iris_session.scene.references import files_read
     from iris_session.scene.report import not_in_glb
 
-    out = path_of(arguments.out)
+    out = expand_path(arguments.out)
     if out.suffix.lower() != ".glb":
         raise CommandError(f"{out} does not end in .glb: GLB is the only format of `scene export`")
-    if _same_file(path_of(arguments.scene), out):
+    if _is_same_file(expand_path(arguments.scene), out):
         raise CommandError(f"{out} is the file that is read: name another one to write")
     with files_read() as files:
-        parsed, store = _parse(arguments)
-    if any(_same_file(path, out) for path in (*files, *_files_of_model(arguments.scene))):
+        parsed, store = _parse_scene(arguments)
+    if any(_is_same_file(path, out) for path in (*files, *_list_model_files(arguments.scene))):
         raise CommandError(f"{out} is a file that {arguments.scene} is made of: name another one to write")
     try:
         size = write_glb(parsed.spec, store, out)
-    except SceneBuildError as error:
+    except (SceneBuildError, AssetStoreError) as error:
         raise CommandError(str(error)) from None
     except OSError as error:
         raise CommandError(f"{out} cannot be written: {error.strerror or error}") from None
@@ -158,13 +155,13 @@ def run_export(arguments: argparse.Namespace) -> int:
         print(f"left out: {text}", file=sys.stderr)
     for text in simplified:
         print(f"in the GLB: {text}", file=sys.stderr)
-    print(f"{out}: {_size(size)}")
+    print(f"{out}: {_format_size(size)}")
     return 0
 
 
-def _files_of_model(scene: str) -> list[Path]:
+def _list_model_files(scene: str) -> list[Path]:
     """What an MJCF file refers to."""
-    path = path_of(scene)
+    path = expand_path(scene)
     if path.suffix.lower() not in (".xml", ".mjcf") or not path.is_file():
         return []
     import mujoco
@@ -173,7 +170,7 @@ def _files_of_model(scene: str) -> list[Path]:
     return [] if names is None else [Path(name) for name in names(str(path))]
 
 
-def _same_file(a: Path, b: Path) -> bool:
+def _is_same_file(a: Path, b: Path) -> bool:
     """Whether both are one file, also by a link, or in another spelling."""
     try:
         return a.samefile(b)
@@ -181,42 +178,173 @@ def _same_file(a: Path, b: Path) -> bool:
         return False
 
 
-def _parse(arguments: argparse.Namespace) -> tuple[_Found, AssetStore]:
+def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStore]:
     """The scene, with its assets in a store."""
     from iris_session.protocol.scene import SceneError
     from iris_session.scene import AssetStore
 
-    path = file_of(arguments.scene)
+    path = find_scene_file(arguments.scene)
     check_file_options(arguments, path)
     try:
         store = AssetStore(arguments.assets)
-        return _parse_model(arguments.scene, store) if path is None else _compose(path, arguments, store), store
+        return _parse_model(arguments.scene, store) if path is None else _compose_file(path, arguments, store), store
     except OSError as error:
         raise CommandError(f"assets cannot be kept: {error} (another place: --assets DIR)") from None
     except SceneError as error:  # more than clients read
         raise CommandError(str(error)) from None
 
 
-def _parse_model(scene: str, store: AssetStore) -> _Found:
+def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     from iris_session.physics import World
     from iris_session.scene.mujoco_scene import parse_mujoco
 
     model = open_scene(scene).model
     beginning = World(model, (), ()).initial_data()  # as a session begins: in the keyframe `home`, if there is one
     parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
-    return _Found(parsed.spec, parsed.scene_hash, parsed.skipped, notes_on_model(parsed.spec))
+    return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 
 
-def _compose(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _Found:
+def _compose_file(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _ParsedScene:
     from iris_session.scene import SceneBuildError
 
-    builder = builder_of(path, path.stem, arguments)
+    builder = make_builder(path, path.stem, arguments)
     try:
         made = builder.build(store)
     except SceneBuildError as error:
         raise CommandError(str(error)) from None
-    return _Found(made.spec, made.scene_hash, made.skipped, made.notes)
+    return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes)
 
 
-def _size(n_bytes: int) -> str:
+def _format_size(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 100_000 else f"{n_bytes / 1e3:.1f} kB"
+
+
+#: Endings of files that MuJoCo simulates; any other file is composed, and shown as it is.
+SIMULATED: Final = (".xml", ".mjcf", ".mjb")
+_ROBOT: Final = ".urdf"
+#: How meshes in a model that are too large or too small are mended.
+_MESH_SCALE_ADVICE: Final = 'scale="{factor} {factor} {factor}" at its <mesh>, times the one that it has,'
+#: From when on it is told that something takes its time: about a second.
+_LARGE_FILE_BYTES: Final = 5_000_000
+_MANY_TRIANGLES: Final = 100_000
+
+
+def add_file_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--package-dir",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder of packages that the file refers to by package://, or may refer into; may be repeated",
+    )
+    parser.add_argument(
+        "--scale",
+        type=_parse_factor,
+        default=None,
+        metavar="FACTOR",
+        help="how large the file is drawn: 0.001 for one in millimetres; not of MJCF and MJB, which are simulated",
+    )
+
+
+def _parse_factor(text: str) -> float:
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not (math.isfinite(factor) and factor > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is no factor: a number above 0, 0.001 for a file in millimetres")
+    return factor
+
+
+def expand_path(text: str | Path) -> Path:
+    """A path that may begin with `~`."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # of a user who is not there
+        raise CommandError(f"{text}: there is no such home folder") from None
+
+
+def find_scene_file(scene: str) -> Path | None:
+    """The file that is meant, if MuJoCo does not read it; else `None`, and others say what is wrong.
+
+    Raises `CommandError` for a folder, a file that is not there, and endings that nobody reads.
+    """
+    from iris_session.scene import SceneBuildError
+    from iris_session.scene.files import ENDINGS, present, xacro_advice
+
+    path = expand_path(scene)
+    kind = path.suffix.lower()
+    if kind in SIMULATED and not path.is_dir():
+        return None
+    if not kind and not path.is_file() and (_is_scene_name(scene) or not path.is_dir()):
+        return None
+    try:
+        present(path)
+    except SceneBuildError as error:
+        raise CommandError(str(error)) from None
+    if kind == ".xacro":
+        raise CommandError(f"{path.name}: {xacro_advice(path)}")
+    if kind.lstrip(".") not in ENDINGS:
+        what = f"files that end in {kind} are not read" if kind else "a file without an ending"
+        raise CommandError(f"{path.name}: {what}. These are: {', '.join(ENDINGS)}")
+    return path
+
+
+def _is_scene_name(scene: str) -> bool:
+    """Whether a scene is called so: a folder of that name is not in its way."""
+    from iris_session.demo.scene_names import SCENE_NAMES
+
+    return scene.rstrip("0123456789") in SCENE_NAMES
+
+
+def check_file_options(arguments: argparse.Namespace, path: Path | None) -> None:
+    """Raises `CommandError` for options that make no sense. `path`: see `file_of`."""
+    for folder in arguments.package_dir:
+        if not os.path.isdir(os.path.expanduser(folder)):
+            raise CommandError(f"--package-dir {folder}: no such folder")
+    if path is None and arguments.package_dir:
+        raise CommandError("--package-dir goes with a file to show: MuJoCo's files say themselves where theirs lie")
+    if path is None and arguments.scale is not None:
+        raise CommandError(
+            f"--scale: MuJoCo simulates {arguments.scene or 'the scene'}, and in another size it would move otherwise; "
+            "a mesh is scaled in the file, by <mesh scale=...>"
+        )
+
+
+def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneBuilder:
+    """A scene called `name` with what is in a file that MuJoCo does not read."""
+    from iris_session.scene import SceneBuildError
+    from iris_session.scene.compose import SceneBuilder
+
+    builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
+    if (size := path.stat().st_size) > _LARGE_FILE_BYTES:
+        _print_progress(f"reading {path.name} ({size / 1e6:.1f} MB)")
+    try:
+        if path.suffix.lower() == _ROBOT:
+            builder.add_urdf(path, package_dirs=arguments.package_dir, scale=scale)
+        else:
+            builder.add_file(path, package_dirs=arguments.package_dir, scale=scale)
+    except SceneBuildError as error:
+        advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
+        raise CommandError(f"{error}{advice}") from None
+    if builder.triangles > _MANY_TRIANGLES:
+        _print_progress(
+            f"preparing meshes of {path.name} ({builder.triangles:,} triangles; the next time they are there)"
+        )
+    return builder
+
+
+def _print_progress(text: str) -> None:
+    """What keeps people waiting, at once, and not among what is read by programs."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
+    """What is to be done where lengths of a model of MuJoCo seem to be no metres; nothing where they do not.
+
+    Its largest mesh is judged: its places are in metres, and halls may be large.
+    """
+    from iris_session.scene.extent import largest_mesh, unit_hint
+
+    hint = unit_hint(largest_mesh(spec), _MESH_SCALE_ADVICE)
+    return (f"its largest mesh is {hint}",) if hint else ()

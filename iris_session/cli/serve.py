@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, TextIO
 
 from iris_session.cli.common import (
     CommandError,
-    add_json,
+    add_json_option,
     add_session_options,
-    no_robots,
+    explain_no_robots,
+    format_scene_names,
     open_scene,
-    positive_seconds,
+    parse_seconds,
     print_json,
-    scene_names,
 )
-from iris_session.cli.scene_files import add_file_options, builder_of, check_file_options, file_of
+from iris_session.cli.scene import add_file_options, check_file_options, find_scene_file, make_builder
 from iris_session.protocol.names import AssignmentPolicy
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="share a MuJoCo scene, or show a file",
         description="Shares a MuJoCo scene in real time until Ctrl-C. Robots are found in the model, or named. Files "
         "of other kinds (GLB, STL, OBJ, ...) are shown as they are, a URDF with its joints at rest.",
-        epilog=f"scenes with a name (iiwa and aloha need the folder that IRIS_DATA names):\n{scene_names()}\n\n"
+        epilog=f"scenes with a name (iiwa and aloha need the folder that IRIS_DATA names):\n{format_scene_names()}\n\n"
         "examples:\n"
         "  iris-session serve scene.xml\n"
         "  iris-session serve scene.xml --robots robots.toml --assignment nearest --mode request\n"
@@ -71,13 +71,13 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="go on from the end of a recording (a .rrd or its folder): same session, people, leases, scene",
     )
     add_file_options(parser)
-    parser.add_argument("--seconds", type=positive_seconds, help="stop after this many seconds")
+    parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_session_options(parser)
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
-def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
+def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     """`SessionConfig` from the options of `add_session_options`."""
     import msgspec
 
@@ -85,7 +85,7 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     from iris_session.session.config import SessionConfig
 
     defaults = SessionConfig()
-    assigned = assignments(getattr(arguments, "assign", []))
+    assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
     if assigned and policy != AssignmentPolicy.CONFIG:
         raise CommandError(f"--assign goes with --assignment {AssignmentPolicy.CONFIG}, not with {policy}")
@@ -115,10 +115,10 @@ def session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
     )
 
 
-def assignments(given: list[str]) -> dict[str, tuple[str, ...]]:
+def parse_assignments(options: list[str]) -> dict[str, tuple[str, ...]]:
     """Participant name -> robots, from `NAME=ROBOT[,ROBOT]`; a name given twice has the robots of both."""
     found: dict[str, tuple[str, ...]] = {}
-    for text in given:
+    for text in options:
         name, _, robots = text.partition("=")
         names = tuple(robot.strip() for robot in robots.split(","))
         if not name or not all(names):
@@ -127,12 +127,12 @@ def assignments(given: list[str]) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def session_name(path: Path) -> str:
+def make_session_name(path: Path) -> str:
     """Default name of a session: that of its scene, with what a name cannot hold replaced."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).strip("._-")[:48] or "session"
 
 
-def new_session(arguments: argparse.Namespace) -> Session:
+def create_session(arguments: argparse.Namespace) -> Session:
     """A session that begins."""
     from iris_session.physics import load_robots_toml
     from iris_session.session.session import Session
@@ -141,25 +141,25 @@ def new_session(arguments: argparse.Namespace) -> Session:
         raise CommandError("which scene? give an MJCF or MJB file, the name of a scene, or --resume RECORDING")
     scene = open_scene(arguments.scene)
     robots = None if arguments.robots is None else load_robots_toml(arguments.robots, scene.model)
-    config = session_config(arguments, session_name(Path(arguments.scene)))
+    config = make_session_config(arguments, make_session_name(Path(arguments.scene)))
     config = dataclasses.replace(config, anchors=scene.anchors, anchor_sizes=scene.anchor_sizes)
-    config = with_anchors(config, arguments.anchors)
+    config = apply_anchors_file(config, arguments.anchors)
     return Session(scene.model, config=config, robots=robots)
 
 
-def showing_session(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
+def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublisher:
     """A session in which everybody sees a file, and nothing moves."""
     from iris_session.session.scene_publisher import ScenePublisher
 
     drives = ("robots", "assign", "assignment", "mode")
     if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
         raise CommandError(f"{', '.join(given)}: nobody drives what is in {path.name}, it is shown as it is")
-    scene = builder_of(path, path.name, arguments)
-    config = with_anchors(session_config(arguments, session_name(path)), arguments.anchors)
+    scene = make_builder(path, path.name, arguments)
+    config = apply_anchors_file(make_session_config(arguments, make_session_name(path)), arguments.anchors)
     return ScenePublisher(scene, config)
 
 
-def resumed_session(arguments: argparse.Namespace) -> Session:
+def resume_session(arguments: argparse.Namespace) -> Session:
     """A session that goes on from its recording."""
     from iris_session.session.session import Session
 
@@ -168,12 +168,12 @@ def resumed_session(arguments: argparse.Namespace) -> Session:
     if given:
         raise CommandError(f"{', '.join(given)} cannot be given with --resume: the recording has them")
     model = None if arguments.scene is None else open_scene(arguments.scene).model
-    config = dataclasses.replace(session_config(arguments, "session"), resume=arguments.resume)
-    config = with_anchors(config, arguments.anchors)
+    config = dataclasses.replace(make_session_config(arguments, "session"), resume=arguments.resume)
+    config = apply_anchors_file(config, arguments.anchors)
     return Session(model, config=config)
 
 
-def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
+def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
     """The anchors of a file, where one was given."""
     from iris_session.session.anchors_file import load_anchors
 
@@ -185,19 +185,21 @@ def with_anchors(config: SessionConfig, path: Path | None) -> SessionConfig:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serves until the end that was asked for; prints where to join and, at the end, what happened."""
-    shown = None if arguments.resume is not None or arguments.scene is None else file_of(arguments.scene)
+    shown = None if arguments.resume is not None or arguments.scene is None else find_scene_file(arguments.scene)
     check_file_options(arguments, shown)
     if shown is not None:
-        return _serve(arguments, showing_session(arguments, shown), lambda session: _showing(session, shown))
-    session = resumed_session(arguments) if arguments.resume is not None else new_session(arguments)
+        return _serve(
+            arguments, create_publisher(arguments, shown), lambda session: _describe_shown_file(session, shown)
+        )
+    session = resume_session(arguments) if arguments.resume is not None else create_session(arguments)
     hint = ""
     if not session.robots:
         tip = f"see `iris-session robots {arguments.scene}`, or name them with --robots FILE"
-        hint = f"{no_robots(session.model)}; {tip}"
+        hint = f"{explain_no_robots(session.model)}; {tip}"
     return _serve(arguments, session, lambda _: hint, ", ".join(robot.name for robot in session.robots))
 
 
-def _showing(session: Session | ScenePublisher, path: Path) -> str:
+def _describe_shown_file(session: Session | ScenePublisher, path: Path) -> str:
     """What is shown, how large it is, and which of its meshes are better simplified."""
     from iris_session.scene import AssetStore, SceneBuildError
     from iris_session.scene.extent import extent_of, size_text
@@ -219,18 +221,18 @@ def _showing(session: Session | ScenePublisher, path: Path) -> str:
 def _serve(
     arguments: argparse.Namespace,
     session: Session | ScenePublisher,
-    hint_of: Callable[[Session | ScenePublisher], str],
+    make_hint: Callable[[Session | ScenePublisher], str],
     robots: str = "",
 ) -> int:
     """`hint_of`: what is said of the session once it runs; empty for nothing."""
     with session.signals(), session:
         out = sys.stderr if arguments.json else sys.stdout
         print(f"session '{session.name}' on {session.address}, robots: {robots or 'none'}", file=out, flush=True)
-        for note in filter(None, (*session.notes, hint_of(session))):
+        for note in filter(None, (*session.notes, make_hint(session))):
             print(note, file=out, flush=True)
         if session.recording is not None:
             print(f"recording to {session.recording}", file=out, flush=True)
-        _run(arguments, session, out)
+        _run_with_live_view(arguments, session, out)
         status = session.status()
         recording = None if session.recording is None else str(session.recording)
     fault = session.recording_fault
@@ -243,7 +245,7 @@ def _serve(
     return 1 if fault else 0
 
 
-def _run(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
+def _run_with_live_view(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
     from iris_session.cli.live import LiveView
 
     view = LiveView(session, out, f"iris-session {session.name} on {session.address}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from iris_session.cli.common import add_json, positive_seconds, print_json
+from iris_session.cli.common import add_json_option, parse_seconds, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -16,8 +16,8 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         epilog="examples:\n  iris-session sessions\n  iris-session sessions --seconds 3 --json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--seconds", type=positive_seconds, default=1.0, help="listen this long (default: %(default)g)")
-    add_json(parser)
+    parser.add_argument("--seconds", type=parse_seconds, default=1.0, help="listen this long (default: %(default)g)")
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -45,13 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
         print_json({"ok": bool(rows), "sessions": rows})
         return 0 if rows else 1
     for row in rows:
-        print(f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_key(row)}")
+        print(f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}")
     if not rows:
         print("no session was heard: type the address of one, or scan its code (docs/network.md)")
     return 0 if rows else 1
 
 
-def _key(row: dict[str, object]) -> str:
+def _format_key(row: dict[str, object]) -> str:
     if not row["encrypted"]:
         return "not encrypted: this machine only"
     return f"key {row['key_fingerprint']}{'' if row['known'] else ' (new: join with --code)'}"

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from iris_session.cli.common import (
     CommandError,
-    add_json,
-    add_way_to_session,
-    expect_session,
-    positive_seconds,
+    add_address_options,
+    add_json_option,
+    check_session_reachable,
+    parse_seconds,
     print_json,
+    to_printable,
 )
-from iris_session.cli.live import printable
 
 if TYPE_CHECKING:
     from iris_session.client import Client
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: Without having been let in by then, the session is asked all the same.
 JOIN_S: Final = 4.0
 #: Clients report once a second: a report before that says less.
-SETTLE_S: Final = 1.2
+FIRST_REPORT_S: Final = 1.2
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,48 +43,48 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "  iris-session status --metrics-port 9463      http://127.0.0.1:9463/metrics for Prometheus",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_way_to_session(parser)
+    add_address_options(parser)
     form = parser.add_mutually_exclusive_group()
-    add_watch(form, parser)
+    add_watch_options(form, parser)
     form.add_argument("--prometheus", action="store_true", help="text exposition format of Prometheus, once")
     form.add_argument(
         "--metrics-port", type=int, default=None, metavar="PORT", help="serve that on 127.0.0.1 over HTTP"
     )
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 
-def add_watch(form: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
+def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
     """The options of `watch`; `form`: where `--watch` goes."""
-    form.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
+    group.add_argument("--watch", action="store_true", help="go on until Ctrl-C")
     parser.add_argument(
-        "--period", type=positive_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
+        "--period", type=parse_seconds, default=1.0, metavar="S", help="--watch: refresh (default: %(default)s)"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Prints the status; with --watch or --metrics-port until Ctrl-C."""
-    from iris_session.cli.metrics import exposition
+    from iris_session.cli.metrics import format_metrics
 
-    with asking(arguments) as (client, report):
+    with open_status(arguments) as (client, report):
         if arguments.metrics_port is not None:
             return _serve_metrics(client, arguments.metrics_port)
         if arguments.watch:
-            return watch(client, arguments.period, show, as_json=arguments.json)
+            return watch_status(client, arguments.period, print_status, as_json=arguments.json)
         if arguments.prometheus:
-            sys.stdout.write(exposition(report))
+            sys.stdout.write(format_metrics(report))
         else:
-            show(report, as_json=arguments.json)
+            print_status(report, as_json=arguments.json)
         return 0
 
 
 @contextmanager
-def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
+def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
     """An observer of the session that is meant, and its status. A session that stands still lets nobody in, but tells
     how it does."""
     from iris_session.client import Client, NotConnectedError, RequestTimeoutError
 
-    expect_session(arguments)
+    check_session_reachable(arguments)
     client = Client(
         arguments.address,
         session=arguments.session,
@@ -96,7 +96,7 @@ def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport
     try:
         client.open()
         if client.wait_for(lambda one: one.ready, JOIN_S):
-            client.sleep(SETTLE_S)
+            client.sleep(FIRST_REPORT_S)
         try:
             report = client.status()
         except (NotConnectedError, RequestTimeoutError) as error:
@@ -107,22 +107,22 @@ def asking(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport
         client.close()
 
 
-class Show(Protocol):
+class ReportPrinter(Protocol):
     """Prints one report."""
 
     def __call__(self, report: StatusReport, *, as_json: bool) -> None: ...
 
 
-def show(report: StatusReport, *, as_json: bool) -> None:
+def print_status(report: StatusReport, *, as_json: bool) -> None:
     import msgspec
 
     if as_json:
         print_json(msgspec.to_builtins(report))
     else:
-        print("\n".join(screen(report)), flush=True)
+        print("\n".join(format_status(report)), flush=True)
 
 
-def watch(client: Client, period_s: float, show: Show, *, as_json: bool) -> int:
+def watch_status(client: Client, period_s: float, print_report: ReportPrinter, *, as_json: bool) -> int:
     """Until Ctrl-C. A session that goes away is waited for."""
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
@@ -135,13 +135,13 @@ def watch(client: Client, period_s: float, show: Show, *, as_json: bool) -> int:
             print(f"{clear}{error}", flush=True)
         else:
             print(clear, end="")
-            show(report, as_json=as_json)
+            print_report(report, as_json=as_json)
         client.sleep(max(0.1, period_s - (time.monotonic() - began)))
 
 
 def _serve_metrics(client: Client, port: int) -> int:
     """Answers scrapes on loopback until Ctrl-C."""
-    from iris_session.cli.metrics import CONTENT_TYPE, exposition
+    from iris_session.cli.metrics import CONTENT_TYPE, format_metrics
     from iris_session.client import ClientError
 
     client.start()
@@ -154,9 +154,9 @@ def _serve_metrics(client: Client, port: int) -> int:
                 return
             try:
                 with asking:
-                    body = exposition(client.status()).encode()
+                    body = format_metrics(client.status()).encode()
             except ClientError as error:
-                self.send_error(503, printable(str(error)))
+                self.send_error(503, to_printable(str(error)))
                 return
             self.send_response(200)
             self.send_header("Content-Type", CONTENT_TYPE)
@@ -177,13 +177,13 @@ def _serve_metrics(client: Client, port: int) -> int:
     return 0
 
 
-def screen(report: StatusReport) -> list[str]:
+def format_status(report: StatusReport) -> list[str]:
     """One screen of printable lines."""
-    return [printable(line) for line in _lines(report)]
+    return [to_printable(line) for line in _format_lines(report)]
 
 
-def _lines(report: StatusReport) -> Iterator[str]:
-    from iris_session.doctor.condition import stages
+def _format_lines(report: StatusReport) -> Iterator[str]:
+    from iris_session.doctor.session_checks import measure_stages
     from iris_session.protocol.status import NOT_PUBLISHED
 
     silent = next((text for text in report.warnings if text.startswith(NOT_PUBLISHED)), "")
@@ -203,7 +203,7 @@ def _lines(report: StatusReport) -> Iterator[str]:
         f"{'missed':>7s} {'samples/s':>9s} {'drops':>6s}  robots"
     )
     for p in report.participants:
-        yield _participant(p)
+        yield _format_participant(p)
     yield ""
     yield f"{'robot':20s} {'holder':20s} {'state':9s} {'hold reason':14s} {'receive to step ms':>19s}  queue"
     for r in report.robots:
@@ -211,19 +211,20 @@ def _lines(report: StatusReport) -> Iterator[str]:
         holder = r.holder_name or r.holder or "-"
         yield (
             f"{r.name:20.20s} {holder:20.20s} {r.state:9s} {r.hold_reason or '-':14s} "
-            f"{_quantiles(r.receive_to_step):>19s}  {waits}"
+            f"{_format_quantiles(r.receive_to_step):>19s}  {waits}"
         )
-    yield from _media(report)
-    yield from _assets(report)
+    yield from _format_media(report)
+    yield from _format_assets(report)
     yield ""
-    took = stages(report.participants, report)
+    took = measure_stages(report.participants, report)
     yield "data age, p99 of the worst: " + (
         ", ".join(f"{stage} {ms:.1f} ms" + (f" ({who})" if who else "") for stage, (ms, who) in took.items()) or "-"
     )
     causes = ", ".join(f"{cause} {n}" for cause, n in report.late_causes.items()) or "none"
     yield (
         f"late ticks: {report.late_share:.2%} of the last ten seconds, {report.late_share_total:.2%} in all; "
-        f"lateness p50/p99 {_quantiles(report.lateness)} ms; causes: {causes}; scheduling {report.scheduling or '-'}"
+        f"lateness p50/p99 {_format_quantiles(report.lateness)} ms; causes: {causes}; "
+        f"scheduling {report.scheduling or '-'}"
     )
     yield (
         f"machine: load {report.load:.1f} of {report.cpus}, the session's process {report.cpu_share:.0%} of one, "
@@ -245,14 +246,14 @@ def _lines(report: StatusReport) -> Iterator[str]:
     yield from (f"warning: {text}" for text in report.warnings)
 
 
-def _participant(p: ParticipantReport) -> str:
+def _format_participant(p: ParticipantReport) -> str:
     aligned = p.alignment
     if p.alignment_age_ns >= 0 and aligned in ("measured", "placed"):
         aligned += f" {p.alignment_error_m * 1e3:.0f} mm, {p.alignment_age_ns * 1e-9:.0f} s"
     elif p.alignment_void_ns >= 0:
         aligned = f"void for {p.alignment_void_ns * 1e-9:.0f} s"
     name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
-    age = _quantiles(p.state_age) if p.reported else "-"
+    age = _format_quantiles(p.state_age) if p.reported else "-"
     waits = f" waits: {', '.join(p.waits_for)}" if p.waits_for else ""
     return (
         f"{name:20.20s} {p.role:9.9s} {aligned:22.22s} {age:>15s} {p.rtt_ms:7.1f} {p.missed_share:7.1%} "
@@ -260,7 +261,7 @@ def _participant(p: ParticipantReport) -> str:
     )
 
 
-def _media(report: StatusReport) -> Iterator[str]:
+def _format_media(report: StatusReport) -> Iterator[str]:
     """Every stream, and who gets what of it."""
     if report.media:
         yield ""
@@ -269,12 +270,12 @@ def _media(report: StatusReport) -> Iterator[str]:
         for p in report.participants:
             for budget in p.media:
                 if budget.stream == one.stream:
-                    gets.append(f"{p.name} ({p.id}) {budget.budget_class}" + _dropped(p.media_drops))
+                    gets.append(f"{p.name} ({p.id}) {budget.budget_class}" + _format_dropped(p.media_drops))
         source = f" from {one.source}" if one.source else ""
         yield f"media {one.stream}: {one.hz:.0f} Hz, {one.mbit_per_s:.1f} Mbit/s{source}; {', '.join(gets) or 'nobody'}"
 
 
-def _assets(report: StatusReport) -> Iterator[str]:
+def _format_assets(report: StatusReport) -> Iterator[str]:
     """What of the scene's meshes and textures was fetched."""
     one = report.assets
     if one is not None and (one.served or one.requests):
@@ -283,9 +284,9 @@ def _assets(report: StatusReport) -> Iterator[str]:
         yield f"assets: {one.served} served, {one.bytes_sent / 1e6:.1f} MB sent{refused}{waiting}"
 
 
-def _dropped(n: int) -> str:
+def _format_dropped(n: int) -> str:
     return f", {n} dropped" if n else ""
 
 
-def _quantiles(values: Quantiles | None) -> str:
+def _format_quantiles(values: Quantiles | None) -> str:
     return "-" if values is None else f"{values.p50:.1f}/{values.p99:.1f}"

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from iris_session.cli.common import add_json, print_json
+from iris_session.cli.common import add_json_option, print_json
 
 
 def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -18,7 +18,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    add_json(parser)
+    add_json_option(parser)
     parser.set_defaults(run=run)
 
 

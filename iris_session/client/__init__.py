@@ -4,7 +4,7 @@ A sans-I/O core (`connection`, `session_state`, `state_stream`, `clock`, `interp
 (`client`, `sockets`). Errors are drawn in `errors`.
 """
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.store import AssetStore
 from iris_session.client.assets import AssetFetch
 from iris_session.client.client import Client
 from iris_session.client.core.interpolation import PoseBuffer, ShownPoses
@@ -29,7 +29,7 @@ from iris_session.client.sockets import CurveKeys
 from iris_session.protocol.session_mirror import SessionMirror
 
 __all__ = [
-    "AssetCache",
+    "AssetStore",
     "AssetFetch",
     "Client",
     "ClientGroup",

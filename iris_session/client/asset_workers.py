@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
-from iris_session.assets.cache import AssetCache, Part
+from iris_session.assets.errors import AssetStoreError
+from iris_session.assets.store import AssetPart, AssetStore
 from iris_session.client.errors import AssetError
-from iris_session.system.priority import give_way
+from iris_session.system.priority import lower_thread_priority
 
 THREADS: Final = 2
 #: Who polls is woken after so many bytes, and not more often than this while there is more to do: to look at everything
@@ -69,10 +70,10 @@ class AssetWorkers:
     """`wake`: called from the threads when there is a result. How much waits is bounded by who asks: a window of bytes,
     and a few assets at once."""
 
-    def __init__(self, cache: AssetCache, wake: Callable[[], None]) -> None:
+    def __init__(self, cache: AssetStore, wake: Callable[[], None]) -> None:
         self.cache = cache
         self._wake = wake
-        self._parts: dict[str, Part] = {}
+        self._parts: dict[str, AssetPart] = {}
         self._closing = False
         self._results: queue.SimpleQueue[Result] = queue.SimpleQueue()
         self._jobs: list[queue.SimpleQueue[_Job | None]] = [queue.SimpleQueue() for _ in range(THREADS)]
@@ -95,7 +96,7 @@ class AssetWorkers:
             view = self.cache.find(address)
             if view is not None:
                 return _decode_found(address, view, decodes, fetched=False)
-            part = self._parts[address] = self.cache.begin(address)
+            part = self._parts[address] = self.cache.open_part(address)
             return AssetMissing(address, part.offset)
 
         self._submit(address, work)
@@ -155,7 +156,7 @@ class AssetWorkers:
     # --- the threads --------------------------------------------------------------------------------------------------
 
     def _run(self, jobs: queue.SimpleQueue[_Job | None]) -> None:
-        give_way()
+        lower_thread_priority()
         untold, woken_ns = 0, 0
         while (job := jobs.get()) is not None:
             address, work, size = job
@@ -175,6 +176,9 @@ class AssetWorkers:
             return work()
         except AssetError as error:
             failure = error
+        except AssetStoreError as error:
+            failure = AssetError.from_store(error)
+            failure.__cause__ = error
         except Exception as error:  # a fault of ours: it must not leave somebody waiting
             failure = AssetError(address, "cache", f"asset {address}: {type(error).__name__}: {error}")
             failure.__cause__ = error

@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.errors import AssetStoreError
+from iris_session.assets.store import AssetStore, default_root
 from iris_session.client.asset_workers import (
     AssetFailed,
     AssetFound,
@@ -45,7 +46,7 @@ class AssetFetch:
 
     def __init__(
         self,
-        cache: AssetCache,
+        cache: AssetStore,
         addresses: Iterable[str],
         sizes: Mapping[str, int],
         on_progress: Callable[[AssetFetch], None] | None,
@@ -91,8 +92,7 @@ class AssetFetch:
         Raises:
             AssetError: It has not come yet, or will not.
         """
-        self._check_here(address)
-        return self._cache.read(address)
+        return bytes(self.view(address))
 
     def view(self, address: str) -> memoryview:
         """Map an asset that is here, without a copy: only the parts that are used are read.
@@ -107,7 +107,10 @@ class AssetFetch:
             AssetError: It has not come yet, or will not.
         """
         self._check_here(address)
-        return self._cache.view(address)
+        try:
+            return self._cache.view(address)
+        except AssetStoreError as error:
+            raise AssetError.from_store(error) from error
 
     def check(self) -> None:
         """Raise the first error of `failed`, if there is one.
@@ -167,7 +170,7 @@ class ClientAssets:
     """
 
     def __init__(self, connection: ClientConnection, sockets: ClientSockets, lock: threading.RLock) -> None:
-        self.cache = AssetCache()
+        self.cache = AssetStore(default_root("client-assets"))
         self.malformed = 0
         self._connection = connection
         self._sockets = sockets

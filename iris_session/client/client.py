@@ -66,7 +66,7 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.common import Alignment, Denial, Lease, Target
 from iris_session.protocol.names import AlignmentKind, AnchorKind, Role, SampleKind, TargetKind
 from iris_session.protocol.server_messages import Event, Feedback, Reply
-from iris_session.protocol.session_mirror import Missed, SessionMirror
+from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import StatusReport
 
 if TYPE_CHECKING:
@@ -326,7 +326,7 @@ class Client:
     @property
     def alignment(self) -> Alignment | None:
         """Our own `T_world_tracking` as accepted by the session, `None` before."""
-        return self.connection.mirror.alignment(self.participant_id)
+        return self.connection.mirror.find_alignment(self.participant_id)
 
     def lease_version(self, target: str) -> int | None:
         """Return our fencing token for a robot or object.
@@ -1158,7 +1158,7 @@ class Client:
     def _call_back(self, message: InboxMessage) -> None:
         if isinstance(message, Event) and self.on_event is not None:
             self.on_event(message)
-        elif isinstance(message, Missed) and self.on_missed is not None:
+        elif isinstance(message, MissedEvents) and self.on_missed is not None:
             self.on_missed(message.first, message.last)
         elif isinstance(message, Feedback) and self.on_feedback is not None:
             self.on_feedback(message)

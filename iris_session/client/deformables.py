@@ -22,11 +22,10 @@ from iris_session.client.client import Client
 from iris_session.client.errors import ClientError
 from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.protocol.scene_names import ArrayKind, ArrayName
 from iris_session.scene.arrays import decode_arrays, require
-from iris_session.scene.errors import AssetError
+from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
 from iris_session.streams.errors import StreamError
@@ -67,7 +66,7 @@ class DeformableMesh:
 
 
 def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: int) -> DeformableMesh:
-    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetError` or `ValueError`."""
+    """`arrays`: of its asset. `n_vertices`: how many its stream has. Raises `AssetDecodeError` or `ValueError`."""
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:
@@ -209,7 +208,7 @@ class Deformables:
                     self._fetch = self._client.assets.fetch(new)
                     return
             self._use(self._made(self._parts, fetch), self._asked)
-        except (ClientError, AssetError, StreamError, KeyError, ValueError) as error:
+        except (ClientError, AssetDecodeError, StreamError, KeyError, ValueError) as error:
             self._failed(error)
         self._parts = None
 

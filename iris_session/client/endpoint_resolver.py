@@ -33,13 +33,12 @@ from iris_session.client.discovery import (
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, SessionNameError, TrustError
 from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import envelope
+from iris_session.protocol.client_messages import Pair, envelope
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.server_messages import ProtocolFault, Refused, Welcome
+from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused, Welcome
 from iris_session.security import KeyHome, KeyPair, KeysError, KnownServer, fingerprint, raw_key
 
 LOCAL_ADDRESS: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"

@@ -17,6 +17,7 @@ Bytes that a server sends and that do not fit the protocol never raise: they are
 
 from __future__ import annotations
 
+from iris_session.assets.errors import AssetStoreError
 from iris_session.protocol.common import Denial
 from iris_session.protocol.server_messages import Refused
 
@@ -93,3 +94,8 @@ class AssetError(ClientError):
         super().__init__(text)
         self.address = address
         self.reason = reason
+
+    @classmethod
+    def from_store(cls, error: AssetStoreError) -> AssetError:
+        """Return the error of a client whose asset store failed."""
+        return cls(error.address, error.reason, str(error))

@@ -10,12 +10,12 @@ import logging
 import os
 import secrets
 import stat
-import tempfile
 from pathlib import Path
 
 import msgspec
 
 from iris_session.client.errors import IdentityError
+from iris_session.system.files import write_atomic
 
 SECRET_BYTES = 16  # 128 bits
 _log = logging.getLogger(__name__)
@@ -102,13 +102,6 @@ class Identity:
         assert self.path is not None
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)  # mode 0600
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    file.write(msgspec.json.encode(_Stored(self.secret, self._resume_token)))
-                os.replace(temporary, self.path)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
+            write_atomic(self.path, msgspec.json.encode(_Stored(self.secret, self._resume_token)))
         except OSError as error:
             raise IdentityError(f"identity file {self.path} cannot be written: {error.strerror}") from error

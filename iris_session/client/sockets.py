@@ -20,7 +20,7 @@ from iris_session.client.errors import IdentityError
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES
 from iris_session.protocol.server_messages import TOPIC_PRESENCE, TOPIC_RIGID
 from iris_session.security import KeysError, load_public, load_secret
-from iris_session.system.priority import made_below
+from iris_session.system.priority import run_at_low_priority
 
 STATE_HWM: Final = 2
 #: Small on purpose: what a stalled client finds when it comes back is at most this old, not seconds old.
@@ -381,7 +381,7 @@ def asset_context() -> zmq.Context[zmq.Socket[bytes]]:
     global _context  # noqa: PLW0603
     with _lock:
         if _context is None or _context[0] != os.getpid():
-            _context = os.getpid(), made_below(_opened)
+            _context = os.getpid(), run_at_low_priority(_opened)
         return _context[1]
 
 

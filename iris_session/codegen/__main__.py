@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m iris_session.codegen", description=__doc__)
     parser.add_argument("what", choices=[*TARGETS, "all"])
     parser.add_argument("--check", action="store_true", help="write nothing; fail when a file is not current")
-    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[3], help="the checkout")
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[2], help="the checkout")
     options = parser.parse_args(arguments)
     if not (options.root / _DOCUMENT).exists():
         parser.error(f"{options.root} is not a checkout: {_DOCUMENT} is missing")

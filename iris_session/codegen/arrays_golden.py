@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAGIC, ArrayHeader, ArrayInfo
-from iris_session.protocol.scene_names import ArrayCodec, ArrayFilter, ArrayKind
+from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
+from iris_session.protocol.names import ArrayCodec, ArrayFilter, ArrayKind
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 
@@ -62,7 +62,7 @@ def malformed() -> Iterator[tuple[str, bytes]]:
     yield "another magic", b"IRA2" + good[4:]
     yield "truncated", good[:-1]
     yield "a byte too many", good + b"\x00"
-    yield "a header of 4 GB", MAGIC + b"\xff\xff\xff\xff" + good[8:]
+    yield "a header of 4 GB", ARRAYS_MAGIC + b"\xff\xff\xff\xff" + good[8:]
     infos = {
         "a frame of another size than the array": ArrayInfo("a", "u1", (201,), 0, codec=ArrayCodec.ZSTD),
         "an array of 2^62 bytes": ArrayInfo("a", "u1", (2**31, 2**31), 0, codec=ArrayCodec.ZSTD),
@@ -143,7 +143,7 @@ def _colors(corners: int) -> NDArray[np.uint8]:
 
 def _asset(header: ArrayHeader, body: bytes) -> bytes:
     head = msgspec.msgpack.encode(header)
-    return MAGIC + len(head).to_bytes(4, "little") + head + body
+    return ARRAYS_MAGIC + len(head).to_bytes(4, "little") + head + body
 
 
 def _numbers(values: NDArray[Any]) -> list[Any]:

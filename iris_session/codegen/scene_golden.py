@@ -16,33 +16,7 @@ import msgspec
 from iris_session.codegen.examples import extreme, full, least
 from iris_session.codegen.schema import GROUPS
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.scene import (
-    Body,
-    Camera,
-    Deformable,
-    Environment,
-    Geometry,
-    Headlight,
-    Light,
-    SceneSpec,
-    Site,
-    Tendon,
-    Totals,
-    Visual,
-    check_scene,
-    encode_scene,
-)
-from iris_session.protocol.scene_looks import (
-    HeightField,
-    Material,
-    Mesh,
-    MeshLevel,
-    Texture,
-    TextureLevel,
-    TextureUse,
-    Vec2,
-)
-from iris_session.protocol.scene_names import (
+from iris_session.protocol.names import (
     SCENE_VERSION,
     AssetEncoding,
     ColorSpace,
@@ -52,13 +26,35 @@ from iris_session.protocol.scene_names import (
     TextureKind,
     TextureRole,
 )
-from iris_session.protocol.scene_patch import (
+from iris_session.protocol.scene import (
     AddMaterial,
     AddMesh,
     AddVisual,
+    Body,
+    Camera,
+    Deformable,
+    Environment,
+    Geometry,
+    Headlight,
+    HeightField,
+    Light,
+    Material,
+    Mesh,
+    MeshLevel,
     PatchOp,
     RemoveVisual,
+    SceneSpec,
     SetVisual,
+    Site,
+    Tendon,
+    Texture,
+    TextureLevel,
+    TextureUse,
+    Totals,
+    Vec2,
+    Visual,
+    check_scene,
+    encode_scene,
     patched,
 )
 

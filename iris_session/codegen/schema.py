@@ -14,7 +14,6 @@ from typing import Any, Final, get_args
 import msgspec
 
 from iris_session.protocol import (
-    arrays,
     assets,
     client_messages,
     common,
@@ -22,9 +21,6 @@ from iris_session.protocol import (
     media,
     names,
     scene,
-    scene_looks,
-    scene_names,
-    scene_patch,
     server_messages,
     status,
 )
@@ -78,7 +74,7 @@ UNIONS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
     "ClientMessage": get_args(client_messages.ClientMessage),
     "ServerMessage": get_args(server_messages.ServerMessage),
     "EventKind": get_args(server_messages.EventKind),
-    "PatchOp": get_args(scene_patch.PatchOp),
+    "PatchOp": get_args(scene.PatchOp),
 }
 
 #: Groups of structs in the order of the document.
@@ -128,13 +124,13 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         scene.Body,
         scene.Visual,
         scene.Geometry,
-        scene_looks.Material,
-        scene_looks.TextureUse,
-        scene_looks.Texture,
-        scene_looks.TextureLevel,
-        scene_looks.Mesh,
-        scene_looks.MeshLevel,
-        scene_looks.HeightField,
+        scene.Material,
+        scene.TextureUse,
+        scene.Texture,
+        scene.TextureLevel,
+        scene.Mesh,
+        scene.MeshLevel,
+        scene.HeightField,
         scene.Light,
         scene.Camera,
         scene.Site,
@@ -144,7 +140,7 @@ GROUPS: Final[dict[str, tuple[type[msgspec.Struct], ...]]] = {
         scene.Headlight,
         scene.Totals,
     ),
-    "arrays": (arrays.ArrayHeader, arrays.ArrayInfo),
+    "arrays": (assets.ArrayHeader, assets.ArrayInfo),
     "patch": UNIONS["PatchOp"],
 }
 
@@ -215,9 +211,6 @@ _ENUMS: Final[dict[str, str]] = {
     "ArrayInfo.codec": "ArrayCodec",
 }
 
-#: Modules of open enumerations, in the order of the document.
-_NAMES: Final = (names, scene_names)
-
 _SCALARS: Final[dict[type[msgspec.inspect.Type], str]] = {
     msgspec.inspect.BoolType: "bool",
     msgspec.inspect.FloatType: "float",
@@ -250,9 +243,8 @@ def enum_doc(name: str) -> str:
 def _enum_classes() -> dict[str, type]:
     return {
         name: value
-        for module in _NAMES
-        for name, value in vars(module).items()
-        if isinstance(value, type) and value.__module__ == module.__name__
+        for name, value in vars(names).items()
+        if isinstance(value, type) and value.__module__ == names.__name__
     }
 
 

@@ -14,10 +14,9 @@ import msgspec
 
 from iris_session.codegen import rigid_reference
 from iris_session.codegen.schema import UNIONS, Field, Struct, Type, all_structs, enum_doc, enums
-from iris_session.protocol import arrays, server_messages
-from iris_session.protocol.names import PROTOCOL_VERSION
+from iris_session.protocol import assets, server_messages
+from iris_session.protocol.names import PROTOCOL_VERSION, SCENE_VERSION
 from iris_session.protocol.scene import MAX_SCENE_BYTES
-from iris_session.protocol.scene_names import SCENE_VERSION
 
 HEAD: Final = """\
 // Messages of the iris-session protocol. Written by `python -m iris_session.codegen typescript`: do not edit.
@@ -52,7 +51,7 @@ def _constants() -> str:
             f"export const RIGID_ROTATION_CENTRE = {rigid_reference.ROTATION_CENTRE};",
             f"export const SCENE_VERSION = {SCENE_VERSION};",
             f"export const MAX_SCENE_BYTES = {MAX_SCENE_BYTES};",
-            f'export const ARRAYS_MAGIC = "{arrays.MAGIC.decode()}";',
+            f'export const ARRAYS_MAGIC = "{assets.ARRAYS_MAGIC.decode()}";',
         ]
     )
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-import subprocess
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -28,7 +26,7 @@ from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
 from iris_session.session.status import HandoverStatus, SessionStatus
 from iris_session.session.verification import verify_recording
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess
 
 #: How often the reports of the emulated people are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
@@ -45,28 +43,20 @@ class EmulatorProcess:
     """Emulated people in a process of their own. `poll()` reads what they report, without waiting."""
 
     def __init__(self, address: str, specs: Sequence[HeadsetSpec], seconds: float) -> None:
-        command = children.command("iris_session.emulator", "--address", address, "--specs", "-", "--json")
-        command += ["--join-timeout", str(JOIN_TIMEOUT_S)]
-        self._process = subprocess.Popen(
-            [*command, "--seconds", str(seconds)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=children.environment(),
-            start_new_session=True,
+        options = ["--address", address, "--specs", "-", "--json", "--join-timeout", str(JOIN_TIMEOUT_S)]
+        self._process = ChildProcess(
+            "iris_session.emulator",
+            [*options, "--seconds", str(seconds)],
+            config=msgspec.json.encode(list(specs)),
+            stdout=PIPE,
+            own_session=True,
         )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(msgspec.json.encode(list(specs)))
-        self._process.stdin.close()
-        self._fd = self._process.stdout.fileno()
-        os.set_blocking(self._fd, False)
-        self._rest = b""
         self._awaited = [spec.name for spec in specs if not spec.endless]
         self.reports: dict[str, HeadsetReport] = {}
 
     @property
     def running(self) -> bool:
-        return self._process.poll() is None
+        return self._process.is_running
 
     @property
     def busy(self) -> bool:
@@ -80,32 +70,15 @@ class EmulatorProcess:
 
     def poll(self) -> None:
         """Takes over the newest report of each person."""
-        while True:
-            try:
-                data = os.read(self._fd, 65536)
-            except BlockingIOError:
-                return
-            if not data:
-                return
-            *lines, self._rest = (self._rest + data).split(b"\n")
-            for line in lines:
-                report = msgspec.json.decode(_nan_for_null(line), type=HeadsetReport, strict=False)
-                self.reports[report.name] = report
+        for line in self._process.read_available_lines():
+            report = msgspec.json.decode(_nan_for_null(line), type=HeadsetReport, strict=False)
+            self.reports[report.name] = report
 
     def close(self) -> None:
         """Ends the process if it still runs, and reads its last words. Can be called twice."""
-        assert self._process.stdout is not None
-        if self._process.stdout.closed:
-            return
-        if self.running:
-            self._process.terminate()
-        try:
-            self._process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.stop(terminate_s=5.0)
         self.poll()
-        self._process.stdout.close()
+        self._process.close()
 
 
 def _nan_for_null(line: bytes) -> bytes:

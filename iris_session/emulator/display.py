@@ -59,9 +59,9 @@ class Display:
         return None if index is None else self._pose(index)
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
-        tip = self._client.mirror.tip(robot)
+        tip = self._client.mirror.find_tip(robot)
         body = None if tip is None else self._pose(tip[0])
-        return None if tip is None or body is None else compose(body, tip[1])
+        return None if tip is None or body is None else compose(body, (tip[1].p, tip[1].q))
 
     def vertex(self, deformable: str, index: int) -> Vec3 | None:
         self.wants_vertices = True

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from iris_session.front.audit import AuditTrail
-from iris_session.front.connection_guard import Doors
-from iris_session.front.connections import ClientTable, Connection, Outbox, Peer, Route
-from iris_session.front.shares import HelloShares, connections_of_one
+from iris_session.front.connection_guard import ConnectionGuard, HelloRateLimiter, max_connections_per_key
+from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, Peer, Route
 from iris_session.link.config import FrontConfig, Ports
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.limits import Drops, RateLimiter
 from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import Keyring, roles_behind
 from iris_session.security.resume_tokens import ResumeTokens
@@ -39,13 +37,13 @@ class Admission:
         self,
         config: FrontConfig,
         ports: Ports,
-        clients: ClientTable,
+        clients: ConnectionTable,
         outbox: Outbox,
         drops: Drops,
         tokens: ResumeTokens,
         keyring: Keyring,
         audit: AuditTrail,
-        doors: Doors,
+        guard: ConnectionGuard,
     ) -> None:
         self._config = config
         self._ports = ports
@@ -55,13 +53,13 @@ class Admission:
         self._tokens = tokens
         self._keyring = keyring
         self._audit = audit
-        self._doors = doors
+        self._guard = guard
         #: Called when somebody is let in, before he is told: by then every channel must know him.
         self.lets_in: list[Callable[[], None]] = []
-        self._hellos = HelloShares(config.limits)
-        self._knocks: dict[int, RateLimiter] = {}
+        self._hellos = HelloRateLimiter(config.limits)
+        self._rates: dict[int, RateLimiter] = {}
 
-    def hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
+    def handle_hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
         """Answers a refusal itself, and gives no entry then."""
         try:
             connection, join = self._accept(route, peer, hello, now_ns)
@@ -73,27 +71,27 @@ class Admission:
         self._clients.add(connection)
         return Entry(connection.number, connection.number, now_ns, join)
 
-    def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[Connection, Join]:
-        if not self._may_knock(route, peer, now_ns):
+    def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[FrontConnection, Join]:
+        if not self._allow_hello(route, peer, now_ns):
             raise _RefusedError(RefusalCode.RATE, "too many hellos at once", "try again in a second")
-        gateway = self._gateway(route, peer, now_ns)
-        key_id = self._key_id(peer, hello, gateway)
-        if self._doors.barred(key_id, now_ns):
+        gateway = self._require_gateway(route, peer, now_ns)
+        key_id = self._make_key_id(peer, hello, gateway)
+        if self._guard.is_banned(key_id, now_ns):
             raise _RefusedError(
                 RefusalCode.RATE, "this client was cut off: it sent a flood", "send less; try again soon"
             )
-        roles = self._roles(key_id, gateway)
+        roles = self._find_roles(key_id, gateway)
         address = peer_of(peer.descriptor)
-        resume_of = self._resume(hello, key_id, address[0], now_ns)
+        resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
         # Who comes back replaces a connection that may still be counted: as many again, so that it is bounded.
         limit = self._config.limits.connections
         if len(self._clients) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
-        share = connections_of_one(limit)
-        if not resume_of and self._held_by(gateway.key_id if gateway else key_id) >= share:
+        share = max_connections_per_key(limit)
+        if not resume_of and self._count_connections(gateway.key_id if gateway else key_id) >= share:
             raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
         number = self._tokens.new_connection()
-        connection = Connection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
+        connection = FrontConnection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
         join = Join(
             key_id,
             hello.role,
@@ -108,34 +106,34 @@ class Admission:
         )
         return connection, join
 
-    def _may_knock(self, route: Route, peer: Peer, now_ns: int) -> bool:
+    def _allow_hello(self, route: Route, peer: Peer, now_ns: int) -> bool:
         """Bounds the hellos of one TCP connection (a gateway's are those of many people), of one key, and of all."""
         if not route.on_behalf_of:
-            knocks = self._knocks.setdefault(peer.descriptor, RateLimiter())
+            knocks = self._rates.setdefault(peer.descriptor, RateLimiter())
             if not knocks.allow(Hello, now_ns):
                 return False
-        return self._hellos.take(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
+        return self._hellos.allow(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
 
-    def _held_by(self, key_id: str) -> int:
+    def _count_connections(self, key_id: str) -> int:
         """Connections of one key, people behind it included."""
         connections = self._clients.by_number
         gateways = {number for number, one in connections.items() if one.key_id == key_id}
         return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
 
-    def forget_peer(self, descriptor: int) -> None:
+    def remove_peer(self, descriptor: int) -> None:
         """A TCP connection was closed: its descriptor may become another's."""
-        self._knocks.pop(descriptor, None)
+        self._rates.pop(descriptor, None)
 
-    def gateway(self, routing_id: bytes, peer: Peer) -> Connection | None:
+    def find_gateway(self, routing_id: bytes, peer: Peer) -> FrontConnection | None:
         """The admitted gateway that this peer is."""
         gateway = self._clients.find(Route(routing_id), peer)
         return gateway if gateway is not None and gateway.admitted and gateway.hello.role == Role.GATEWAY else None
 
-    def forged(self, route: Route, peer: Peer, now_ns: int) -> None:
+    def report_forged_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
         """Somebody who is no gateway spoke on behalf of another."""
         address = peer_of(peer.descriptor)[0]
         sender = self._clients.find(Route(route.routing_id), peer)
-        self._audit.note(
+        self._audit.record(
             AuditKind.GATEWAY_REFUSED,
             now_ns,
             subject=sender.key_id if sender is not None else peer.user_id,
@@ -144,13 +142,13 @@ class Admission:
             detail=f"on behalf of {route.on_behalf_of}",
         )
 
-    def _gateway(self, route: Route, peer: Peer, now_ns: int) -> Connection | None:
+    def _require_gateway(self, route: Route, peer: Peer, now_ns: int) -> FrontConnection | None:
         """The gateway that speaks, `None` for a client of its own."""
         if not route.on_behalf_of:
             return None
-        gateway = self.gateway(route.routing_id, peer)
+        gateway = self.find_gateway(route.routing_id, peer)
         if gateway is None:
-            self.forged(route, peer, now_ns)
+            self.report_forged_gateway(route, peer, now_ns)
             raise _RefusedError(
                 RefusalCode.GATEWAY_ONLY,
                 "only an admitted participant with role 'gateway' may speak on behalf of others",
@@ -158,7 +156,7 @@ class Admission:
             )
         return gateway
 
-    def _key_id(self, peer: Peer, hello: Hello, gateway: Connection | None) -> str:
+    def _make_key_id(self, peer: Peer, hello: Hello, gateway: FrontConnection | None) -> str:
         if gateway is None and peer.user_id:
             return peer.user_id
         if len(hello.secret) < SECRET_BYTES:
@@ -169,7 +167,7 @@ class Admission:
             )
         return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
-    def _roles(self, key_id: str, gateway: Connection | None) -> tuple[str, ...]:
+    def _find_roles(self, key_id: str, gateway: FrontConnection | None) -> tuple[str, ...]:
         """What the key may join as, empty for any role."""
         entry = self._keyring.find(gateway.key_id if gateway else key_id)
         if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
@@ -179,12 +177,12 @@ class Admission:
         roles = () if entry is None else entry.roles
         return roles if gateway is None else roles_behind(roles)
 
-    def _resume(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
+    def _find_resumed(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         if not hello.resume_token:
             return ""
         participant_id = self._tokens.find(hello.resume_token, key_id)
         if participant_id is None:
-            self._audit.note(
+            self._audit.record(
                 AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
             )
             raise _RefusedError(
@@ -192,7 +190,7 @@ class Admission:
             )
         return participant_id
 
-    def welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
+    def send_welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
         """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over. `tick_period_ns`: of
         the present scene."""
         connection = self._clients.by_number.get(admitted.connection)
@@ -233,11 +231,11 @@ class Admission:
             ),
         )
 
-    def left(self, participant_id: str) -> None:
+    def expire_tokens(self, participant_id: str) -> None:
         """A participant is gone for good: its tokens open nothing any more."""
         self._tokens.left(participant_id)
 
-    def confirmed(self, connection: Connection) -> None:
+    def confirm(self, connection: FrontConnection) -> None:
         """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
         if connection.hello.resume_token:
             self._tokens.retire(connection.hello.resume_token)

@@ -6,17 +6,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from iris_session.front.beacon import BeaconSender
-from iris_session.front.introduction import Introducer, Listeners
+from iris_session.front.introduction import IntroductionServer, Listeners
 from iris_session.front.service import Service
 from iris_session.link.config import FrontConfig, Ports
 from iris_session.link.interfaces import WILDCARDS, interfaces, public_host, reachable
 from iris_session.link.sockets import host_in_address
 from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.protocol.token_bucket import Drops
 
 
-class Facts(NamedTuple):
+class SessionFacts(NamedTuple):
     """What the introduction tells beside the beacon, as it is now. `server_key`: Z85, empty without encryption."""
 
     server_key: str
@@ -24,13 +24,13 @@ class Facts(NamedTuple):
     participants: Callable[[], int]
 
 
-def host_for_address(config: FrontConfig) -> str:
+def choose_address_host(config: FrontConfig) -> str:
     """What stands before `:PORT` in our address: an address of this machine, IPv6 in brackets."""
     host = config.hosts[0]
     return host_in_address(public_host(config.hosts, interfaces()) if host in WILDCARDS else host)
 
 
-def hosts_to_tell(config: FrontConfig) -> tuple[str, ...]:
+def list_reachable_hosts(config: FrontConfig) -> tuple[str, ...]:
     """The addresses under which others reach the session, best first; `advertise` before all others."""
     have = interfaces()
     covered = [one.address for one in reachable(config.hosts, have) if config.loopback or not one.loopback]
@@ -38,7 +38,9 @@ def hosts_to_tell(config: FrontConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys(told)) or config.hosts
 
 
-def announce(config: FrontConfig, ports: Ports, listeners: Listeners, drops: Drops, facts: Facts) -> list[Service]:
+def make_discovery_services(
+    config: FrontConfig, ports: Ports, listeners: Listeners, drops: Drops, facts: SessionFacts
+) -> list[Service]:
     """The services that make this session known."""
     beacon = Beacon(
         protocol=PROTOCOL_VERSION,
@@ -57,7 +59,7 @@ def announce(config: FrontConfig, ports: Ports, listeners: Listeners, drops: Dro
     def introduction() -> Introduction:
         return Introduction(beacon, facts.server_key, facts.pairing(), facts.participants())
 
-    services: list[Service] = [Introducer(listeners, introduction)]
+    services: list[Service] = [IntroductionServer(listeners, introduction)]
     if config.beacon_port:
         services.append(BeaconSender(beacon, config.hosts, config.beacon_port, drops, config.advertise))
     return services

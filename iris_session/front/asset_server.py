@@ -17,8 +17,8 @@ from typing import Final, NamedTuple
 import zmq
 
 from iris_session.assets.chunk_scheduler import ADVICE, AssetHub, Reader
-from iris_session.assets.mapped_files import AssetFiles
-from iris_session.front.media.connection_guard import MediaDoors
+from iris_session.assets.store import ServedAssets
+from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link.config import MILLISECOND, FrontConfig
 from iris_session.link.sockets import open_assets, readable, watch_tcp
 from iris_session.protocol.assets import AssetChunk, AssetRefused
@@ -27,7 +27,7 @@ from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.security import KeyPair, fingerprint
 from iris_session.security.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
-from iris_session.system.priority import made_below
+from iris_session.system.priority import run_at_low_priority
 
 IDLE_MS: Final = 50
 #: Requests taken, and chunks sent, before the rest is looked at.
@@ -45,19 +45,19 @@ REQUEST_BYTES: Final = 65_536
 
 
 #: A folder, with the addresses of what is served from it.
-Store = tuple[str, tuple[str, ...]]
+AssetFolder = tuple[str, tuple[str, ...]]
 
 
-class Table(NamedTuple):
+class AssetAccess(NamedTuple):
     """What the thread has to know, replaced as a whole. `listeners`: connections that may ask, with the key by which
     they come (empty without encryption); `marks`: keys that may connect; `stores`: what is served."""
 
     listeners: Mapping[int, str] = {}
     marks: frozenset[str] = frozenset()
-    stores: tuple[Store, ...] = ()
+    stores: tuple[AssetFolder, ...] = ()
 
 
-class Tallied(NamedTuple):
+class AssetCounters(NamedTuple):
     """Counters since the start, and readers that wait now. `reasons`: refusals and everything thrown away."""
 
     bytes: int
@@ -87,28 +87,28 @@ class AssetSockets:
         self.context.destroy(linger=0)
 
 
-def open_below(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
+def open_asset_sockets(config: FrontConfig, key: KeyPair | None) -> AssetSockets:
     """`AssetSockets` whose I/O thread gives way to all others. Raises `FrontError`."""
-    return made_below(lambda: AssetSockets(config, key))
+    return run_at_low_priority(lambda: AssetSockets(config, key))
 
 
 class AssetServer:
     """`publish`, `late_until_ns` and `tallied` are for other threads; everything else belongs to ours."""
 
-    def __init__(self, sockets: AssetSockets, doors: MediaDoors, now_ns: Callable[[], int]) -> None:
+    def __init__(self, sockets: AssetSockets, guard: ChannelGuard, now_ns: Callable[[], int]) -> None:
         self._sockets = sockets
         self._socket = sockets.socket
-        self._doors = doors
+        self._guard = guard
         self._now_ns = now_ns
         self._encrypted = sockets.zap is not None
-        self._files = AssetFiles()
-        self._hub = AssetHub(self._files.size)
-        self._table = self._taken = Table()
+        self._files = ServedAssets()
+        self._scheduler = AssetHub(self._files.size)
+        self._access = self._applied = AssetAccess()
         self._counts = {"bytes": 0, "chunks": 0, "requests": 0}
         self._reasons: dict[str, int] = {}
         self._lock = threading.Lock()  # of the counters
         self._stopping = False
-        self._said = ""
+        self._reported_fault = ""
         self._thread = threading.Thread(target=self._run, name="iris-assets", daemon=True)
         #: Session time until which the front's loop wants to be left alone.
         self.late_until_ns = 0
@@ -116,22 +116,24 @@ class AssetServer:
     def start(self) -> None:
         self._thread.start()
 
-    def publish(self, table: Table) -> None:
+    def set_access(self, access: AssetAccess) -> None:
         """Who may ask for what: whoever hears of it after this call, and asks then, is answered by it."""
-        self._table = table
+        self._access = access
 
-    def tallied(self) -> Tallied:
+    def read_counters(self) -> AssetCounters:
         with self._lock:
             counts = self._counts
             reasons = dict(self._reasons)
-            return Tallied(counts["bytes"], counts["chunks"], counts["requests"], self._hub.waiting, reasons)
+            return AssetCounters(
+                counts["bytes"], counts["chunks"], counts["requests"], self._scheduler.waiting, reasons
+            )
 
     def close(self) -> None:
         """Waits for the end of the thread, then frees the sockets."""
         self._stopping = True
         if self._thread.ident is not None:
             self._thread.join()
-        self._doors.close()
+        self._guard.close()
         self._sockets.close()
 
     # --- the thread --------------------------------------------------------------------------------------------------
@@ -141,16 +143,16 @@ class AssetServer:
             try:
                 self._serve()
             except Exception as error:  # a fault of ours: it costs what was under way, and assets alone
-                self._begin_anew(error)
+                self._recover(error)
 
-    def _begin_anew(self, error: Exception) -> None:
+    def _recover(self, error: Exception) -> None:
         """Counts every fault, and tells each the first time in a row. Readers ask again by new connections."""
-        for descriptor in self._hub.begin_anew():
-            self._doors.close_one(descriptor, "")
-        self._count(["assets_fault"])
-        if repr(error) != self._said:
-            self._said = repr(error)
-            text = f"iris-session: a fault in the thread of assets, which goes on: {self._said}\n"
+        for descriptor in self._scheduler.begin_anew():
+            self._guard.evict(descriptor, "")
+        self._count_reasons(["assets_fault"])
+        if repr(error) != self._reported_fault:
+            self._reported_fault = repr(error)
+            text = f"iris-session: a fault in the thread of assets, which goes on: {self._reported_fault}\n"
             print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
         time.sleep(FAULT_S)
 
@@ -160,17 +162,17 @@ class AssetServer:
             if one is not None:
                 poller.register(one, zmq.POLLIN)
         while not self._stopping:
-            poller.poll(self._patience_ms())
-            self._look_at_table()
+            poller.poll(self._poll_timeout_ms())
+            self._apply_access()
             if self._sockets.zap is not None:
-                answer_zap(self._sockets.zap, self._user_id)
-            self._come_and_gone()
-            self._count(self._doors.turn(self._now_ns()))
-            self._take_requests()
+                answer_zap(self._sockets.zap, self._authenticate)
+            self._read_connection_events()
+            self._count_reasons(self._guard.tick(self._now_ns()))
+            self._receive_requests()
             self._send_chunks()
 
-    def _patience_ms(self) -> int:
-        due_ns = self._hub.next_turn_ns()
+    def _poll_timeout_ms(self) -> int:
+        due_ns = self._scheduler.next_turn_ns()
         if due_ns is None:
             return IDLE_MS
         now_ns = self._now_ns()
@@ -178,40 +180,40 @@ class AssetServer:
             return YIELD_MS
         return min(IDLE_MS, max(0, -(-(due_ns - now_ns) // MILLISECOND)))
 
-    def _look_at_table(self) -> None:
-        table = self._table
-        if table is self._taken:
+    def _apply_access(self) -> None:
+        table = self._access
+        if table is self._applied:
             return
-        if table.stores != self._taken.stores:
+        if table.stores != self._applied.stores:
             self._files.serve(table.stores)
-        self._taken = table
-        for descriptor in self._hub.allow(table.listeners):
-            self._doors.close_one(descriptor, "")
+        self._applied = table
+        for descriptor in self._scheduler.allow(table.listeners):
+            self._guard.evict(descriptor, "")
 
-    def _user_id(self, request: list[bytes]) -> str:
+    def _authenticate(self, request: list[bytes]) -> str:
         mark = fingerprint(request[6]) if asks_with_curve(request) else ""
-        if mark in self._taken.marks:
+        if mark in self._applied.marks:
             return mark
-        self._count(["assets_unknown_key"])
+        self._count_reasons(["assets_unknown_key"])
         return ""
 
-    def _come_and_gone(self) -> None:
-        for descriptor in self._doors.read(self._now_ns()):
-            self._hub.left(descriptor)
+    def _read_connection_events(self) -> None:
+        for descriptor in self._guard.read_events(self._now_ns()):
+            self._scheduler.left(descriptor)
 
-    def _count(self, reasons: Iterable[str]) -> None:
+    def _count_reasons(self, reasons: Iterable[str]) -> None:
         for reason in filter(None, reasons):
             with self._lock:
                 self._reasons[reason] = self._reasons.get(reason, 0) + 1
 
     # --- what is asked -----------------------------------------------------------------------------------------------
 
-    def _take_requests(self) -> None:
+    def _receive_requests(self) -> None:
         for _ in range(ROUND):
             if not readable(self._socket):
                 return
             route = self._socket.recv(_DONTWAIT)
-            self._look_at_table()  # a scene that was told of since the last look may be what is asked for
+            self._apply_access()  # a scene that was told of since the last look may be what is asked for
             frame = self._socket.recv(_DONTWAIT, copy=False)
             lengths = [len(frame)]
             more = frame.more
@@ -223,13 +225,13 @@ class AssetServer:
                 descriptor = int(frame.get(zmq.SRCFD))
                 user = str(frame.get("User-Id")) if self._encrypted else ""
             except zmq.ZMQError:
-                self._count(["assets_unversioned_peer"])
+                self._count_reasons(["assets_unversioned_peer"])
                 continue
-            self._come_and_gone()
-            refused = self._take(route, descriptor, user, frame, single=len(lengths) == 1)
-            self._count([self._doors.heard(descriptor, user, lengths, counts=refused)])
+            self._read_connection_events()
+            refused = self._handle_request(route, descriptor, user, frame, single=len(lengths) == 1)
+            self._count_reasons([self._guard.record_message(descriptor, user, lengths, counts=refused)])
 
-    def _take(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
+    def _handle_request(self, route: bytes, descriptor: int, user: str, frame: zmq.Frame, *, single: bool) -> bool:
         """One message. True: it was refused."""
         now_ns = self._now_ns()
         request_id, address = 0, ""
@@ -243,19 +245,19 @@ class AssetServer:
             reason = AssetRefusal.MALFORMED
         else:
             request_id, address = request.request_id, request.address
-            reason = self._hub.ask(route, descriptor, user, request, now_ns)
+            reason = self._scheduler.ask(route, descriptor, user, request, now_ns)
         if reason:
-            self._refuse(route, request_id, address, reason)
+            self._queue_refusal(route, request_id, address, reason)
         return bool(reason)
 
-    def _refuse(self, route: bytes, request_id: int, address: str, reason: str) -> None:
+    def _queue_refusal(self, route: bytes, request_id: int, address: str, reason: str) -> None:
         """At once, or behind what the reader waits for."""
-        self._count([f"assets_{reason}"])
-        if self._hub.queues(route) or not self._told(route, _refusal(request_id, address, reason)):
-            kept = self._hub.refuse(route, request_id, address, reason)
-            self._count([] if kept else ["assets_refusal_unsent"])
+        self._count_reasons([f"assets_{reason}"])
+        if self._scheduler.queues(route) or not self._send_refusal(route, _refusal(request_id, address, reason)):
+            kept = self._scheduler.refuse(route, request_id, address, reason)
+            self._count_reasons([] if kept else ["assets_refusal_unsent"])
 
-    def _told(self, route: bytes, refusal: bytes) -> bool:
+    def _send_refusal(self, route: bytes, refusal: bytes) -> bool:
         """False: who is to be told reads nothing, or is gone."""
         try:
             self._socket.send_multipart((route, refusal), _DONTWAIT)
@@ -268,7 +270,7 @@ class AssetServer:
     def _send_chunks(self) -> None:
         late = self._now_ns() < self.late_until_ns
         for _ in range(1 if late else CHUNKS):
-            reader = self._hub.turn(self._now_ns())
+            reader = self._scheduler.turn(self._now_ns())
             if reader is None:
                 return
             self._send_chunk(reader)
@@ -287,12 +289,12 @@ class AssetServer:
                 self._socket.send(encode_asset_header(head), _MORE)
                 self._socket.send(chunk, _DONTWAIT, copy=False)
         except zmq.Again:
-            self._hub.full(reader, self._now_ns())
+            self._scheduler.full(reader, self._now_ns())
             return
         except zmq.ZMQError:  # gone; its end will be told of
-            self._hub.forget(reader.route)
+            self._scheduler.forget(reader.route)
             return
-        self._hub.sent(reader)
+        self._scheduler.sent(reader)
         if chunk is not None:
             with self._lock:
                 self._counts["bytes"] += wanted.length

@@ -14,13 +14,13 @@ from iris_session.link.config import MILLISECOND, SECOND
 from iris_session.link.interfaces import LOOPBACK_BROADCAST, Interface, interfaces, public_host, reachable
 from iris_session.protocol.codec import encode_beacon
 from iris_session.protocol.discovery import Beacon
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
-PERIOD_NS: Final = 200 * MILLISECOND
+BEACON_PERIOD_NS: Final = 200 * MILLISECOND
 #: Networks come and go: a laptop changes its Wi-Fi, a lease gives another address.
-LOOK_AGAIN_NS: Final = 2 * SECOND
+INTERFACES_PERIOD_NS: Final = 2 * SECOND
 #: The queue of the interface is full: the next beacon is 0.2 s away.
-_PASSES: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
+_TRANSIENT_ERRORS: Final = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
 
 
 class BeaconSender:
@@ -37,7 +37,7 @@ class BeaconSender:
         port: int,
         drops: Drops,
         advertise: str = "",
-        look: Callable[[], list[Interface]] = interfaces,
+        list_interfaces: Callable[[], list[Interface]] = interfaces,
     ) -> None:
         self.problems: dict[str, str] = {}
         self._beacon = beacon
@@ -45,20 +45,20 @@ class BeaconSender:
         self._port = port
         self._drops = drops
         self._advertise = advertise
-        self._look = look
+        self._list_interfaces = list_interfaces
         self._targets: list[tuple[str, bytes]] = []
         self._next_ns = self._next_look_ns = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._socket.setblocking(False)
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Sends what is due at session time `now_ns`; never waits."""
         if now_ns < self._next_ns:
             return
-        self._next_ns = now_ns + PERIOD_NS
+        self._next_ns = now_ns + BEACON_PERIOD_NS
         if now_ns >= self._next_look_ns:
-            self._next_look_ns = now_ns + LOOK_AGAIN_NS
+            self._next_look_ns = now_ns + INTERFACES_PERIOD_NS
             self._targets = self._find_targets()
         for broadcast, datagram in self._targets:
             self._send(broadcast, datagram)
@@ -68,7 +68,7 @@ class BeaconSender:
 
     def _find_targets(self) -> list[tuple[str, bytes]]:
         """Broadcast address and datagram per network, and this machine itself, where our own address will do."""
-        have = self._look()
+        have = self._list_interfaces()
         targets = {LOOPBACK_BROADCAST: self._datagram(public_host(self._hosts, have))}
         for one in reachable(self._hosts, have):
             if one.broadcast and not one.loopback:
@@ -82,7 +82,7 @@ class BeaconSender:
         try:
             self._socket.sendto(datagram, (broadcast, self._port))
         except OSError as error:
-            if error.errno not in _PASSES and broadcast not in self.problems:
+            if error.errno not in _TRANSIENT_ERRORS and broadcast not in self.problems:
                 self.problems[broadcast] = error.strerror or str(error)
                 self._drops.count("beacon_unsent")
                 text = f"no beacons to {broadcast} ({self.problems[broadcast]}): join by address there"

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 
 from iris_session.link.config import FrontLimits
-from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, Sample, TrackingEpoch
+from iris_session.protocol.client_messages import Bye, EStop, Heartbeat, RemoveParticipant, Sample, TrackingEpoch
 from iris_session.protocol.entries import (
     HOST,
     URGENT,
@@ -25,15 +25,14 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AlarmKind
-from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
 
 #: A gripper closed further than this counts as pressed: crossing it is an edge.
 GRIPPER_EDGE = 0.5
 
 
-def _differs_by_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
+def _has_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
     """True when merging sample `a` into `b` would lose more than motion."""
     return (
         a.clutch is not b.clutch
@@ -52,7 +51,7 @@ def _differs_by_edge(old: Entry, new: Entry, a: Sample, b: Sample) -> bool:
     )
 
 
-def _replaces(message: EntryMessage) -> Hashable:
+def _replacement_key(message: EntryMessage) -> Hashable:
     """What an entry takes the place of while it waits, `None` for nothing. Names of anchors are the session's own, so
     there are few."""
     if isinstance(message, Heartbeat | TrackingEpoch):
@@ -86,7 +85,7 @@ class Coalescer:
         self._drops = drops
         self._lanes: dict[int, _Lane] = {}
         self._arrivals = 0
-        self._first = 0
+        self._next_connection = 0
         self.urgent = False
 
     def __bool__(self) -> bool:
@@ -108,7 +107,7 @@ class Coalescer:
             return self._offer_urgent(lane, item)
         if isinstance(message, AlignmentAlarm) and message.kind == AlarmKind.JUMP:
             return self._offer_jump(lane, item)
-        replaces = _replaces(message)
+        replaces = _replacement_key(message)
         if replaces is not None:
             lane.newest[replaces] = item
             return True
@@ -128,7 +127,7 @@ class Coalescer:
             lane.samples[sample.device] = [item]
             return True
         old = waiting[-1][1]
-        if not _differs_by_edge(old, item[1], old.message, sample):  # type: ignore[arg-type]
+        if not _has_edge(old, item[1], old.message, sample):  # type: ignore[arg-type]
             waiting[-1] = item
             return True
         if len(waiting) >= self._limits.pending_samples:
@@ -143,7 +142,7 @@ class Coalescer:
         """An e-stop or loss is never dropped for want of room: a second one of the same connection says nothing new."""
         message = item[1].message
         if isinstance(message, Lost) and any(isinstance(e.message, Join) for _, e in lane.messages):
-            self.forget(item[1].connection)  # the authority never heard of this connection
+            self.remove_connection(item[1].connection)  # the authority never heard of this connection
             return True
         if isinstance(message, EStop | Lost) and any(type(e.message) is type(message) for _, e in lane.urgent):
             return True
@@ -181,7 +180,7 @@ class Coalescer:
         self.urgent = True
         return True
 
-    def take(self, urgent_only: bool = False) -> list[Entry]:
+    def take_batch(self, urgent_only: bool = False) -> list[Entry]:
         """The next batch, at most `batch_entries`: urgent entries first, then connections in turn, each in order of
         arrival. What does not fit stays, and its connection comes first the next time."""
         urgent = [item for lane in self._lanes.values() for item in lane.urgent]
@@ -193,26 +192,26 @@ class Coalescer:
         if urgent_only:
             return batch
         order = sorted(self._lanes)
-        start = next((i for i, number in enumerate(order) if number >= self._first), 0)
+        start = next((i for i, number in enumerate(order) if number >= self._next_connection), 0)
         rest: list[tuple[int, Entry]] = []
-        self._first = 0
+        self._next_connection = 0
         for number in order[start:] + order[:start]:
             if rest and len(batch) + len(rest) >= self._limits.batch_entries:
-                self._first = number
+                self._next_connection = number
                 break
-            rest += self._empty(self._lanes.pop(number))
+            rest += self._list_pending(self._lanes.pop(number))
         rest.sort(key=_arrival)
         return batch + [entry for _, entry in rest]
 
     @staticmethod
-    def _empty(lane: _Lane) -> list[tuple[int, Entry]]:
+    def _list_pending(lane: _Lane) -> list[tuple[int, Entry]]:
         items = lane.messages
         for waiting in lane.samples.values():
             items += waiting
         items += lane.newest.values()
         return items
 
-    def forget(self, connection: int) -> None:
+    def remove_connection(self, connection: int) -> None:
         """The authority is done with a connection, or never heard of it: nothing that waits of it matters any more, but
         that it stops the session."""
         lane = self._lanes.pop(connection, None)

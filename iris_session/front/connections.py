@@ -1,55 +1,70 @@
-"""Connections as the front knows them, and sending to them without ever waiting.
+"""Connections of the front, the table of them, and sending to them without waiting.
 
-A connection is one accepted `hello`. It is found by its route (ZeroMQ routing id, and for those behind a gateway the
-name that the gateway gave), but it is bound to the TCP connection and key that said `hello`: another peer that comes
-to own the same routing id is a stranger.
+A connection is one accepted `hello`. It is found by its route: the ZeroMQ routing id and, behind a gateway, the name
+that the gateway gave. It is bound to the TCP connection and key that said `hello`: another peer with the same routing
+id does not get it. Limits on TCP connections are in `connection_guard`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
 import zmq
 
-from iris_session.front.traffic import Traffic
 from iris_session.link.config import FrontLimits
+from iris_session.link.sockets import tcp_counts
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry
-from iris_session.protocol.limits import RateLimiter
+from iris_session.protocol.limits import Drops, RateLimiter, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import ServerMessage
-from iris_session.protocol.token_bucket import Drops, TokenBucket
 
 _encoder = msgspec.msgpack.Encoder()
-#: Connections that were given up and may still stop the session.
-MAX_GIVEN_UP: Final = 256
+#: Disconnected connections that may still stop the session.
+MAX_KEPT: Final = 256
+#: ZMTP 3: flags and length before a frame, the length in one byte or eight.
+_SHORT: Final = 255
+_SHORT_HEADER: Final = 2
+_LONG_HEADER: Final = 9
+#: CurveZMQ: name of the command, nonce, authenticator and flags around every frame.
+_CURVE: Final = 8 + 8 + 16 + 1
 
 
 class Route(NamedTuple):
-    """Where a message came from. `on_behalf_of` is empty but for participants behind a gateway."""
+    """Where a message came from. `on_behalf_of` is empty except for participants behind a gateway."""
 
     routing_id: bytes
     on_behalf_of: str = ""
 
 
 class Peer(NamedTuple):
-    """The TCP connection and the CURVE user id (fingerprint, empty on plain sockets) that a message came by."""
+    """TCP connection and CURVE user id (a fingerprint, empty without encryption) by which a message came."""
 
     descriptor: int
     user_id: str
 
 
-class Connection:
-    """One accepted `hello`, until it is lost or dropped."""
+class FrontConnection:
+    """One accepted `hello`, until the connection is removed.
+
+    Attributes:
+        number: Connection number, which the protocol calls connection epoch.
+        gateway: Number of the gateway that speaks for this connection, 0 for none.
+        participant_id: Assigned by the authority, empty before.
+        confirmed: A message with this connection epoch has come, so the client has its `Welcome`.
+        flood_last_ns, flood_since_ns: When a rate limit was last exceeded, and since when without a pause.
+        late_epoch: The newest tracking epoch that came above its rate limit.
+        prefix: Encoded start of every `ServerEnvelope` to this connection.
+    """
 
     __slots__ = (
         "address",
         "admitted",
         "confirmed",
+        "consecutive_drops",
         "denials",
-        "drops_in_a_row",
         "faults",
         "flood_last_ns",
         "flood_since_ns",
@@ -77,120 +92,166 @@ class Connection:
         self.hello = hello
         self.gateway = gateway
         self.admitted = False
-        self.participant_id = ""  # from the authority, once admitted
-        self.confirmed = False  # a message with its connection epoch has come: it has its `Welcome`
+        self.participant_id = ""
+        self.confirmed = False
         self.last_heard_ns = 0
-        self.drops_in_a_row = 0
-        self.flood_last_ns = self.flood_since_ns = 0  # above a rate limit: when last, and without a pause since when
+        self.consecutive_drops = 0
+        self.flood_last_ns = self.flood_since_ns = 0
         self.faults = TokenBucket(2.0, 5)
-        self.denials = TokenBucket(20.0, 40)  # as many as requests of one kind in an honest hand
-        self.late_epoch: Entry | None = None  # the newest tracking epoch that came above its rate
+        self.denials = TokenBucket(20.0, 40)  # as many as an honest client makes requests of one kind
+        self.late_epoch: Entry | None = None
         self.rates = RateLimiter()
-        self.prefix = server_prefix(number)
+        self.prefix = encode_envelope_prefix(number)
 
 
-class ClientTable:
+class ConnectionTable:
     """All connections, by number and by route."""
 
     def __init__(self) -> None:
-        self.by_number: dict[int, Connection] = {}
-        self.by_route: dict[Route, Connection] = {}
-        self._given_up: dict[tuple[Route, Peer], Connection] = {}
+        self.by_number: dict[int, FrontConnection] = {}
+        self.by_route: dict[Route, FrontConnection] = {}
+        self._kept: dict[tuple[Route, Peer], FrontConnection] = {}
 
     def __len__(self) -> int:
         return len(self.by_number)
 
-    def add(self, connection: Connection) -> None:
+    def add(self, connection: FrontConnection) -> None:
         self.by_number[connection.number] = connection
         self.by_route[connection.route] = connection
 
-    def remove(self, connection: Connection) -> None:
+    def remove(self, connection: FrontConnection) -> None:
         self.by_number.pop(connection.number, None)
         if self.by_route.get(connection.route) is connection:
             del self.by_route[connection.route]
 
-    def find(self, route: Route, peer: Peer) -> Connection | None:
-        """The connection of a route, if it still is the peer that said `hello`."""
+    def find(self, route: Route, peer: Peer) -> FrontConnection | None:
+        """Return the connection of a route, if its peer is the one that said `hello`."""
         connection = self.by_route.get(route)
         return connection if connection is not None and connection.peer == peer else None
 
-    def give_up(self, connection: Connection) -> None:
-        """It counts no more, but who it was may not know that yet."""
-        self._given_up.pop((connection.route, connection.peer), None)
-        while len(self._given_up) >= MAX_GIVEN_UP:
-            del self._given_up[next(iter(self._given_up))]
-        self._given_up[connection.route, connection.peer] = connection
-
-    def given_up(self, route: Route, peer: Peer) -> Connection | None:
-        """The connection that this peer lost lately."""
-        return self._given_up.get((route, peer))
-
-    def forget_given_up(self, heard_before_ns: int) -> None:
-        """Who has said nothing since then is nobody any more: its TCP connection may be closed like a stranger's."""
-        for key, connection in list(self._given_up.items()):
-            if connection.last_heard_ns < heard_before_ns:
-                del self._given_up[key]
-
-    @property
-    def lost_lately(self) -> Collection[Connection]:
-        """Connections that were given up while their TCP connections stood."""
-        return self._given_up.values()
-
-    def closed(self, descriptor: int, address: tuple[str, int]) -> None:
-        """A TCP connection was closed. `address`: of the peer that has its descriptor now."""
-        for key, connection in list(self._given_up.items()):
-            if key[1].descriptor == descriptor and (connection.address != address or not address[1]):
-                del self._given_up[key]
-
-    def behind(self, gateway: Connection) -> list[Connection]:
-        """Connections that a gateway speaks for."""
+    def list_behind(self, gateway: FrontConnection) -> list[FrontConnection]:
+        """Return the connections that a gateway speaks for."""
         return [c for c in self.by_number.values() if c.gateway == gateway.number]
 
+    # Connections that were disconnected while their TCP connections stay open. Their clients may not know yet, and an
+    # e-stop of theirs still counts.
 
-def server_prefix(connection_epoch: int) -> bytes:
-    """The bytes of a `ServerEnvelope` before its message: one encoded message serves every connection."""
+    @property
+    def kept(self) -> Collection[FrontConnection]:
+        """Disconnected connections whose TCP connections are open."""
+        return self._kept.values()
+
+    def keep_for_estop(self, connection: FrontConnection) -> None:
+        """Keep a disconnected connection, because its client may still send an e-stop."""
+        self._kept.pop((connection.route, connection.peer), None)
+        while len(self._kept) >= MAX_KEPT:
+            del self._kept[next(iter(self._kept))]
+        self._kept[connection.route, connection.peer] = connection
+
+    def find_kept(self, route: Route, peer: Peer) -> FrontConnection | None:
+        """Return the disconnected connection of a peer."""
+        return self._kept.get((route, peer))
+
+    def expire_kept(self, heard_before_ns: int) -> None:
+        """Remove kept connections that have sent nothing since then."""
+        for key, connection in list(self._kept.items()):
+            if connection.last_heard_ns < heard_before_ns:
+                del self._kept[key]
+
+    def remove_closed(self, descriptor: int, address: tuple[str, int]) -> None:
+        """Remove kept connections of a closed TCP connection. `address`: of the peer that has its descriptor now."""
+        for key, connection in list(self._kept.items()):
+            if key[1].descriptor == descriptor and (connection.address != address or not address[1]):
+                del self._kept[key]
+
+
+def encode_envelope_prefix(connection_epoch: int) -> bytes:
+    """Encode a `ServerEnvelope` up to its message, so that one encoded message serves every connection."""
     return b"\x93" + _encoder.encode(PROTOCOL_VERSION) + _encoder.encode(connection_epoch)
 
 
+class TrafficCounter:
+    """Count the bytes that are pending in libzmq for and from each TCP connection, which libzmq does not report.
+
+    What was handed to libzmq, less what the peer has acknowledged to the system, waits to be sent. What the system has
+    received, less what was read, waits to be read. Both are off by the handshake, which does not matter when megabytes
+    are looked for. `curve`: whether the socket is encrypted.
+    """
+
+    def __init__(self, *, curve: bool = False) -> None:
+        self._overhead = _CURVE if curve else 0
+        self._sent: dict[int, int] = {}
+        self._received: dict[int, int] = {}
+
+    def reset(self, descriptor: int) -> None:
+        """Start anew for a descriptor: a TCP connection was accepted or has ended."""
+        self._sent.pop(descriptor, None)
+        self._received.pop(descriptor, None)
+
+    def count_sent(self, descriptor: int, frames: Iterable[bytes]) -> None:
+        """Count a message that was handed to libzmq for a connection."""
+        self._sent[descriptor] = self._sent.get(descriptor, 0) + sum(self._wire_length(len(one)) for one in frames)
+
+    def count_received(self, descriptor: int, length: int) -> None:
+        """Count a frame that was read from a connection."""
+        self._received[descriptor] = self._received.get(descriptor, 0) + self._wire_length(length)
+
+    def pending_bytes(self, descriptor: int) -> int:
+        """Return the bytes pending in both directions, 0 where the system does not count them."""
+        counts = tcp_counts(descriptor)
+        if counts is None:
+            return 0
+        to_send = self._sent.get(descriptor, 0) - counts.acknowledged
+        to_read = counts.received - self._received.get(descriptor, 0)
+        return max(0, to_send) + max(0, to_read)
+
+    def _wire_length(self, length: int) -> int:
+        length += self._overhead
+        return length + (_SHORT_HEADER if length <= _SHORT else _LONG_HEADER)
+
+
 class Outbox:
-    """Sends on the control socket. What a socket does not take at once is dropped and counted."""
+    """Send on the control socket. A message for which a send queue has no room is dropped and counted.
+
+    Attributes:
+        failed: Reason by number of connections found slow while sending. The loop disconnects them.
+    """
 
     def __init__(
-        self, control: zmq.Socket[bytes], limits: FrontLimits, drops: Drops, traffic: Traffic | None = None
+        self, control: zmq.Socket[bytes], limits: FrontLimits, drops: Drops, traffic: TrafficCounter | None = None
     ) -> None:
         self._control = control
         self._limits = limits
         self._drops = drops
-        self._traffic = traffic or Traffic()
-        #: Connections found gone or too slow while sending, with the reason; the loop takes leave of them.
+        self._traffic = traffic or TrafficCounter()
         self.failed: dict[int, str] = {}
 
-    def send(self, connection: Connection, message: ServerMessage, *bulk: bytes) -> bool:
-        """Sends one message, and bulk frames after it."""
+    def send(self, connection: FrontConnection, message: ServerMessage, *bulk: bytes) -> bool:
+        """Send one message, and bulk frames after it. Return whether there was room."""
         return self.send_encoded(connection, _encoder.encode(message), bulk)
 
-    def send_encoded(self, connection: Connection, message: bytes, bulk: Sequence[bytes] = ()) -> bool:
-        """Sends an encoded message. A connection that loses `slow_drops` messages in a row is listed as slow."""
+    def send_encoded(self, connection: FrontConnection, message: bytes, bulk: Sequence[bytes] = ()) -> bool:
+        """Send an encoded message. A connection that loses `slow_drops` messages in a row is listed as slow."""
         envelope = connection.prefix + message
         if self._send(connection.route, envelope, bulk):
-            self._traffic.handed(connection.peer.descriptor, (envelope, *bulk))
-            connection.drops_in_a_row = 0
+            self._traffic.count_sent(connection.peer.descriptor, (envelope, *bulk))
+            connection.consecutive_drops = 0
             return True
-        connection.drops_in_a_row += 1
+        connection.consecutive_drops += 1
         self._drops.count("send_queue_full", connection.number)
-        if connection.drops_in_a_row >= self._limits.slow_drops:
+        if connection.consecutive_drops >= self._limits.slow_drops:
             self.failed.setdefault(connection.number, "slow")
         return False
 
     def send_to_route(self, route: Route, message: ServerMessage) -> None:
-        """Sends to somebody who has no connection number: a refusal, or a fault before `hello`."""
-        if not self._send(route, server_prefix(0) + _encoder.encode(message), ()):
+        """Send to a peer without a connection number: a refusal, or a fault before `hello`."""
+        if not self._send(route, encode_envelope_prefix(0) + _encoder.encode(message), ()):
             self._drops.count("send_queue_full")
 
     def _send(self, route: Route, envelope: bytes, bulk: Sequence[bytes]) -> bool:
         frames = [route.routing_id, envelope, *bulk]
         if route.on_behalf_of:
-            frames.append(route.on_behalf_of.encode())  # last frame: whom of those behind the gateway this is for
+            frames.append(route.on_behalf_of.encode())  # last frame: the recipient behind the gateway
         try:
             self._control.send_multipart(frames, zmq.DONTWAIT)
         except zmq.ZMQError as error:
@@ -201,5 +262,5 @@ class Outbox:
 
 
 def encode_message(message: ServerMessage) -> bytes:
-    """Bytes for `Outbox.send_encoded`."""
+    """Encode a message for `Outbox.send_encoded`."""
     return _encoder.encode(message)

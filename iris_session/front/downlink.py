@@ -7,13 +7,14 @@ from collections.abc import Callable
 import msgspec
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
-from iris_session.front.connections import ClientTable, Connection, Outbox, encode_message
-from iris_session.front.revocation import Revocation
+from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, encode_message
+from iris_session.front.revocation import RevocationService
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.sockets import readable
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
     Event,
@@ -24,9 +25,8 @@ from iris_session.protocol.server_messages import (
     Snapshot,
 )
 from iris_session.protocol.steps import Outgoing
-from iris_session.protocol.token_bucket import Drops
 
-_BOUND = 64  # messages taken at once
+_MAX_MESSAGES = 64  # messages taken at once
 #: Why a director ends a participation: nobody joins again by itself after that.
 REMOVALS = ("removed", "revoked")
 
@@ -42,15 +42,15 @@ class Downlink:
     def __init__(
         self,
         socket: zmq.Socket[bytes],
-        clients: ClientTable,
+        clients: ConnectionTable,
         outbox: Outbox,
         admission: Admission,
         publisher: StatePublisher,
         drops: Drops,
         session_ns: Callable[[], int],
-        forget: Callable[[Connection, str], None],
-        revocation: Revocation,
-        anchoring: Anchoring,
+        forget: Callable[[FrontConnection, str], None],
+        revocation: RevocationService,
+        alignment: AlignmentService,
         on_scene: Callable[[], None],
     ) -> None:
         self._socket = socket
@@ -62,7 +62,7 @@ class Downlink:
         self._session_ns = session_ns
         self._forget = forget
         self._revocation = revocation
-        self._anchoring = anchoring
+        self._alignment = alignment
         self._on_scene = on_scene
         self.heard_ns = 0
         self.acknowledged = 0
@@ -74,7 +74,7 @@ class Downlink:
         if not readable(self._socket):
             return
         waiting = [self._socket.recv_multipart()]
-        while len(waiting) < _BOUND and readable(self._socket):
+        while len(waiting) < _MAX_MESSAGES and readable(self._socket):
             waiting.append(self._socket.recv_multipart())
         self.heard_ns = self._session_ns()
         states = [i for i, frames in enumerate(waiting) if frames[0] == link.STATE]
@@ -103,7 +103,7 @@ class Downlink:
             except msgspec.ValidationError:  # beyond a limit of the protocol: no client would have taken it either
                 self._drops.count("decision_invalid")
                 return
-            self._decided(decided)
+            self._handle_decision(decided)
         elif kind == link.PRESENCE:
             self._publisher.publish_presence(self.heard_ns, frames[1])
         elif kind == link.SCENE:
@@ -114,27 +114,27 @@ class Downlink:
         elif kind == link.END:
             self.ended = True
 
-    def _decided(self, decided: link.Decided) -> None:
+    def _handle_decision(self, decided: link.Decided) -> None:
         """Welcomes, answers, events, then snapshots: those are of the end of the step, with its events. Who takes part
         already gets the events first, because a client passes over those that its snapshot contains."""
         for admitted in decided.admitted:
-            self._admission.welcome(admitted, self._session_ns(), self._publisher.scene.tick_period_ns)
+            self._admission.send_welcome(admitted, self._session_ns(), self._publisher.scene.tick_period_ns)
         snapshots = [outgoing for outgoing in decided.outgoing if isinstance(outgoing.message, Snapshot)]
         for outgoing in decided.outgoing:
             if not isinstance(outgoing.message, Snapshot):
-                self._answer(outgoing)
+                self._send_outgoing(outgoing)
         for event in decided.events:
             self.broadcast(event)
-            self._anchoring.heard(event.body)
+            self._alignment.process_event(event.body)
             if isinstance(event.body, ParticipantLeft) and not event.body.grace:
-                self._admission.left(event.body.participant)
+                self._admission.expire_tokens(event.body.participant)
         for outgoing in snapshots:
-            self._answer(outgoing)
+            self._send_outgoing(outgoing)
         for dropped in decided.dropped:
             connection = self._clients.by_number.get(dropped.connection)
             if dropped.reason in REMOVALS and connection is not None:
                 text = f"a director {dropped.reason} this participant"
-                self._revocation.remove(connection, text, self.heard_ns, dropped.reason)
+                self._revocation.disconnect(connection, text, self.heard_ns, dropped.reason)
                 self._forget(connection, dropped.reason)
             elif connection is not None:
                 text = f"the session let this connection go: {dropped.reason}"
@@ -143,15 +143,15 @@ class Downlink:
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, self.heard_ns)
 
-    def _answer(self, outgoing: Outgoing) -> None:
+    def _send_outgoing(self, outgoing: Outgoing) -> None:
         message: ServerMessage = outgoing.message
         connection = self._clients.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
             # What only the front knows: the scene, and the poses of the newest state frame.
-            self._anchoring.shown(message.participants)
-            state_seq, poses = self._publisher.keyframe()
+            self._alignment.process_snapshot(message.participants)
+            state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
             filled = msgspec.structs.replace(
                 message, scene_hash=scene.scene_hash, robots=scene.robots, bodies=scene.bodies, state_seq=state_seq

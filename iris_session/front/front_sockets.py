@@ -8,8 +8,8 @@ from typing import NamedTuple
 import msgspec
 import zmq
 
-from iris_session.front.announce import host_for_address, hosts_to_tell
-from iris_session.front.asset_server import AssetSockets, open_below
+from iris_session.front.announce import choose_address_host, list_reachable_hosts
+from iris_session.front.asset_server import AssetSockets, open_asset_sockets
 from iris_session.front.introduction import Listeners, open_with_introduction
 from iris_session.link import messages as link
 from iris_session.link.config import FrontError, FrontStart, Ports
@@ -23,7 +23,7 @@ from iris_session.link.sockets import (
     open_state,
     watch_tcp,
 )
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security.keyring import open_keyring
 from iris_session.security.zap import Authenticator
 
@@ -73,7 +73,7 @@ class FrontSockets:
             self.state = self.open_state(config.state_port)
             media = open_media(self.context, config, key)
             ingest = open_ingest(self.context, config, key)
-            self.assets = open_below(config, key)
+            self.assets = open_asset_sockets(config, key)
         except FrontError:
             for listener in self.listeners:
                 listener.close()
@@ -84,11 +84,11 @@ class FrontSockets:
         self.local_ingest = open_local_ingest(self.context, endpoint) if endpoint else None
         self.control = Watched(control, watch_tcp(control, "control"))
         self.ports = Ports(
-            host_for_address(config),
+            choose_address_host(config),
             bound_port(control),
             bound_port(self.state.socket),
             key.fingerprint if key else "",
-            hosts_to_tell(config),
+            list_reachable_hosts(config),
             bound_port(media),
             bound_port(ingest),
             bound_port(self.assets.socket),

@@ -16,26 +16,26 @@ from iris_session.protocol.codec import encode_introduction
 from iris_session.protocol.discovery import INTRODUCTION_OFFSET, Introduction
 
 #: Connections answered in one turn of the loop (every 10 ms): the rest waits in the system's queue, which is bounded.
-ROUND: Final = 24
+ANSWERS_PER_TICK: Final = 24
 BACKLOG: Final = 256
 #: Attempts at finding two free neighbouring ports.
-TRIES: Final = 50
+MAX_PORT_ATTEMPTS: Final = 50
 #: Larger than any introduction: what the system does not take at once is not sent.
 SEND_BUFFER_BYTES: Final = 16_384
 T = TypeVar("T")
 Listeners = Sequence[socket.socket]
 
 
-class Introducer:
+class IntroductionServer:
     """A service of the front. `introduction` gives what is said now."""
 
     def __init__(self, listeners: Listeners, introduction: Callable[[], Introduction]) -> None:
         self._listeners = listeners
         self._introduction = introduction
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Answers up to `ROUND` of those who wait."""
-        left = ROUND
+        left = ANSWERS_PER_TICK
         said = b""
         for listener in self._listeners:
             while left:
@@ -54,12 +54,12 @@ class Introducer:
             listener.close()
 
 
-def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
+def open_listeners(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """Listening sockets on every host, the same port; 0: any free one. Raises `FrontError`."""
     opened: list[socket.socket] = []
     try:
         for host in hosts:
-            opened.append(_listen(host, port or (opened[0].getsockname()[1] if opened else 0)))
+            opened.append(_open_listener(host, port or (opened[0].getsockname()[1] if opened else 0)))
     except OSError as error:
         for listener in opened:
             listener.close()
@@ -76,8 +76,8 @@ def open_with_introduction(
 
     With port 0, two free neighbours are looked for. Raises `FrontError`: a port in use, an address that is not ours.
     """
-    for attempt in range(TRIES):
-        listeners = listen(hosts, control_port + INTRODUCTION_OFFSET if control_port else 0)
+    for attempt in range(MAX_PORT_ATTEMPTS):
+        listeners = open_listeners(hosts, control_port + INTRODUCTION_OFFSET if control_port else 0)
         port = listeners[0].getsockname()[1] - INTRODUCTION_OFFSET
         try:
             return open_control(port), listeners
@@ -85,12 +85,12 @@ def open_with_introduction(
             for listener in listeners:
                 listener.close()
             in_use = isinstance(error, PortInUseError)
-            if control_port or not in_use or attempt == TRIES - 1:
+            if control_port or not in_use or attempt == MAX_PORT_ATTEMPTS - 1:
                 raise
     raise AssertionError("unreachable")
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _open_listener(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     try:

@@ -11,39 +11,36 @@ import time
 
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
-from iris_session.front.announce import Facts, announce
+from iris_session.front.announce import SessionFacts, make_discovery_services
 from iris_session.front.asset_server import REQUEST_BYTES, AssetServer
-from iris_session.front.asset_service import AssetDesk
+from iris_session.front.asset_service import AssetService
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import Doors
-from iris_session.front.connections import ClientTable, Outbox, Peer
-from iris_session.front.disconnects import Departures
+from iris_session.front.connection_guard import ChannelGuard, ConnectionGuard, MemoryGuard
+from iris_session.front.connections import ConnectionTable, Outbox, Peer, TrafficCounter
+from iris_session.front.disconnects import DisconnectHandler
 from iris_session.front.downlink import Downlink
 from iris_session.front.front_sockets import FrontSockets
 from iris_session.front.intake import Intake, RawFeed
-from iris_session.front.media.connection_guard import MediaDoors
 from iris_session.front.media.proxy import MediaProxy
-from iris_session.front.media.service import MediaDesk
-from iris_session.front.memory import MemoryWatch
-from iris_session.front.pairing import PairingDesk
-from iris_session.front.revocation import Revocation
+from iris_session.front.media.service import MediaService
+from iris_session.front.pairing import PairingService
+from iris_session.front.revocation import RevocationService
 from iris_session.front.service import Service
-from iris_session.front.session_note import NoteKeeper
+from iris_session.front.session_note import SessionNoteService
 from iris_session.front.state_publisher import StatePublisher
-from iris_session.front.status import StatusDesk, Telling
-from iris_session.front.traffic import Traffic
+from iris_session.front.status import StatusService, Telling
 from iris_session.front.uplink import Uplink
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND, FrontStart
 from iris_session.link.sockets import readable
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.resume_tokens import ResumeTokens
-from iris_session.system.parent import parent_is
+from iris_session.system.process import is_parent
 
 #: Messages of clients handled before the link is looked at again: about 0.2 ms.
 ROUND = 8
@@ -74,17 +71,17 @@ class Front:
         config = self._config = start.config
         self._services: list[Service] = []  # in the order of their turns
         self._drops = Drops()
-        self._clients = ClientTable()
+        self._clients = ConnectionTable()
         sockets = self._sockets = FrontSockets(start, self._drops, self._key_refused)
         self._link, self._control = sockets.link, sockets.control.socket
         self._keyring = sockets.keyring
-        self._traffic = Traffic(curve=self._keyring.key is not None)
+        self._traffic = TrafficCounter(curve=self._keyring.key is not None)
         self._outbox = Outbox(self._control, config.limits, self._drops, self._traffic)
         self._tokens = ResumeTokens(config.limits.resume_tokens, start.handback)
         self._coalescer = Coalescer(config.limits, self._drops)
         self._audit = AuditTrail(self._coalescer.offer)
-        doors = self._doors = Doors(self._clients, self._drops, self._audit, config.limits, self._traffic)
-        doors.watch_state(*sockets.state)
+        guard = self._guard = ConnectionGuard(self._clients, self._drops, self._audit, config.limits, self._traffic)
+        guard.watch_state_socket(*sockets.state)
         admission = self._admission = Admission(
             config,
             sockets.ports,
@@ -94,17 +91,24 @@ class Front:
             self._tokens,
             self._keyring,
             self._audit,
-            doors,
+            guard,
         )
-        self._pairing = PairingDesk(self._keyring, self._outbox, self._audit, self._drops)
+        self._pairing = PairingService(self._keyring, self._outbox, self._audit, self._drops)
         raw = RawFeed(sockets.context, config.recorder_endpoint, self._drops)
-        self._status = StatusDesk(config, self._clients, self._outbox, self._drops, self._telling)
+        self._status = StatusService(config, self._clients, self._outbox, self._drops, self._telling)
         self._media = self._make_media()
-        self._status.media_row = self._media.row
-        anchoring = Anchoring(config, self._clients, self._coalescer.offer, self._drops)
-        self._status.alignment_report = anchoring.report
-        memory = MemoryWatch(config.limits.memory_bytes, lambda: doors.shed(self._give_way), self._shed)
-        self._services += [self._keyring, self._status, self._media, doors, memory]
+        self._status.media_row = self._media.report_participant
+        alignment = AlignmentService(
+            self._coalescer.offer,
+            self._drops,
+            anchors=config.anchors,
+            anchor_sizes=config.anchor_sizes,
+            proposal_period_ns=config.proposal_period_ns,
+            max_connections=config.limits.connections,
+        )
+        self._status.alignment_report = alignment.complete_report
+        memory = MemoryGuard(config.limits.memory_bytes, lambda: guard.evict_for_memory(self._give_way), self._shed)
+        self._services += [self._keyring, self._status, self._media, guard, memory]
         self._intake = Intake(
             config,
             self._clients,
@@ -113,14 +117,14 @@ class Front:
             self._coalescer,
             raw,
             self._drops,
-            self._session_ns,
+            self.now_ns,
             self._status,
             self._pairing,
             self._audit,
-            doors,
-            anchoring,
+            guard,
+            alignment,
         )
-        departures = self._departures = Departures(
+        departures = self._departures = DisconnectHandler(
             sockets.control.monitor,
             self._clients,
             self._outbox,
@@ -128,13 +132,13 @@ class Front:
             self._coalescer,
             self._drops,
             self._status,
-            anchoring,
-            self._session_ns,
-            doors,
+            alignment,
+            self.now_ns,
+            guard,
         )
-        first_seq = 1 + (self._session_ns() // SEQ_NS if start.handback else 0)
-        self._publisher = StatePublisher(sockets.state.socket, start.scene, self._session_ns, first_seq)
-        revocation = Revocation(
+        first_seq = 1 + (self.now_ns() // SEQ_NS if start.handback else 0)
+        self._publisher = StatePublisher(sockets.state.socket, start.scene, self.now_ns, first_seq)
+        revocation = RevocationService(
             self._keyring,
             self._clients,
             self._outbox,
@@ -142,11 +146,11 @@ class Front:
             self._audit,
             self._publisher,
             self._coalescer.offer,
-            departures.lose,
+            departures.report_lost,
             self._open_state_again,
         )
         self._assets = self._make_assets()
-        admission.lets_in += [self._media.meet, self._assets.look]
+        admission.lets_in += [self._media.sync_clients, self._assets.sync_clients]
         self._services += [self._pairing, revocation, self._audit, self._assets]
         self._downlink = Downlink(
             self._link,
@@ -155,11 +159,11 @@ class Front:
             admission,
             self._publisher,
             self._drops,
-            self._session_ns,
-            departures.forget,
+            self.now_ns,
+            departures.remove,
             revocation,
-            anchoring,
-            self._assets.look,
+            alignment,
+            self._assets.sync_clients,
         )
         self.ended = ""
         #: The link closed without a word: its process ends, or has ended already.
@@ -177,62 +181,62 @@ class Front:
             self._drops,
             self._publisher,
         )
-        self._services += [*self._announced(), anchoring]
+        self._services += [*self._announced(), alignment]
         self._next_housekeeping_ns = self._next_collect_ns = 0
 
     def _announced(self) -> list[Service]:
         """What makes the session known, on the network and in the home of keys."""
         sockets, config, key = self._sockets, self._config, self._keyring.key
-        facts = Facts(key.public if key else "", lambda: self._pairing.open, lambda: len(self._clients))
+        facts = SessionFacts(key.public if key else "", lambda: self._pairing.has_open_code, lambda: len(self._clients))
         services: list[Service] = []
         if self._keyring.home is not None:
-            services.append(NoteKeeper(self._keyring.home, self._keyring.files, config, sockets.ports))
-        return services + announce(config, sockets.ports, sockets.listeners, self._drops, facts)
+            services.append(SessionNoteService(self._keyring.home, self._keyring.files, config, sockets.ports))
+        return services + make_discovery_services(config, sockets.ports, sockets.listeners, self._drops, facts)
 
-    def _make_media(self) -> MediaDesk:
+    def _make_media(self) -> MediaService:
         sockets, encrypted = self._sockets, self._keyring.key is not None
         limits = self._config.limits
         proxy = MediaProxy(
             sockets.media.socket,
-            MediaDoors(sockets.media.monitor, limits, limits.subscribers, SUBSCRIBER_BYTES, curve=encrypted),
-            MediaDoors(sockets.ingest.monitor, limits, limits.sources, limits.source_bytes, curve=encrypted),
+            ChannelGuard(sockets.media.monitor, limits, limits.subscribers, SUBSCRIBER_BYTES, curve=encrypted),
+            ChannelGuard(sockets.ingest.monitor, limits, limits.sources, limits.source_bytes, curve=encrypted),
             sockets.local_ingest,
             sockets.ingest.socket,
-            self._session_ns,
+            self.now_ns,
             encrypted=encrypted,
         )
-        self._give_way = proxy.give_way
-        return MediaDesk(
+        self._give_way = proxy.release_memory
+        return MediaService(
             proxy,
             self._clients,
             self._outbox,
             self._keyring,
             self._drops,
-            self._status.client_report,
+            self._status.find_report,
             self._tokens.revoked,
             lambda: self._publisher.frames,
             adapt=self._config.adapt_media,
         )
 
-    def _make_assets(self) -> AssetDesk:
+    def _make_assets(self) -> AssetService:
         sockets, encrypted, limits = self._sockets.assets, self._keyring.key is not None, self._config.limits
-        doors = MediaDoors(sockets.monitor, limits, limits.subscribers, REQUEST_BYTES, curve=encrypted, name="assets")
-        server = AssetServer(sockets, doors, self._session_ns)
-        return AssetDesk(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.revoked)
+        guard = ChannelGuard(sockets.monitor, limits, limits.subscribers, REQUEST_BYTES, curve=encrypted, name="assets")
+        server = AssetServer(sockets, guard, self.now_ns)
+        return AssetService(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.revoked)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
-        self._doors.watch_state(*state)
+        self._guard.watch_state_socket(*state)
         return state.socket
 
     def _shed(self, whom: str, now_ns: int) -> None:
-        self._doors.flood("", f"memory: closed {whom}", now_ns, warning=f"memory ran short: closed {whom}")
+        self._guard.report_flood("", f"memory: closed {whom}", now_ns, warning=f"memory ran short: closed {whom}")
 
-    def _session_ns(self) -> int:
+    def now_ns(self) -> int:
         return time.monotonic_ns() - self._config.origin_ns
 
     def _key_refused(self, mark: str, address: str) -> None:
-        self._audit.note(AuditKind.KEY_REFUSED, self._session_ns(), subject=mark, address=address, detail="state")
+        self._audit.record(AuditKind.KEY_REFUSED, self.now_ns(), subject=mark, address=address, detail="state")
 
     def end(self, reason: str) -> None:
         """Lets `run` return after the clients were told."""
@@ -250,12 +254,12 @@ class Front:
         busy = False
         while not self.ended:
             poller.poll(0 if busy else IDLE_MS)
-            busy = self._pass()
+            busy = self._run_once()
         self._downlink.broadcast(ProtocolFault(FaultCode.SESSION_ENDED, f"the session has ended: {self.ended}"))
         if len(self._clients):
             time.sleep(FAREWELL_S)
 
-    def _pass(self) -> bool:
+    def _run_once(self) -> bool:
         """One pass of the loop. True when clients still have something to say."""
         self._downlink.drain()
         if self._authenticator is not None:
@@ -263,14 +267,14 @@ class Front:
         more = True
         for _ in range(ROUNDS):
             self._departures.drain_monitor()
-            more = self._drain_control()
+            more = self._receive_messages()
             self._uplink.flush()
             self._downlink.drain()
             if not more:
                 break
         replaced, self._intake.replaced = self._intake.replaced, []
-        self._departures.take_leave(replaced, drained=not more)
-        self._housekeeping(idle=not more)
+        self._departures.process_disconnects(replaced, drained=not more)
+        self._run_services(idle=not more)
         self._uplink.flush()
         return more
 
@@ -282,7 +286,7 @@ class Front:
 
     # --- from clients ------------------------------------------------------------------------------------------------
 
-    def _drain_control(self) -> bool:
+    def _receive_messages(self) -> bool:
         """Takes up to `ROUND` messages. True when there may be more."""
         control = self._control
         with_user = self._authenticator is not None
@@ -301,37 +305,37 @@ class Front:
             except zmq.ZMQError:  # a browser, or a ZeroMQ of before 2013: libzmq does not tell by which connection
                 self._drops.count("unversioned_peer")
                 continue
-            self._traffic.taken(peer.descriptor, len(frame.buffer))
-            self._intake.take(routing_id, peer, frame.buffer, extra)
+            self._traffic.count_received(peer.descriptor, len(frame.buffer))
+            self._intake.handle_message(routing_id, peer, frame.buffer, extra)
         return True
 
     # --- now and then ------------------------------------------------------------------------------------------------
 
-    def _housekeeping(self, idle: bool) -> None:
-        now_ns = self._session_ns()
-        self._watch_end()
+    def _run_services(self, idle: bool) -> None:
+        now_ns = self.now_ns()
+        self._check_end()
         if now_ns < self._next_housekeeping_ns:
             return
         self._next_housekeeping_ns = now_ns + HOUSEKEEPING_NS
-        self._departures.silent(now_ns, self._config.silence_ns)
+        self._departures.disconnect_silent(now_ns, self._config.silence_ns)
         for service in self._services:
-            service.turn(now_ns)
-        self._publisher.tend()
-        self._watch_stall(now_ns)
-        self._uplink.turn(now_ns)
+            service.tick(now_ns)
+        self._publisher.poll()
+        self._check_stall(now_ns)
+        self._uplink.tick(now_ns)
         if idle and now_ns >= self._next_collect_ns:
             self._next_collect_ns = now_ns + COLLECT_NS
             gc.collect()
 
-    def _watch_end(self) -> None:
+    def _check_end(self) -> None:
         """The link closes with the session's process, however that ended, or with the session."""
         if self._downlink.ended:
             self.end(ENDED)
         elif readable(self._sockets.link_monitor):
             self.cut_off = True
-            self.end(ENDED if parent_is(self._start.parent_pid) else ORPHANED)
+            self.end(ENDED if is_parent(self._start.parent_pid) else ORPHANED)
 
-    def _watch_stall(self, now_ns: int) -> None:
+    def _check_stall(self, now_ns: int) -> None:
         """Called after the link was drained, so a front that was kept from running does not blame the authority."""
         heard_ns = self._downlink.heard_ns
         stalled = heard_ns > 0 and now_ns - heard_ns > self._config.stall_ns
@@ -341,17 +345,17 @@ class Front:
         elif self._uplink.stalled and not stalled:
             self._downlink.broadcast(ProtocolFault(FaultCode.RECOVERED, "the session steps again"))
         self._uplink.stalled = stalled
-        if not parent_is(self._start.parent_pid):
+        if not is_parent(self._start.parent_pid):
             self.end(ORPHANED)
 
     def _telling(self) -> Telling:
         return Telling(
-            self._publisher.delays_ns(),
+            self._publisher.read_recent_delays_ns(),
             self._downlink.heard_ns,
             self._downlink.report,
             self._uplink.stalled,
             self._uplink.entries,
-            self._doors.warnings(self._session_ns()),
-            self._media.streams(),
+            self._guard.list_warnings(self.now_ns()),
+            self._media.report_streams(),
             self._assets.report(),
         )

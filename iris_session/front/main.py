@@ -14,7 +14,7 @@ import msgspec
 from iris_session.front.loop import ENDED, ORPHANED, Front
 from iris_session.link.config import FrontError, FrontStart
 from iris_session.link.sockets import raise_descriptor_limit
-from iris_session.system.parent import die_with_parent, parent_ends, parent_is
+from iris_session.system.process import die_with_parent, is_parent, wait_for_parent_exit
 
 
 def main() -> int:
@@ -29,7 +29,7 @@ def main() -> int:
     def on_signal(number: int, _frame: FrameType | None) -> None:
         if number != signal.SIGHUP:
             front.end(ENDED)
-        elif not parent_is(start.parent_pid):
+        elif not is_parent(start.parent_pid):
             front.end(ORPHANED)
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -43,7 +43,7 @@ def main() -> int:
         front.run()
     finally:
         front.close()
-        if (front.cut_off or front.ended == ORPHANED) and parent_ends(start.parent_pid):
+        if (front.cut_off or front.ended == ORPHANED) and wait_for_parent_exit(start.parent_pid):
             # Killed: nobody else removes the folder of the link.
             shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
     return 0

@@ -18,10 +18,10 @@ from iris_session.front.connections import Outbox, Peer, Route
 from iris_session.link.config import SECOND
 from iris_session.link.sockets import peer_of
 from iris_session.protocol import pairing
+from iris_session.protocol.client_messages import Pair
+from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind, RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.server_messages import Refused
-from iris_session.protocol.token_bucket import Drops, TokenBucket
+from iris_session.protocol.server_messages import Paired, Refused
 from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
 from iris_session.security.file_worker import PATIENCE_S
 from iris_session.security.join_codes import Attempt
@@ -35,21 +35,21 @@ ADDRESS_PER_SECOND: Final = 2.0
 ADDRESS_BURST: Final = 12
 #: How long an attempt may wait for its turn, and how many may: a client waits 5 s for the answer.
 PATIENCE_NS: Final = 2 * SECOND
-MAX_WAITING: Final = 32
+MAX_PENDING: Final = 32
 #: Who paired last, and may ask again what was answered.
-MAX_TOLD: Final = 32
+MAX_RECENTLY_PAIRED: Final = 32
 #: Wrong codes of one address within `WINDOW_NS`: as many as two codes have.
 ADDRESS_ATTEMPTS: Final = 10
 WINDOW_NS: Final = 600 * SECOND
 MAX_ADDRESSES: Final = 1024
 #: Codes that could not be read (no descriptor left, a network drive) are read again after so long.
-AGAIN_S: Final = 1.0
+RETRY_S: Final = 1.0
 REVOKED: Final = "this key was revoked just now"
 BUSY: Final = "the list of keys is busy"
 SHUT_OUT: Final = "too many wrong codes from this address"
 
 
-class _Waiting(NamedTuple):
+class _PendingAttempt(NamedTuple):
     route: Route
     address: str
     key: str
@@ -57,7 +57,7 @@ class _Waiting(NamedTuple):
     since_ns: int
 
 
-class PairingDesk:
+class PairingService:
     """A `Service`. `take` gets every `Pair`; answers are sent in `turn`."""
 
     def __init__(self, keyring: Keyring, outbox: Outbox, audit: AuditTrail, drops: Drops) -> None:
@@ -67,9 +67,11 @@ class PairingDesk:
         self._drops = drops
         self._pairs = TokenBucket(PER_SECOND, BURST)
         self._complaints = TokenBucket(PER_SECOND, BURST)
-        self._waiting: deque[_Waiting] = deque()
+        self._pending: deque[_PendingAttempt] = deque()
         self._trying = False
-        self._told: dict[str, tuple[bytes, Paired]] = {}  # who has paired lately: proof and answer, by fingerprint
+        self._recently_paired: dict[
+            str, tuple[bytes, Paired]
+        ] = {}  # who has paired lately: proof and answer, by fingerprint
         self._rates: dict[str, TokenBucket] = {}
         self._wrong: dict[str, tuple[int, int]] = {}  # network -> wrong attempts, since when [ns]
         self._signature: object = None
@@ -77,7 +79,7 @@ class PairingDesk:
         self._codes: tuple[JoinCode, ...] = ()
 
     @property
-    def open(self) -> bool:
+    def has_open_code(self) -> bool:
         """Whether a join code can be used now."""
         home, key = self._keyring.home, self._keyring.key
         if home is None or key is None:
@@ -95,25 +97,25 @@ class PairingDesk:
             self._codes, unread = home.codes.of(key.fingerprint), ""
         except KeysError as error:
             self._codes, unread = (), str(error)
-            self._again_s = time.monotonic() + AGAIN_S
+            self._again_s = time.monotonic() + RETRY_S
             if unread != self._unread:
-                self._say(error)
+                self._log_error(error)
         self._unread = unread
 
-    def take(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
+    def handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
         """One `Pair` of a key that is on the list, or is not."""
         address = peer_of(peer.descriptor)[0]
         key = stranger_key(peer.user_id)
         known = self._keyring.find(peer.user_id)
         if known is not None:
             key = known.key
-        taken = self._rate(address, now_ns)
-        if self._exhausted(address, now_ns):  # before all that others have a share in
-            self._audit.note(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
+        taken = self._allow_address(address, now_ns)
+        if self._has_exhausted_attempts(address, now_ns):  # before all that others have a share in
+            self._audit.record(AuditKind.CODE_REFUSED, now_ns, address=address, detail="too many wrong codes")
             self._drops.count("pair_shut_out")
             if taken:
                 self._refuse(route, SHUT_OUT, "wait ten minutes")
-        elif not taken or not self._pairs.take(now_ns) or len(self._waiting) >= MAX_WAITING:
+        elif not taken or not self._pairs.take(now_ns) or len(self._pending) >= MAX_PENDING:
             self._drops.count("pair_rate")
             if self._complaints.take(now_ns):
                 advice = "try again in a second"
@@ -128,90 +130,94 @@ class PairingDesk:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
         elif fingerprint(raw_key(key)) in self._keyring.revoking:
             self._refuse(route, REVOKED, "ask for another join code")
-        elif (again := self._paired_before(key, pair)) is not None:
+        elif (again := self._find_earlier_answer(key, pair)) is not None:
             self._outbox.send_to_route(route, again)
-        elif not self.open:
+        elif not self.has_open_code:
             mark = fingerprint(raw_key(key))
-            self._audit.note(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
+            self._audit.record(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
             self._refuse(route, "no join code can be used now", "run `iris-session pair` where the session runs")
         else:
-            self._waiting.append(_Waiting(route, address, key, pair, now_ns))
+            self._pending.append(_PendingAttempt(route, address, key, pair, now_ns))
 
-    def _paired_before(self, key: str, pair: Pair) -> Paired | None:
+    def _find_earlier_answer(self, key: str, pair: Pair) -> Paired | None:
         """The answer to an attempt that succeeded, where it is made again: the first may have been lost, or too late.
         `None` where it is another one, and for a key that is off the list by now."""
         mark = fingerprint(raw_key(key))
-        proof, answer = self._told.get(mark, (b"", None))
+        proof, answer = self._recently_paired.get(mark, (b"", None))
         return answer if pairing.same(proof, pair.proof) and self._keyring.find(mark) is not None else None
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Begins the next attempt when the one before is done."""
-        waiting, self._waiting = self._waiting, deque()
+        waiting, self._pending = self._pending, deque()
         for one in waiting:
-            self._sort(one, now_ns)
-        if self._trying or not self._waiting:
+            self._recheck_pending(one, now_ns)
+        if self._trying or not self._pending:
             return
         home, key = self._keyring.home, self._keyring.key
         assert home is not None
         assert key is not None
-        first = self._waiting[0]
-        self._trying = self._keyring.files.submit(partial(_attempt, home, key, first), partial(self._tried, first, key))
+        first = self._pending[0]
+        self._trying = self._keyring.files.submit(
+            partial(_run_attempt, home, key, first), partial(self._on_attempt_done, first, key)
+        )
         if self._trying:
-            self._waiting.popleft()
+            self._pending.popleft()
 
-    def _sort(self, one: _Waiting, now_ns: int) -> None:
+    def _recheck_pending(self, one: _PendingAttempt, now_ns: int) -> None:
         """Lets an attempt wait on, or ends it: much may have happened since it came."""
         if now_ns - one.since_ns > PATIENCE_NS:
-            self._put_off(one.route)
+            self._refuse_busy(one.route)
         elif fingerprint(raw_key(one.key)) in self._keyring.revoking:
             self._refuse(one.route, REVOKED, "ask for another join code")
-        elif self._exhausted(one.address, now_ns):
+        elif self._has_exhausted_attempts(one.address, now_ns):
             self._refuse(one.route, SHUT_OUT, "wait ten minutes")
         else:
-            self._waiting.append(one)
+            self._pending.append(one)
 
-    def _tried(self, waiting: _Waiting, key: KeyPair, outcome: Attempt | KeysError, now_ns: int) -> None:
+    def _on_attempt_done(
+        self, waiting: _PendingAttempt, key: KeyPair, outcome: Attempt | KeysError, now_ns: int
+    ) -> None:
         self._trying = False
         if isinstance(outcome, Attempt):
             self._answer(waiting, outcome, key, now_ns)
         elif isinstance(outcome, KeysBusyError):
-            self._put_off(waiting.route)
+            self._refuse_busy(waiting.route)
         else:
-            self._say(outcome)
+            self._log_error(outcome)
             advice = "whoever runs the session finds more at its terminal"
             self._refuse(waiting.route, "the session cannot change its list of keys", advice)
 
     def close(self) -> None:
         """Nothing was opened."""
 
-    def _answer(self, waiting: _Waiting, attempt: Attempt, key: KeyPair, now_ns: int) -> None:
+    def _answer(self, waiting: _PendingAttempt, attempt: Attempt, key: KeyPair, now_ns: int) -> None:
         client = raw_key(waiting.key)
         mark = fingerprint(client)
         entry = attempt.entry
         if entry is not None:
-            self._wrong.pop(_network(waiting.address), None)
+            self._wrong.pop(_network_prefix(waiting.address), None)
             revoked = mark in self._keyring.revoking  # since it asked: the later word counts
             if revoked or not self._keyring.paired(mark):
                 self._refuse(waiting.route, REVOKED, "ask for another join code")
                 return
             roles = ", ".join(entry.roles) or "any role"
-            self._audit.note(
+            self._audit.record(
                 AuditKind.PAIRED, now_ns, subject=mark, name=entry.name, address=waiting.address, detail=roles
             )
             paired = Paired(pairing.server_proof(attempt.secret, key.raw_public, client), entry.roles)
-            self._told.pop(mark, None)
-            while len(self._told) >= MAX_TOLD:
-                del self._told[next(iter(self._told))]
-            self._told[mark] = waiting.pair.proof, paired
+            self._recently_paired.pop(mark, None)
+            while len(self._recently_paired) >= MAX_RECENTLY_PAIRED:
+                del self._recently_paired[next(iter(self._recently_paired))]
+            self._recently_paired[mark] = waiting.pair.proof, paired
             self._outbox.send_to_route(waiting.route, paired)
             return
         self._count_wrong(waiting.address, now_ns)
         kind = AuditKind.CODE_EXHAUSTED if attempt.exhausted else AuditKind.CODE_REFUSED
-        self._audit.note(kind, now_ns, subject=mark, name=waiting.pair.name, address=waiting.address)
+        self._audit.record(kind, now_ns, subject=mark, name=waiting.pair.name, address=waiting.address)
         advice = "run `iris-session pair` anew" if not attempt.open_codes else "look at the code again"
         self._refuse(waiting.route, "this join code is wrong, used or expired", advice)
 
-    def _put_off(self, route: Route) -> None:
+    def _refuse_busy(self, route: Route) -> None:
         """Nothing was tried: the same may be asked again, and no attempt is lost."""
         self._drops.count("pair_busy")
         self._outbox.send_to_route(route, Refused(RefusalCode.RATE, BUSY, "try again"))
@@ -220,21 +226,21 @@ class PairingDesk:
         self._drops.count("pair_refused")
         self._outbox.send_to_route(route, Refused(RefusalCode.CODE, message, advice))
 
-    def _rate(self, address: str, now_ns: int) -> bool:
+    def _allow_address(self, address: str, now_ns: int) -> bool:
         """Whether this address may ask now."""
-        network = _network(address)
+        network = _network_prefix(address)
         bucket = self._rates.pop(network, None) or TokenBucket(ADDRESS_PER_SECOND, ADDRESS_BURST, now_ns)
         while len(self._rates) >= MAX_ADDRESSES:
             del self._rates[next(iter(self._rates))]
         self._rates[network] = bucket
         return bucket.take(now_ns)
 
-    def _exhausted(self, address: str, now_ns: int) -> bool:
-        wrong, since_ns = self._wrong.get(_network(address), (0, now_ns))
+    def _has_exhausted_attempts(self, address: str, now_ns: int) -> bool:
+        wrong, since_ns = self._wrong.get(_network_prefix(address), (0, now_ns))
         return wrong >= ADDRESS_ATTEMPTS and now_ns - since_ns < WINDOW_NS
 
     def _count_wrong(self, address: str, now_ns: int) -> None:
-        network = _network(address)
+        network = _network_prefix(address)
         wrong, since_ns = self._wrong.pop(network, (0, now_ns))
         if now_ns - since_ns >= WINDOW_NS:
             wrong, since_ns = 0, now_ns
@@ -243,17 +249,17 @@ class PairingDesk:
         self._wrong[network] = (wrong + 1, since_ns)
 
     @staticmethod
-    def _say(error: KeysError) -> None:
+    def _log_error(error: KeysError) -> None:
         print(f"iris-session: pairing does not work: {error}", file=sys.stderr, flush=True)
 
 
-def _attempt(home: KeyHome, key: KeyPair, waiting: _Waiting) -> Attempt:
+def _run_attempt(home: KeyHome, key: KeyPair, waiting: _PendingAttempt) -> Attempt:
     pair = waiting.pair
     name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
     return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, PATIENCE_S)
 
 
-def _network(address: str) -> str:
+def _network_prefix(address: str) -> str:
     """What counts as one address: with IPv6, a household or lab has 2**64 of them."""
     try:
         ip = ipaddress.ip_address(address.partition("%")[0])

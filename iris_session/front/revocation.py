@@ -14,20 +14,20 @@ from typing import Final
 import zmq
 
 from iris_session.front.audit import AuditTrail
-from iris_session.front.connections import ClientTable, Connection, Outbox
+from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import MILLISECOND, SECOND, FrontError
 from iris_session.link.sockets import close_tcp
+from iris_session.protocol.client_messages import RemoveParticipant
 from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
-from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
 from iris_session.security.file_worker import PATIENCE_S
 from iris_session.security.keyring import Keyring, roles_behind
 from iris_session.security.resume_tokens import ResumeTokens
 
-LOOK_NS: Final = 100 * MILLISECOND
+CHECK_PERIOD_NS: Final = 100 * MILLISECOND
 #: Between the fault and the end of the TCP connection, so that the fault arrives.
 FAREWELL_NS: Final = 100 * MILLISECOND
 #: libzmq frees a port some milliseconds after its socket was closed; later than this somebody else has it.
@@ -38,20 +38,20 @@ GATEWAY_REVOKED: Final = "the gateway's key was taken off the session's list"
 ROLE_TAKEN: Final = "its key lost the role"
 
 
-class Revocation:
+class RevocationService:
     """A `Service`. `lose` tells the authority that a connection is gone; `open_state` opens the state socket, and
     raises `FrontError` while its port is not free yet."""
 
     def __init__(
         self,
         keyring: Keyring,
-        clients: ClientTable,
+        clients: ConnectionTable,
         outbox: Outbox,
         tokens: ResumeTokens,
         audit: AuditTrail,
         publisher: StatePublisher,
         offer: Callable[[Entry], bool],
-        lose: Callable[[Connection, str], None],
+        lose: Callable[[FrontConnection, str], None],
         open_state: Callable[[], zmq.Socket[bytes]],
     ) -> None:
         self._keyring = keyring
@@ -63,31 +63,31 @@ class Revocation:
         self._offer = offer
         self._lose = lose
         self._open_state = open_state
-        self._leaving: list[tuple[int, Connection]] = []
+        self._closing: list[tuple[int, FrontConnection]] = []
         self._writing = False
-        self._said = ""  # what went wrong with the list last
+        self._reported_error = ""  # what went wrong with the list last
         self._state_due_ns = 0  # while the state socket is closed: when its port should have been free
         self._next_look_ns = self._next_seen_ns = 0
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """A director's word: ends the key here, and takes it off the list."""
         self._keyring.revoking[key_id] = None
-        self._end(key_id, now_ns, "a director revoked this key")
+        self._disconnect_key(key_id, now_ns, "a director revoked this key")
 
-    def remove(self, connection: Connection, text: str, now_ns: int, reason: str = "revoked") -> None:
+    def disconnect(self, connection: FrontConnection, text: str, now_ns: int, reason: str = "revoked") -> None:
         """The authority has removed a participant: told, then disconnected."""
         self._outbox.send(connection, ProtocolFault(FaultCode.REVOKED, text, reason))
         if not connection.gateway:  # one of many on the TCP connection of a gateway
-            self._leaving.append((now_ns + FAREWELL_NS, connection))
+            self._closing.append((now_ns + FAREWELL_NS, connection))
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Looks at the list, ends what has to end, opens what is closed."""
-        while self._leaving and now_ns >= self._leaving[0][0]:
-            _, gone = self._leaving.pop(0)
+        while self._closing and now_ns >= self._closing[0][0]:
+            _, gone = self._closing.pop(0)
             close_tcp(gone.peer.descriptor, gone.address)
         if now_ns >= self._next_look_ns:
-            self._next_look_ns = now_ns + LOOK_NS
-            self._write(now_ns)
+            self._next_look_ns = now_ns + CHECK_PERIOD_NS
+            self._write_allow_list(now_ns)
             self._keyring.look()
         if self._keyring.gone:
             gone_keys, self._keyring.gone = self._keyring.gone, {}
@@ -96,47 +96,47 @@ class Revocation:
                 if now is None and self._tokens.revoked(mark):
                     continue  # a director did it: all is done
                 if now is None:
-                    self._audit.note(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
-                    self._end(mark, now_ns, REVOKED)
+                    self._audit.record(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
+                    self._disconnect_key(mark, now_ns, REVOKED)
                 else:
-                    self._narrow(mark, now.roles, now_ns)
+                    self._apply_roles(mark, now.roles, now_ns)
         while self._keyring.come:
             self._tokens.forgive(self._keyring.come.popitem()[0])
         if self._state_due_ns:
-            self._reopen(now_ns)
+            self._reopen_state(now_ns)
 
     def close(self) -> None:
         """Closes the connections that were told to go."""
-        for _, gone in self._leaving:
+        for _, gone in self._closing:
             close_tcp(gone.peer.descriptor, gone.address)
 
-    def _end(self, key_id: str, now_ns: int, text: str) -> None:
-        for connection in self._of(key_id):
-            for one in self._clients.behind(connection):
-                self.remove(one, GATEWAY_REVOKED, now_ns)
-            self.remove(connection, text, now_ns)
+    def _disconnect_key(self, key_id: str, now_ns: int, text: str) -> None:
+        for connection in self._list_connections(key_id):
+            for one in self._clients.list_behind(connection):
+                self.disconnect(one, GATEWAY_REVOKED, now_ns)
+            self.disconnect(connection, text, now_ns)
             self._lose(connection, "revoked")  # and those behind it
         for participant in self._tokens.revoke(key_id):
-            self._expel(participant, "key revoked", now_ns)
+            self._remove_participant(participant, "key revoked", now_ns)
         if key_id in self._keyring.watching and not self._state_due_ns:
-            self._publisher.use_socket(None)
+            self._publisher.replace_socket(None)
             self._keyring.watching.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
-    def _narrow(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
+    def _apply_roles(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
         """A key has other roles now: whoever is here in a role that it lost, itself or behind it, is removed, and
         refused when it comes back."""
-        for connection in self._of(key_id):
-            behind = self._clients.behind(connection)
+        for connection in self._list_connections(key_id):
+            behind = self._clients.list_behind(connection)
             if roles and connection.hello.role not in roles:
                 lost = [*behind, connection]
             else:
                 left = roles_behind(roles)
                 lost = [one for one in behind if left and one.hello.role not in left]
             for one in lost:
-                self._end_role(one, now_ns)
+                self._disconnect_role(one, now_ns)
 
-    def _end_role(self, connection: Connection, now_ns: int) -> None:
+    def _disconnect_role(self, connection: FrontConnection, now_ns: int) -> None:
         participant, role = connection.participant_id, connection.hello.role
         if connection.gateway:
             text = f"the session let this connection go: its gateway may speak for no {role} any more"
@@ -146,17 +146,17 @@ class Revocation:
             close_tcp(connection.peer.descriptor, connection.address)
         if participant:
             self._tokens.left(participant)
-            self._expel(participant, ROLE_TAKEN, now_ns)
+            self._remove_participant(participant, ROLE_TAKEN, now_ns)
 
-    def _of(self, key_id: str) -> list[Connection]:
+    def _list_connections(self, key_id: str) -> list[FrontConnection]:
         return [c for c in self._clients.by_number.values() if c.key_id == key_id]
 
-    def _expel(self, participant: str, reason: str, now_ns: int) -> None:
+    def _remove_participant(self, participant: str, reason: str, now_ns: int) -> None:
         self._offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
 
-    def _reopen(self, now_ns: int) -> None:
+    def _reopen_state(self, now_ns: int) -> None:
         try:
-            self._publisher.use_socket(self._open_state())
+            self._publisher.replace_socket(self._open_state())
         except FrontError as error:
             if now_ns >= self._state_due_ns:
                 self._state_due_ns = now_ns + PORT_FREE_NS
@@ -164,7 +164,7 @@ class Revocation:
             return
         self._state_due_ns = 0
 
-    def _write(self, now_ns: int) -> None:
+    def _write_allow_list(self, now_ns: int) -> None:
         """Has the list changed. What it says is decided already: nobody waits for the file."""
         keyring = self._keyring
         if keyring.home is None:
@@ -174,13 +174,13 @@ class Revocation:
         if self._writing or not (keyring.revoking or due):
             return
         marks, seen = tuple(keyring.revoking), keyring.seen if due else {}
-        job = partial(_change, keyring.home.clients, marks, seen)
-        self._writing = keyring.files.submit(job, partial(self._written, marks, seen))
+        job = partial(_change_allow_list, keyring.home.clients, marks, seen)
+        self._writing = keyring.files.submit(job, partial(self._on_written, marks, seen))
         if self._writing and due:
             self._next_seen_ns = now_ns + SEEN_NS
             keyring.seen = {}
 
-    def _written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
+    def _on_written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
         self._writing = False
         keyring = self._keyring
         if outcome is None:
@@ -188,12 +188,12 @@ class Revocation:
                 keyring.revoking.pop(mark, None)
             return
         keyring.seen = {**seen, **keyring.seen}
-        if not isinstance(outcome, KeysBusyError) and str(outcome) != self._said:
-            self._said = str(outcome)  # the key stays out of this session; its file is tried again
+        if not isinstance(outcome, KeysBusyError) and str(outcome) != self._reported_error:
+            self._reported_error = str(outcome)  # the key stays out of this session; its file is tried again
             print(f"iris-session: the allow-list cannot be changed: {outcome}", file=sys.stderr, flush=True)
 
 
-def _change(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
+def _change_allow_list(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
     for mark in marks:
         clients.revoke(mark, PATIENCE_S)
     if seen:

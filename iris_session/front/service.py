@@ -8,7 +8,7 @@ from typing import Protocol
 class Service(Protocol):
     """One of them. It never waits; what it opened, `close` frees."""
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Does what is due at session time `now_ns`. Called about every 10 ms, after the link was drained."""
         ...
 

@@ -12,7 +12,7 @@ from iris_session.security import KeyHome, KeysBusyError, KeysError, SessionNote
 from iris_session.security.file_worker import PATIENCE_S, FileWorker
 
 
-class NoteKeeper:
+class SessionNoteService:
     """A `Service`: has the note written in its first turn, removes it in the end."""
 
     def __init__(self, home: KeyHome, files: FileWorker, config: FrontConfig, ports: Ports) -> None:
@@ -23,10 +23,10 @@ class NoteKeeper:
         )
         self._asked = False
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Tries until nobody else changes the file."""
         if not self._asked:
-            self._asked = self._files.submit(partial(self._notes.add, self._note, PATIENCE_S), self._done)
+            self._asked = self._files.submit(partial(self._notes.add, self._note, PATIENCE_S), self._on_written)
 
     def close(self) -> None:
         """The front's loop has ended: nobody waits for it any more."""
@@ -35,7 +35,7 @@ class NoteKeeper:
         with contextlib.suppress(KeysError):
             self._notes.remove(self._note.session_id, self._note.pid, patience_s=0.2)
 
-    def _done(self, outcome: KeysError | None, _now_ns: int) -> None:
+    def _on_written(self, outcome: KeysError | None, _now_ns: int) -> None:
         if isinstance(outcome, KeysBusyError):
             self._asked = False
         elif outcome is not None:

@@ -41,27 +41,27 @@ class StatePublisher:
         #: When each of the newest frames was handed to the socket, and how long after the end of its tick; without
         #: those that are sent again while their source is silent.
         self._delays: deque[tuple[int, int]] = deque(maxlen=300)
-        self._shown_ns = -1
+        self._last_session_time = -1
         self.scene = scene
-        self._begin()
+        self._reset_encoder()
 
     @property
     def newest_delay_ns(self) -> int:
         """End of the tick of the newest frame until it was handed to the socket, 0 before the first."""
         return self._delays[-1][1] if self._delays else 0
 
-    def delays_ns(self) -> list[int]:
+    def read_recent_delays_ns(self) -> list[int]:
         """The same of all frames of the last seconds, oldest first."""
         since_ns = self._now_ns() - RECENT_NS
         return [delay for at_ns, delay in self._delays if at_ns > since_ns]
 
-    def use_socket(self, state: zmq.Socket[bytes] | None) -> None:
+    def replace_socket(self, state: zmq.Socket[bytes] | None) -> None:
         """Sends on another socket from now on, and closes the one before. `None`: nothing is sent for a while."""
         if self._state is not None:
             self._state.close(linger=0)
         self._state = state
 
-    def tend(self) -> None:
+    def poll(self) -> None:
         """Lets libzmq do what it does only when asked for something: else, while no state is sent, all that became of
         connections would pile up."""
         if self._state is not None:
@@ -72,9 +72,9 @@ class StatePublisher:
         before, self.scene = self.scene, scene
         if scene.patches and scene.bodies == before.bodies:
             return
-        self._begin()
+        self._reset_encoder()
 
-    def _begin(self) -> None:
+    def _reset_encoder(self) -> None:
         self._encoder = RigidEncoder(len(self.scene.bodies), self._next_seq)
         self._published = False
 
@@ -91,9 +91,9 @@ class StatePublisher:
         self._published = True
         self._next_seq = frame.state_seq + 1
         published_ns = self._now_ns()
-        if head.session_time != self._shown_ns:
+        if head.session_time != self._last_session_time:
             self._delays.append((published_ns, published_ns - head.session_time))
-        self._shown_ns = head.session_time
+        self._last_session_time = head.session_time
         stamped = StateHeader(
             head.scene_epoch,
             head.scene_revision,
@@ -116,7 +116,7 @@ class StatePublisher:
             presence = _RawPresence(session_time, self._now_ns(), msgspec.Raw(items))
             self._state.send_multipart((TOPIC_PRESENCE, _encoder.encode(presence)))
 
-    def keyframe(self) -> tuple[int, bytes]:
+    def read_keyframe(self) -> tuple[int, bytes]:
         """`(state_seq, float64 (n, 7) poses)` for a snapshot: of the newest frame, or of the scene before the first."""
         if not self._published:
             return 0, self.scene.poses

@@ -13,9 +13,10 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from iris_session.front.connections import ClientTable, Connection, Outbox
+from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox
 from iris_session.link.config import FrontConfig
 from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import (
     AlignmentReport,
     AssetsReport,
@@ -27,7 +28,6 @@ from iris_session.protocol.status import (
     StatusReport,
     quantiles,
 )
-from iris_session.protocol.token_bucket import Drops
 
 #: Samples of one connection whose way is remembered: five devices at 90 Hz for a second, one for six.
 DELAYS: Final = 512
@@ -36,14 +36,14 @@ ROLL_NS: Final = 1_000_000_000
 STALE_REPORT_NS: Final = 3_000_000_000
 #: Of fewer frames of state than this in some seconds no 99th percentile is told: it would be the latest one, and of a
 #: scene that stands still, whose state is sent again four times a second, one that was late would be blamed for long.
-ENOUGH: Final = 25
+MIN_DELAYS: Final = 25
 #: A report is made at most this often, however many ask.
 REUSE_NS: Final = 200_000_000
 
 _decode_report = msgspec.msgpack.Decoder(StatusReport).decode
 
 
-class _Line:
+class _ConnectionStats:
     """What the front measures of one connection."""
 
     __slots__ = ("delays_ns", "report", "reported_ns", "samples", "samples_per_s")
@@ -55,7 +55,7 @@ class _Line:
         self.report: ClientReport | None = None
         self.reported_ns = 0
 
-    def fresh(self, now_ns: int) -> ClientReport | None:
+    def recent_report(self, now_ns: int) -> ClientReport | None:
         """The newest report of the client, unless it is too old."""
         return self.report if now_ns - self.reported_ns <= STALE_REPORT_NS else None
 
@@ -77,11 +77,11 @@ class Telling(NamedTuple):
     assets: AssetsReport | None = None
 
 
-class StatusDesk:
+class StatusService:
     """One per front. A `Service`: `turn` rolls the rates."""
 
     def __init__(
-        self, config: FrontConfig, clients: ClientTable, outbox: Outbox, drops: Drops, tell: Callable[[], Telling]
+        self, config: FrontConfig, clients: ConnectionTable, outbox: Outbox, drops: Drops, tell: Callable[[], Telling]
     ) -> None:
         self._config = config
         self._clients = clients
@@ -94,7 +94,7 @@ class StatusDesk:
         self.alignment_report: Callable[[int, AlignmentReport | None, int], AlignmentReport | None] = (
             lambda _number, half, _now_ns: half
         )
-        self._lines: dict[int, _Line] = {}
+        self._stats: dict[int, _ConnectionStats] = {}
         self._lost: dict[str, str] = {}  # participant id -> why its connection was lost
         self._rolled_ns = 0
         self._entries = 0
@@ -102,43 +102,43 @@ class StatusDesk:
         self._made: StatusReport | None = None
         self._made_ns = 0
 
-    def sampled(self, connection: int, sample: Sample, now_ns: int) -> None:
+    def record_sample(self, connection: int, sample: Sample, now_ns: int) -> None:
         """A sample has come in."""
-        line = self._line(connection)
+        line = self._find_stats(connection)
         line.samples += 1
         line.delays_ns.append(now_ns - sample.capture_ns)
 
-    def reported(self, connection: int, report: ClientReport, now_ns: int) -> None:
+    def record_report(self, connection: int, report: ClientReport, now_ns: int) -> None:
         """A client tells how state arrives."""
-        line = self._line(connection)
+        line = self._find_stats(connection)
         numbers = [value for value in msgspec.structs.astuple(report) if isinstance(value, float)]
         if all(map(math.isfinite, numbers)):
             line.report, line.reported_ns = report, now_ns
         else:
             self._drops.count("report_not_finite", connection)
 
-    def client_report(self, connection: int, now_ns: int) -> ClientReport | None:
+    def find_report(self, connection: int, now_ns: int) -> ClientReport | None:
         """The newest report of a client, `None` without one of the last seconds."""
-        line = self._lines.get(connection)
-        return None if line is None else line.fresh(now_ns)
+        line = self._stats.get(connection)
+        return None if line is None else line.recent_report(now_ns)
 
-    def lost(self, connection: Connection, reason: str) -> None:
+    def record_disconnect(self, connection: FrontConnection, reason: str) -> None:
         """The front lost a connection: its participant may wait in the roster for a while."""
-        self._lines.pop(connection.number, None)
+        self._stats.pop(connection.number, None)
         if connection.participant_id:
             self._lost.pop(connection.participant_id, None)
             self._lost[connection.participant_id] = reason
             while len(self._lost) > self._config.limits.connections:
                 del self._lost[next(iter(self._lost))]
 
-    def asked(self, connection: Connection, question: GetStatus, now_ns: int) -> None:
+    def send_report(self, connection: FrontConnection, question: GetStatus, now_ns: int) -> None:
         """Answers. Rates are limited as those of every message; many who ask get one and the same report."""
         if self._made is None or now_ns - self._made_ns > REUSE_NS:
-            self._made, self._made_ns = self._report(now_ns), now_ns
+            self._made, self._made_ns = self._make_report(now_ns), now_ns
         report = msgspec.structs.replace(self._made, request_id=question.request_id, session_time=now_ns)
         self._outbox.send(connection, report)
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Once a second: rates."""
         elapsed_ns = now_ns - self._rolled_ns
         if elapsed_ns < ROLL_NS:
@@ -147,9 +147,9 @@ class StatusDesk:
         entries = self._tell().entries
         self._entries_per_s = (entries - self._entries) / elapsed_ns * 1e9
         self._entries = entries
-        for number in [n for n in self._lines if n not in self._clients.by_number]:
-            del self._lines[number]
-        for line in self._lines.values():
+        for number in [n for n in self._stats if n not in self._clients.by_number]:
+            del self._stats[number]
+        for line in self._stats.values():
             line.samples_per_s = line.samples / elapsed_ns * 1e9
             line.samples = 0
             if not line.samples_per_s:
@@ -158,13 +158,13 @@ class StatusDesk:
     def close(self) -> None:
         """Nothing was opened."""
 
-    def _line(self, connection: int) -> _Line:
-        line = self._lines.get(connection)
+    def _find_stats(self, connection: int) -> _ConnectionStats:
+        line = self._stats.get(connection)
         if line is None:
-            line = self._lines[connection] = _Line()
+            line = self._stats[connection] = _ConnectionStats()
         return line
 
-    def _report(self, now_ns: int) -> StatusReport:
+    def _make_report(self, now_ns: int) -> StatusReport:
         telling = self._tell()
         config = self._config
         half = _decode_report(telling.authority) if telling.authority else StatusReport(0, "", "", 0)
@@ -177,8 +177,8 @@ class StatusDesk:
             session_id=config.session_id,
             session_name=config.session_name,
             stalled=telling.stalled,
-            step_to_publish=quantiles(delays) if len(delays) >= ENOUGH else None,
-            participants=tuple(self._row(row, by_participant.get(row.id), now_ns) for row in half.participants),
+            step_to_publish=quantiles(delays) if len(delays) >= MIN_DELAYS else None,
+            participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
             warnings=(*half.warnings, *telling.warnings),
             connections=len(self._clients),
@@ -188,14 +188,14 @@ class StatusDesk:
             assets=telling.assets,
         )
 
-    def _row(self, row: ParticipantReport, connection: Connection | None, now_ns: int) -> ParticipantReport:
+    def _merge_row(self, row: ParticipantReport, connection: FrontConnection | None, now_ns: int) -> ParticipantReport:
         """The authority's row of a participant with what the front knows of its connection."""
         if connection is None:
             return msgspec.structs.replace(row, connected=False, lost=self._lost.get(row.id, ""))
-        line = self._lines.get(connection.number) or _Line()
-        report = line.fresh(now_ns)
+        line = self._stats.get(connection.number) or _ConnectionStats()
+        report = line.recent_report(now_ns)
         host, port = connection.address
-        measured = {} if report is None else _of_client(report)
+        measured = {} if report is None else _client_fields(report)
         return msgspec.structs.replace(
             row,
             address=f"{host}:{port}" if host else "",
@@ -211,7 +211,7 @@ class StatusDesk:
         )
 
 
-def _of_client(report: ClientReport) -> dict[str, Any]:
+def _client_fields(report: ClientReport) -> dict[str, Any]:
     expected = report.delivered + report.missed
     measured = report.delivered > 0 and report.age_ms_p99 > 0.0  # 0: what came was sent again, and has no age
     return {

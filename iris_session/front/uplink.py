@@ -5,13 +5,13 @@ from __future__ import annotations
 import zmq
 
 from iris_session.front.coalescer import Coalescer
-from iris_session.front.connections import ClientTable
+from iris_session.front.connections import ConnectionTable
 from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND
 from iris_session.protocol.entries import Entry, encode_entries
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security.resume_tokens import ResumeTokens
 
 STATUS_NS = 500 * MILLISECOND
@@ -27,7 +27,7 @@ class Uplink:
         coalescer: Coalescer,
         downlink: Downlink,
         tokens: ResumeTokens,
-        clients: ClientTable,
+        clients: ConnectionTable,
         drops: Drops,
         publisher: StatePublisher,
     ) -> None:
@@ -52,19 +52,19 @@ class Uplink:
         used = self._batches - self._downlink.acknowledged
         batch: list[Entry] = []
         if used < limit:
-            batch = self._coalescer.take() if self._coalescer else []
+            batch = self._coalescer.take_batch() if self._coalescer else []
         elif self._coalescer.urgent and used < 2 * limit:
-            batch = self._coalescer.take(urgent_only=True)
-        if self._tokens.changed and (batch or self._listens):
+            batch = self._coalescer.take_batch(urgent_only=True)
+        if self._tokens.changed and (batch or self._is_authority_listening):
             self._socket.send_multipart((link.HANDBACK, self._tokens.blob()), zmq.DONTWAIT)
         if batch:
             self._socket.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
             self._batches += 1
             self.entries += len(batch)
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Says that the front lives, and what it counted."""
-        if now_ns >= self._next_beat_ns and self._listens:
+        if now_ns >= self._next_beat_ns and self._is_authority_listening:
             self._next_beat_ns = now_ns + link.BEAT_NS
             self._socket.send_multipart((link.BEAT, b""), zmq.DONTWAIT)
         if now_ns >= self._next_status_ns:
@@ -72,7 +72,7 @@ class Uplink:
             self._report()
 
     @property
-    def _listens(self) -> bool:
+    def _is_authority_listening(self) -> bool:
         """Whether the authority takes what is sent, as far as we know."""
         return self._downlink.heard_ns > 0 and not self.stalled
 

@@ -32,7 +32,7 @@ class FrontLimits(msgspec.Struct, frozen=True):
     `hello_timeout_ns` each; as many again to the state socket that have not subscribed. `subscribers`: TCP connections
     to the state socket that have, and to the media socket; `sources`: to the socket that takes media, of
     each of which `source_bytes` may wait.
-    `memory_bytes`: what all queues together may hold (see `memory.py`).
+    `memory_bytes`: what all queues together may hold (see `MemoryGuard`).
     """
 
     connections: int = 64

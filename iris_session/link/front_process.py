@@ -7,7 +7,6 @@ takes longer than a tick.
 from __future__ import annotations
 
 import os
-import subprocess
 import tempfile
 import threading
 import time
@@ -23,7 +22,7 @@ from iris_session.link.front_link import FrontLink
 from iris_session.link.media_source import MediaSource
 from iris_session.link.starvation import Starvation
 from iris_session.protocol.common import Pose
-from iris_session.system import children
+from iris_session.system.process import ChildProcess
 
 #: Room is left for our own names, of folder and socket.
 LONGEST_FOLDER: Final = 75
@@ -56,7 +55,7 @@ class FrontProcess:
         self.media_endpoint = f"ipc://{self._folder.name}/media"
         self._config = msgspec.structs.replace(config, media_endpoint=self.media_endpoint)
         self._generation = 0
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
         self._replacing: threading.Thread | None = None
         self._failure: FrontError | None = None
         self._source = MediaSource(self.media_endpoint)
@@ -84,7 +83,7 @@ class FrontProcess:
     def fault(self) -> str:
         """What a front did that is to be replaced, empty while all is well."""
         process = self._process
-        if process is None or process.poll() is not None:
+        if process is None or not process.is_running:
             return "ended"
         if self.link.overrun:
             return "read nothing any more"
@@ -134,10 +133,9 @@ class FrontProcess:
         self._replacing = threading.Thread(target=self._replace, args=(self._process, start), name="iris-front")
         self._replacing.start()
 
-    def _replace(self, old: subprocess.Popen[bytes] | None, start: FrontStart) -> None:
+    def _replace(self, old: ChildProcess | None, start: FrontStart) -> None:
         if old is not None:
-            old.kill()  # dead, or it takes part no more: no step waits for its answer
-            old.wait()
+            old.close()  # dead, or it takes part no more: no step waits for its answer
         try:
             self._process = self._spawn(start)
         except FrontError as error:
@@ -163,7 +161,7 @@ class FrontProcess:
         while time.monotonic() < deadline:
             # In this order: once the thread has ended, the process is the new one.
             replacing = self._replacing is not None and self._replacing.is_alive()
-            running = replacing or (self._process is not None and self._process.poll() is None)
+            running = replacing or (self._process is not None and self._process.is_running)
             self.link.receive()
             if self.link.ports is not None:
                 return self.link.ports
@@ -185,19 +183,9 @@ class FrontProcess:
             raise _not_started(error) from error
         return FrontStart(self._config, self._scene, endpoint, os.getpid(), self.link.handback)
 
-    def _spawn(self, start: FrontStart) -> subprocess.Popen[bytes]:
+    def _spawn(self, start: FrontStart) -> ChildProcess:
         try:
-            # A file instead of a pipe: a large scene must not make the parent wait until the front reads.
-            path = Path(self._folder.name) / "start"
-            path.write_bytes(msgspec.msgpack.encode(start))
-            with path.open("rb") as stdin:
-                path.unlink()
-                return subprocess.Popen(
-                    children.command("iris_session.front.main"),
-                    stdin=stdin,
-                    env=children.environment(),
-                    start_new_session=True,
-                )
+            return ChildProcess("iris_session.front.main", config=msgspec.msgpack.encode(start), own_session=True)
         except OSError as error:
             raise _not_started(error) from error
 
@@ -208,18 +196,8 @@ class FrontProcess:
         return self._source.publish(stream, frames, capture_ns, scene_epoch, encoding)
 
     def _end_process(self, patience_s: float) -> None:
-        process = self._process
-        if process is None:
-            return
-        try:
-            process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            process.terminate()
-            try:
-                process.wait(0.2 if patience_s else 0.05)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        if self._process is not None:
+            self._process.close(exit_s=patience_s, terminate_s=0.2 if patience_s else 0.05)
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Tells the clients that the session ends, ends the front, removes the link. May be called twice."""

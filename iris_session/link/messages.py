@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from iris_session.link.config import Ports, SceneInfo
-from iris_session.protocol.decoding import decoder
+from iris_session.protocol.codec import decoder
 from iris_session.protocol.server_messages import Event
 from iris_session.protocol.steps import Admitted, Dropped, Outgoing
 

@@ -16,10 +16,8 @@ import contextlib
 import gc
 import json
 import os
-import select
 import selectors
 import signal
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -27,7 +25,7 @@ from typing import Any, Final, Self
 
 from iris_session.netsim.profiles import Profile, ProfileError, load_profile
 from iris_session.netsim.proxy import Link
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess
 
 ANSWER_S: Final = 10.0
 #: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
@@ -52,20 +50,11 @@ class ImpairmentProcess:
         self, links: Mapping[str, str], ports: Sequence[int], *, target: str = "127.0.0.1", seed: int = 0,
         udp: Sequence[int] = (),
     ) -> None:  # fmt: skip
-        command = children.command(__name__, "--target", target, "--seed", str(seed), "--until-eof")
-        command += ["--ports", ",".join(map(str, ports))]
+        command = ["--target", target, "--seed", str(seed), "--until-eof", "--ports", ",".join(map(str, ports))]
         command += ["--udp", ",".join(map(str, udp))] if udp else []
         for address, profile in links.items():
             command += ["--link", f"{address}={profile}"]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=children.environment(),
-            start_new_session=True,
-        )
-        self._rest = b""
+        self._process = ChildProcess(__name__, command, stdout=PIPE, stderr=PIPE, own_session=True)
         self._unanswered = 1
         try:
             self._answer("start")
@@ -86,24 +75,15 @@ class ImpairmentProcess:
 
     def post(self, command: str) -> None:
         """One command, without waiting for it."""
-        assert self._process.stdin is not None
         self._unanswered += 1
         try:
-            self._process.stdin.write(command.encode() + b"\n")
-            self._process.stdin.flush()
+            self._process.write(command.encode() + b"\n")
         except OSError as error:
-            raise ImpairmentError(f"the proxy has ended with status {self._process.poll()}") from error
+            raise ImpairmentError(f"the proxy has ended with status {self._process.exit_status}") from error
 
     def close(self) -> None:
         """Ends the process; may be called twice."""
-        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
-            assert pipe is not None
-            pipe.close()
-        try:
-            self._process.wait(2.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._process.close(exit_s=2.0)
 
     def __enter__(self) -> Self:
         return self
@@ -114,20 +94,13 @@ class ImpairmentProcess:
         self.close()
 
     def _answer(self, command: str) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        fd = self._process.stdout.fileno()
-        ready = select.poll()  # `select.select` takes no descriptor above 1023
-        ready.register(fd, select.POLLIN)
-        while b"\n" not in self._rest:
-            if not ready.poll(ANSWER_S * 1e3):
-                raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s")
-            data = os.read(fd, 65536)
-            if not data:
-                said = self._process.stderr.read().decode(errors="replace").strip().splitlines()
-                raise ImpairmentError(said[-1] if said else f"the proxy ended at {command!r}")
-            self._rest += data
-        line, _, self._rest = self._rest.partition(b"\n")
+        try:
+            line = self._process.read_line(ANSWER_S)
+        except TimeoutError:
+            raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s") from None
+        except EOFError:
+            messages = self._process.read_stderr().strip().splitlines()
+            raise ImpairmentError(messages[-1] if messages else f"the proxy ended at {command!r}") from None
         self._unanswered -= 1
         answer: dict[str, Any] = json.loads(line)
         if not answer["ok"]:

@@ -11,9 +11,8 @@ from typing import Annotated
 
 import msgspec
 
-from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Target, Text
+from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Proof, Target, Text
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.protocol.security import Pair, RemoveParticipant
 from iris_session.protocol.status import ClientReport, GetStatus
 
 Joints = Annotated[tuple[float, ...], msgspec.Meta(max_length=64)]
@@ -248,6 +247,27 @@ class Marker(Message, frozen=True, tag="marker"):
 
     request_id: Count
     text: Text
+
+
+class Pair(Message, frozen=True, tag="pair"):
+    """Asks for the key of this connection to be put on the allow-list: all that an unknown key may say.
+
+    `proof`: shows that the sender knows a join code, without telling it (`protocol.pairing`). `name`: under which the
+    key is listed, for people.
+    """
+
+    name: Name
+    proof: Proof
+    software: Name = ""
+
+
+class RemoveParticipant(Message, frozen=True, tag="remove_participant"):
+    """A director ends someone's participation. `revoke`: their key is taken off the allow-list too."""
+
+    request_id: Count
+    participant: Name
+    revoke: bool = False
+    reason: Text = ""
 
 
 ClientMessage = (

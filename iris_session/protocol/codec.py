@@ -8,7 +8,7 @@ authority answers them with typed reasons).
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final, TypeVar, get_args
 
 import msgspec
@@ -16,7 +16,6 @@ import msgspec
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRefused, AssetRequest
 from iris_session.protocol.client_messages import ClientEnvelope, ClientMessage
 from iris_session.protocol.common import EventBody, Message
-from iris_session.protocol.decoding import BAD_BYTES, Bytes
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.errors import MalformedError, ProtocolError, TooLargeError, VersionError
 from iris_session.protocol.limits import (
@@ -43,8 +42,27 @@ from iris_session.protocol.server_messages import (
     StateHeader,
 )
 
+Bytes = bytes | bytearray | memoryview
+#: Exceptions that `msgspec` raises for arbitrary bytes: schema and syntax, text that is not UTF-8, nesting, numbers.
+BAD_BYTES: Final = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError)
+K = TypeVar("K")
 T = TypeVar("T")
 A = TypeVar("A", AssetRequest, AssetChunk, AssetRefused)
+
+
+def decoder(kind: type[K]) -> Callable[[Bytes], K]:
+    """Bytes to a `kind`. Raises `msgspec.DecodeError` (or its subclass `ValidationError`) and nothing else."""
+    decode = msgspec.msgpack.Decoder(kind).decode
+
+    def checked(data: Bytes) -> K:
+        try:
+            return decode(data)
+        except msgspec.DecodeError:
+            raise
+        except BAD_BYTES as error:
+            raise msgspec.DecodeError(str(error)) from None
+
+    return checked
 
 
 def tag_of(kind: type[msgspec.Struct]) -> str:

@@ -17,6 +17,8 @@ Names = Annotated[tuple[Name, ...], msgspec.Meta(max_length=32)]
 #: Any counter, epoch, version or nanosecond count. Fits an int64 in every client language.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+#: HMAC-SHA256 of a join code (`protocol.pairing`).
+Proof = Annotated[bytes, msgspec.Meta(max_length=64)]
 #: Metres (or metres per second), x y z.
 Vec3 = tuple[float, float, float]
 #: Unit quaternion `[w, x, y, z]`.

@@ -28,15 +28,15 @@ from iris_session.protocol.client_messages import (
     Observation,
     PlaceAlignment,
     Release,
+    RemoveParticipant,
     Sample,
     SetMode,
     SetScale,
     TrackingEpoch,
 )
+from iris_session.protocol.codec import decoder
 from iris_session.protocol.common import Count, Message, Name, Names, Nanoseconds, Pose, Text, Vec3
-from iris_session.protocol.decoding import decoder
-from iris_session.protocol.scene_patch import MAX_OPS, PatchOp
-from iris_session.protocol.security import RemoveParticipant
+from iris_session.protocol.scene import MAX_OPS, PatchOp
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 
 #: Connection number of the process that owns the session (its Python API). It acts with the rights of a director.

@@ -1,7 +1,8 @@
-"""Size and rate limits of every message, and the token bucket that applies the rates.
+"""Size and rate limits of every message, the token bucket that applies rates, and the counters of dropped messages.
 
-Sizes are checked by `codec` when it decodes. Rates are per connection and message type; the front applies them with a
-`RateLimiter` and counts what it drops. A limit is generous for an honest client: it bounds memory and work, not use.
+`codec` checks sizes when it decodes. Rates are per connection and message type; the front applies them with a
+`RateLimiter` and counts drops in `Drops`. A limit is generous for an honest client: it bounds memory and work, not use.
+Pure: time is an argument, in nanoseconds.
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ from iris_session.protocol.client_messages import (
     Marker,
     MoveAnchor,
     Observation,
+    Pair,
     PlaceAlignment,
     Release,
+    RemoveParticipant,
     Sample,
     Samples,
     SetMode,
@@ -39,11 +42,11 @@ from iris_session.protocol.client_messages import (
     TrackingEpoch,
 )
 from iris_session.protocol.common import Message
-from iris_session.protocol.security import Pair, Paired, RemoveParticipant
 from iris_session.protocol.server_messages import (
     ClockPong,
     Event,
     Feedback,
+    Paired,
     ProtocolFault,
     Refused,
     Reply,
@@ -51,6 +54,8 @@ from iris_session.protocol.server_messages import (
     Welcome,
 )
 from iris_session.protocol.status import ClientReport, DeliveryBudget, GetStatus, StatusReport
+
+_TOKEN: Final = 1_000_000_000  # nano-tokens
 
 
 class Limit(msgspec.Struct, frozen=True):
@@ -61,7 +66,7 @@ class Limit(msgspec.Struct, frozen=True):
     burst: int = 0
 
 
-#: What a person or program asks for: clicks and commands, not a stream. A list of 32 names of 64 characters (4 bytes
+#: Requests of a person or program: clicks and commands, not a stream. A list of 32 names of 64 characters (4 bytes
 #: each in the worst case) fits.
 _REQUEST: Final = Limit(max_bytes=20_000, per_second=20, burst=40)
 
@@ -98,7 +103,7 @@ LIMITS: Final[Mapping[type[Message], Limit]] = MappingProxyType(
         ClientReport: Limit(1_000, 4, 8),
     }
 )
-#: Largest message of any type from a client: what the socket may take at all (`ZMQ_MAXMSGSIZE`).
+#: Largest message of any type from a client (`ZMQ_MAXMSGSIZE` of the control socket).
 MAX_CLIENT_BYTES: Final = max(limit.max_bytes for limit in LIMITS.values())
 
 #: From the server, checked by clients. A snapshot names every body: 65,535 of them.
@@ -128,34 +133,75 @@ MAX_ASSET_REQUEST_BYTES: Final = 512
 MAX_ASSET_HEADER_BYTES: Final = 4_000
 #: One UDP datagram without fragmentation on Ethernet.
 MAX_BEACON_BYTES: Final = 1_400
-#: What a session says of itself over TCP, without the length before it.
+#: The introduction of a session over TCP, without its length prefix.
 MAX_INTRODUCTION_BYTES: Final = 4_000
 
 
-class RateLimiter:
-    """Token buckets of one connection, one per message type. Pure: the time is given.
+class TokenBucket:
+    """A token bucket: allows `burst` at once and `rate` per second on average.
 
-    Integer arithmetic in nano-tokens, so that it is exact: a bucket gains `per_second` nano-tokens per nanosecond.
+    Counts in integer nano-tokens, so it is exact: it gains `rate` nano-tokens per nanosecond.
     """
+
+    __slots__ = ("_full", "_last_ns", "_rate", "_tokens")
+
+    def __init__(self, rate: float, burst: int, now_ns: int = 0) -> None:
+        self._rate = rate
+        self._full = burst * _TOKEN
+        self._tokens = self._full
+        self._last_ns = now_ns
+
+    def take(self, now_ns: int) -> bool:
+        """Use one token; return false when there is none. A time before the last one adds nothing."""
+        if now_ns > self._last_ns:
+            self._tokens = min(self._full, self._tokens + int((now_ns - self._last_ns) * self._rate))
+            self._last_ns = now_ns
+        if self._tokens < _TOKEN:
+            return False
+        self._tokens -= _TOKEN
+        return True
+
+
+class RateLimiter:
+    """The token buckets of one connection, one per message type. Pure: time is an argument."""
 
     __slots__ = ("_buckets", "_limits")
 
     def __init__(self, limits: Mapping[type[Message], Limit] = LIMITS) -> None:
         self._limits = limits
-        self._buckets: dict[type[Message], tuple[int, int]] = {}  # type -> (nano-tokens, time of last use)
+        self._buckets: dict[type[Message], TokenBucket] = {}
 
     def allow(self, kind: type[Message], now_ns: int) -> bool:
-        """Whether one more message of type `kind` may pass at `now_ns`; takes its token. Time may stand still.
+        """Use one token of the type's bucket; return false when there is none. Types without a burst always pass.
 
         Raises `KeyError` for a type without a limit.
         """
         limit = self._limits[kind]
         if not limit.burst:
             return True
-        full = limit.burst * 1_000_000_000
-        tokens, used_ns = self._buckets.get(kind, (full, now_ns))
-        elapsed_ns = max(0, now_ns - used_ns)
-        tokens = min(full, tokens + int(elapsed_ns * limit.per_second))
-        allowed = tokens >= 1_000_000_000
-        self._buckets[kind] = (tokens - 1_000_000_000 if allowed else tokens, max(now_ns, used_ns))
-        return allowed
+        bucket = self._buckets.get(kind)
+        if bucket is None:
+            bucket = self._buckets[kind] = TokenBucket(limit.per_second, limit.burst, now_ns)
+        return bucket.take(now_ns)
+
+
+class Drops(msgspec.Struct):
+    """Counters of dropped messages, by reason and by connection. `version` grows with every drop.
+
+    The connection map keeps open connections only: `remove` takes one out when it is closed.
+    """
+
+    by_reason: dict[str, int] = {}
+    by_connection: dict[int, int] = {}
+    version: int = 0
+
+    def count(self, reason: str, connection: int = 0, n: int = 1) -> None:
+        """Add `n` drops for `reason`, and for `connection` unless it is 0."""
+        self.by_reason[reason] = self.by_reason.get(reason, 0) + n
+        if connection:
+            self.by_connection[connection] = self.by_connection.get(connection, 0) + n
+        self.version += 1
+
+    def remove(self, connection: int) -> None:
+        """Forget the counter of one connection."""
+        self.by_connection.pop(connection, None)

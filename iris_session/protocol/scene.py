@@ -1,33 +1,137 @@
-"""The scene specification, version 1: what a client needs to draw a scene, apart from the bytes of meshes and textures.
+"""The scene specification, version 1: everything a client needs to draw a scene but the bytes of meshes and textures.
 
 A specification is itself an asset: `encode_scene` gives its bytes, and the SHA-256 of these is the scene's hash. All
 references are indices into the lists of the specification, -1 for none; bodies are referred to by `Body.id`. World
-frame right-handed, Z up; metres, radians where nothing else is said; colours are red, green, blue (and alpha) in
+frame right-handed, Z up; metres and radians unless stated otherwise; colours are red, green, blue (and alpha) in
 0..1, without colour management, as MuJoCo blends them. Names may be empty, and may repeat.
+
+Patches (`PatchOp`) are visual changes of a scene in use. They concern drawing only: bodies, joints and collisions
+change with another scene. A patch is applied whole or not at all; after it the scene has the hash of its new
+specification.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Final, Protocol
 
 import msgspec
 
+from iris_session.protocol.codec import Bytes, decoder
 from iris_session.protocol.common import Count, Name, Pose, Text, Vec3
-from iris_session.protocol.decoding import Bytes, decoder
-from iris_session.protocol.scene_looks import (
-    Address,
-    HeightField,
-    Int32,
-    Material,
-    Mesh,
-    Ref,
-    Rgb,
-    Rgba,
-    Texture,
-    Vec2,
-)
-from iris_session.protocol.scene_names import SCENE_VERSION, AssetEncoding, Follow
+from iris_session.protocol.names import SCENE_VERSION, AssetEncoding, Follow, TextureRole
+
+#: SHA-256 of the bytes of an asset, as 64 hex digits.
+Address = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+#: Index into a list of the specification, or -1 for none.
+Ref = Annotated[int, msgspec.Meta(ge=-1, le=2**31 - 1)]
+#: A small number: of a group, of pixels.
+Int32 = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
+#: Levels of detail of a mesh or texture: each halves the sides, so 32 are more than any image has.
+MAX_LEVELS: Final = 32
+Rgb = tuple[float, float, float]
+Rgba = tuple[float, float, float, float]
+Vec2 = tuple[float, float]
+
+
+class TextureUse(msgspec.Struct, frozen=True):
+    """A texture in one `TextureRole`."""
+
+    role: Name
+    texture: Ref
+
+
+class Material(msgspec.Struct, frozen=True):
+    """How a surface looks, in MuJoCo's terms. `specular`, `shininess` (times 128: exponent), `reflectance`: 0..1.
+
+    `emission`: light of its own, times the colour. `metallic`, `roughness`: -1 where the scene does not say. The
+    texture's colour multiplies that of the visual. `repeat`: times that a 2d texture is laid over the shape, or over
+    one metre when `uniform` (docs/scene.md, texture coordinates).
+    """
+
+    name: Text
+    rgba: Rgba
+    emission: float = 0.0
+    specular: float = 0.5
+    shininess: float = 0.5
+    reflectance: float = 0.0
+    metallic: float = -1.0
+    roughness: float = -1.0
+    textures: Annotated[tuple[TextureUse, ...], msgspec.Meta(max_length=16)] = ()
+    repeat: Vec2 = (1.0, 1.0)
+    uniform: bool = False
+
+    def texture(self, *roles: str) -> int:
+        """The texture in the first of `roles` that is there, -1 for none. Without roles: the colour."""
+        for role in roles or (TextureRole.RGB, TextureRole.RGBA):
+            for use in self.textures:
+                if use.role == role:
+                    return use.texture
+        return -1
+
+
+class TextureLevel(msgspec.Struct, frozen=True):
+    """One size of a texture. `max_error`: largest difference of a channel to the exact pixels of this size, 0..255."""
+
+    address: Address
+    bytes: Count
+    encoding: Name
+    width: Count
+    height: Count
+    max_error: Int32 = 0
+
+
+class Texture(msgspec.Struct, frozen=True):
+    """An image. `height` of cube and skybox is that of one face; their assets hold six, one below the other, in the
+    order right, left, up, down, front, back. Level 0 is the whole image, each further one has half its sides.
+    """
+
+    name: Text
+    kind: Name
+    width: Count
+    height: Count
+    channels: Count
+    colorspace: Name
+    levels: Annotated[tuple[TextureLevel, ...], msgspec.Meta(max_length=MAX_LEVELS)]
+
+
+class MeshLevel(msgspec.Struct, frozen=True):
+    """One level of detail. `max_error_m`: how far its points lie from the exact mesh at most [m], 0: exact. Parts of
+    the exact mesh that are smaller than this may be missing.
+    """
+
+    address: Address
+    bytes: Count
+    encoding: Name
+    vertices: Count
+    triangles: Count
+    max_error_m: float = 0.0
+
+
+class Mesh(msgspec.Struct, frozen=True):
+    """Triangles. Level 0 is exact, each further one coarser. `low`, `high`: the box around it in its frame [m]."""
+
+    name: Text
+    low: Vec3
+    high: Vec3
+    textured: bool
+    levels: Annotated[tuple[MeshLevel, ...], msgspec.Meta(max_length=MAX_LEVELS)]
+
+
+class HeightField(msgspec.Struct, frozen=True):
+    """Elevations on a grid, rows along y, columns along x, in 0..1.
+
+    `size` [m]: half length along x, along y, height of elevation 1, depth of the base below 0.
+    """
+
+    name: Text
+    rows: Count
+    columns: Count
+    size: tuple[float, float, float, float]
+    address: Address
+    bytes: Count
+    encoding: Name = AssetEncoding.ARRAYS
+
 
 #: Largest specification in bytes that is read: some 100,000 visuals.
 MAX_SCENE_BYTES: Final = 32_000_000
@@ -372,3 +476,111 @@ def _on_bodies(what: str, things: Sequence[Placed], bodies: set[int]) -> None:
 def _refer(what: str, index: int, count: int) -> None:
     if index >= count:
         raise SceneError(f"reference to {what} {index}, but there are {count}")
+
+
+# --- patches ---
+
+#: Operations of one patch, and all that a scene may have had since it was loaded.
+MAX_OPS: Final = 64
+MAX_PATCHES: Final = 1024
+
+
+class SetVisual(msgspec.Struct, frozen=True, tag_field="op", tag="set_visual"):
+    """Changes how a visual is drawn; what is not given stays. `rgba` with alpha 0 hides it."""
+
+    visual: Count
+    rgba: Rgba | None = None
+    group: Int32 | None = None
+    material: Ref | None = None
+    T_body_visual: Pose | None = None
+
+
+class AddVisual(msgspec.Struct, frozen=True, tag_field="op", tag="add_visual"):
+    """Decoration on a body (0: the world). Its `id` must be free."""
+
+    visual: Visual
+
+
+class RemoveVisual(msgspec.Struct, frozen=True, tag_field="op", tag="remove_visual"):
+    visual: Count
+
+
+class AddMesh(msgspec.Struct, frozen=True, tag_field="op", tag="add_mesh"):
+    """At the end of the list, for visuals that come after it."""
+
+    mesh: Mesh
+
+
+class AddMaterial(msgspec.Struct, frozen=True, tag_field="op", tag="add_material"):
+    """At the end of the list, for visuals that come after it."""
+
+    material: Material
+
+
+PatchOp = SetVisual | AddVisual | RemoveVisual | AddMesh | AddMaterial
+
+
+def patched(spec: SceneSpec, ops: Sequence[PatchOp]) -> SceneSpec:
+    """The scene after a patch. Raises `SceneError` that says what does not fit; nothing is changed then.
+
+    `totals` stay those of the scene as it was loaded.
+    """
+    if len(ops) > MAX_PATCHES:
+        raise SceneError(f"{len(ops)} operations at once, at most {MAX_PATCHES}")
+    visuals = {visual.id: visual for visual in spec.visuals}
+    meshes, materials = list(spec.meshes), list(spec.materials)
+    for op in ops:
+        if isinstance(op, AddVisual):
+            if op.visual.id in visuals:
+                raise SceneError(f"there is a visual {op.visual.id} already: take an id that is free")
+            visuals[op.visual.id] = op.visual
+        elif isinstance(op, AddMesh):
+            meshes.append(op.mesh)
+        elif isinstance(op, AddMaterial):
+            materials.append(op.material)
+        elif op.visual not in visuals:
+            raise SceneError(f"there is no visual {op.visual}")
+        elif isinstance(op, SetVisual):
+            visuals[op.visual] = _set(visuals[op.visual], op)
+        else:
+            del visuals[op.visual]
+    after = msgspec.structs.replace(
+        spec, visuals=tuple(visuals.values()), meshes=tuple(meshes), materials=tuple(materials)
+    )
+    check_scene(after)
+    return after
+
+
+def merged(before: Iterable[PatchOp], ops: Iterable[PatchOp]) -> tuple[PatchOp, ...]:
+    """One list of operations that does what both do, in as few as there is something to say of each visual."""
+    found: list[PatchOp] = list(before)
+    for op in ops:
+        earlier = next((i for i in range(len(found) - 1, -1, -1) if _about(found[i]) == _about(op)), -1)
+        old = found[earlier] if earlier >= 0 else None
+        if isinstance(op, SetVisual) and isinstance(old, SetVisual):
+            found[earlier] = msgspec.structs.replace(old, **_given(op))
+        elif isinstance(op, SetVisual) and isinstance(old, AddVisual):
+            found[earlier] = AddVisual(_set(old.visual, op))
+        elif isinstance(op, RemoveVisual) and isinstance(old, AddVisual):
+            del found[earlier]  # what it refers to may serve others: lists keep their order
+        elif isinstance(op, RemoveVisual) and isinstance(old, SetVisual):
+            found[earlier] = op
+        else:
+            found.append(op)
+    return tuple(found)
+
+
+def _about(op: PatchOp) -> int | None:
+    """Id of the visual that an operation is about; additions to lists are about themselves only."""
+    if isinstance(op, AddVisual):
+        return op.visual.id
+    return op.visual if isinstance(op, SetVisual | RemoveVisual) else None
+
+
+def _given(op: SetVisual) -> dict[str, object]:
+    fields = ("rgba", "group", "material", "T_body_visual")
+    return {name: getattr(op, name) for name in fields if getattr(op, name) is not None}
+
+
+def _set(visual: Visual, op: SetVisual) -> Visual:
+    return msgspec.structs.replace(visual, **_given(op))

@@ -1,35 +1,30 @@
 """Messages from the session to a client, version 1. The tag field is `type`; events carry their kind in `event`.
 
-On the control channel each is inside a `ServerEnvelope`. World frame: right-handed, Z up, metres, `[w, x, y, z]`.
+On the control channel each is inside a `ServerEnvelope`. The state channel has two messages of its own, `StateHeader`
+and `Presence`, of which only the latest counts. World frame: right-handed, Z up, metres, `[w, x, y, z]`.
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from iris_session.protocol.alignment_events import AlignmentAlarmed as AlignmentAlarmed  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.alignment_events import AlignmentRun as AlignmentRun  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.alignment_events import AnchorMoved as AnchorMoved  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.alignment_events import HeadsetsCompared as HeadsetsCompared  # noqa: PLC0414 (offered here too)
 from iris_session.protocol.common import (
     Alignment,
+    Applied,
     Count,
     Denial,
     EventBody,
     Lease,
     Message,
     Name,
+    Names,
     Nanoseconds,
     Pose,
+    Proof,
     Text,
+    Vec3,
 )
 from iris_session.protocol.names import PROTOCOL_VERSION
-from iris_session.protocol.security import Audited, Paired
-from iris_session.protocol.state_channel import TOPIC_PRESENCE as TOPIC_PRESENCE  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.state_channel import TOPIC_RIGID as TOPIC_RIGID  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.state_channel import Presence as Presence  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.state_channel import PresenceItem as PresenceItem  # noqa: PLC0414 (offered here too)
-from iris_session.protocol.state_channel import StateHeader as StateHeader  # noqa: PLC0414 (offered here too)
 from iris_session.protocol.status import DeliveryBudget, StatusReport
 
 
@@ -216,6 +211,50 @@ class AlignmentChanged(EventBody, frozen=True, tag="alignment_changed"):
     alignment: Alignment
 
 
+class AlignmentRun(EventBody, frozen=True, tag="alignment_run"):
+    """The alignment run of a participant was started anew (`running`), or stopped. `run` counts the starts."""
+
+    participant: Name
+    running: bool
+    run: Count
+    by: Name = ""
+
+
+class AlignmentAlarmed(EventBody, frozen=True, tag="alignment_alarmed"):
+    """The alignment of a participant was found wrong by `size_m` (`AlarmKind`); a `jump` has voided it. `beside`:
+    anchors that stayed where they were meanwhile: then the anchor was moved, not the headset."""
+
+    participant: Name
+    kind: Name
+    anchor_id: Name
+    size_m: float
+    beside: Names = ()
+
+
+class AnchorMoved(EventBody, frozen=True, tag="anchor_moved"):
+    """A director moved an anchor: alignments to it follow."""
+
+    anchor_id: Name
+    T_world_anchor: Pose
+    by: Name = ""
+
+
+class HeadsetsCompared(EventBody, frozen=True, tag="headsets_compared"):
+    """Measured: participants `a` and `b` put one thing (`anchor_id`), at `p_world`, `error_m` and `error_rad` apart.
+
+    `expected_p95_m`: what 95 % of such pairs stay below by their stated errors and the noise of these `n` looks.
+    """
+
+    a: Name
+    b: Name
+    anchor_id: Name
+    error_m: float
+    error_rad: float
+    expected_p95_m: float
+    p_world: Vec3
+    n: Count
+
+
 class SceneChanged(EventBody, frozen=True, tag="scene_changed"):
     """`cause`: reset, new_scene, patch, external (the user's loop went back in time).
 
@@ -300,6 +339,20 @@ class Notice(EventBody, frozen=True, tag="notice"):
     reason: Name = ""
 
 
+class Audited(EventBody, frozen=True, tag="audited"):
+    """Something that concerns security. `kind`: `AuditKind`. `subject`: fingerprint of a key, or a participant id.
+
+    Repeated ones (wrong codes, unknown keys) come at most once a second and address, with their `count`.
+    """
+
+    kind: Name
+    subject: Name = ""
+    name: Name = ""
+    address: Name = ""
+    detail: Text = ""
+    count: Count = 1
+
+
 EventKind = (
     ParticipantJoined
     | ParticipantChanged
@@ -364,6 +417,17 @@ class Snapshot(Message, frozen=True, tag="snapshot"):
     tick_period_ns: Nanoseconds = 0
 
 
+class Paired(Message, frozen=True, tag="paired"):
+    """The key is on the allow-list. Connect anew to say `hello`: this connection stays that of an unknown key.
+
+    `proof`: shows that the session knows the join code too, so it is the one that gave it out.
+    `roles`: what this key may join as; empty: any role.
+    """
+
+    proof: Proof
+    roles: Names = ()
+
+
 ServerMessage = (
     Welcome
     | Refused
@@ -385,3 +449,46 @@ class ServerEnvelope(msgspec.Struct, frozen=True, array_like=True):
     version: int
     connection_epoch: Count
     message: ServerMessage
+
+
+# --- state channel ---
+
+
+class StateHeader(msgspec.Struct, frozen=True, array_like=True):
+    """First payload frame of a rigid-state message; topic frame before it, encoded poses after it.
+
+    `session_time`: end of the tick that this state belongs to. `published_ns`: session time when handed to the socket.
+    `base_seq`: a client that holds any frame >= `base_seq` of this `scene_epoch` has every body within the bound after
+    this one; an older client asks for a snapshot. `ticks` are counted within the epoch.
+    """
+
+    scene_epoch: Count
+    scene_revision: Count
+    tick: Count
+    sim_time: float
+    session_time: Nanoseconds
+    published_ns: Nanoseconds
+    state_seq: Count
+    base_seq: Count
+    applied: tuple[Applied, ...] = ()
+
+
+class PresenceItem(msgspec.Struct, frozen=True, array_like=True):
+    """A device of a participant in the world. Only of participants that are aligned."""
+
+    participant: Name
+    device: Name
+    pose: Pose
+    capture_ns: Nanoseconds = 0
+
+
+class Presence(msgspec.Struct, frozen=True, array_like=True):
+    """Message on topic `presence`: heads and hands of everyone, latest value."""
+
+    session_time: Nanoseconds
+    published_ns: Nanoseconds
+    items: tuple[PresenceItem, ...]
+
+
+TOPIC_RIGID = b"rigid"
+TOPIC_PRESENCE = b"presence"

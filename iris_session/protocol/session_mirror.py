@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from anchors.pose import PoseTuple
-from iris_session.protocol.common import Alignment, Lease
+from iris_session.protocol.common import Alignment, Lease, Pose
 from iris_session.protocol.server_messages import (
     AlignmentChanged,
     BodyInfo,
@@ -38,7 +37,7 @@ SAME_BODIES: Final = frozenset({"reset", "patch", "external"})
 _encoder = msgspec.msgpack.Encoder(order="deterministic")
 
 
-class Missed(NamedTuple):
+class MissedEvents(NamedTuple):
     """Events `first` to `last` that will not be handed over: a snapshot tells what came of them, not what they were."""
 
     first: int
@@ -63,7 +62,7 @@ class SessionMirror:
     def reset(self) -> None:
         """Forgets the session, keeps the counters."""
         self.synced = False
-        self._begun = False  # a snapshot has come
+        self._has_snapshot = False  # a snapshot has come
         self.event_seq = 0
         self.scene_epoch = 0
         self.scene_revision = 0
@@ -81,7 +80,7 @@ class SessionMirror:
         self.index_of_id: dict[int, int] = {}
         self._held: deque[Event] = deque(maxlen=MAX_HELD_EVENTS)
 
-    def apply_snapshot(self, snapshot: Snapshot) -> list[Event | Missed]:
+    def apply_snapshot(self, snapshot: Snapshot) -> list[Event | MissedEvents]:
         """Takes over a snapshot and the held events after it. Returns, in order, the events since the last one that was
         applied: each one that came, and for those that did not come that they are missed. What was before the first
         snapshot is neither.
@@ -93,7 +92,7 @@ class SessionMirror:
             return []
         held = {event.event_seq: event for event in self._held}
         self._held = deque(maxlen=MAX_HELD_EVENTS)
-        told = self._covered(held, snapshot.event_seq) if self._begun else []
+        told = self._list_covered_events(held, snapshot.event_seq) if self._has_snapshot else []
         self.event_seq = snapshot.event_seq
         self.scene_epoch = snapshot.scene_epoch
         self.scene_revision = snapshot.scene_revision
@@ -110,21 +109,21 @@ class SessionMirror:
         self.bodies, self.bodies_until = snapshot.bodies, snapshot.scene_epoch
         self.body_index = {body.name: i for i, body in enumerate(snapshot.bodies)}
         self.index_of_id = {body.id: i for i, body in enumerate(snapshot.bodies)}
-        self.synced = self._begun = True
+        self.synced = self._has_snapshot = True
         self.discarded += 0 if told else sum(seq <= snapshot.event_seq for seq in held)
         return told + [held[seq] for seq in sorted(held) if seq > snapshot.event_seq and self.apply_event(held[seq])]
 
-    def _covered(self, held: dict[int, Event], last: int) -> list[Event | Missed]:
+    def _list_covered_events(self, held: dict[int, Event], last: int) -> list[Event | MissedEvents]:
         """What is to be told of the events up to `last`, which a snapshot contains."""
-        told: list[Event | Missed] = []
+        told: list[Event | MissedEvents] = []
         next_seq = self.event_seq + 1
         for seq in sorted(seq for seq in held if next_seq <= seq <= last):
             if seq > next_seq:
-                told.append(Missed(next_seq, seq - 1))
+                told.append(MissedEvents(next_seq, seq - 1))
             told.append(held[seq])
             next_seq = seq + 1
         if next_seq <= last:
-            told.append(Missed(next_seq, last))
+            told.append(MissedEvents(next_seq, last))
         return told
 
     def apply_event(self, event: Event) -> bool:
@@ -149,18 +148,18 @@ class SessionMirror:
         """Ids of the participants who are here now."""
         return frozenset(info.id for info in self.participants.values() if info.connected)
 
-    def alignment(self, participant: str) -> Alignment | None:
+    def find_alignment(self, participant: str) -> Alignment | None:
         """The alignment of one participant, `None` while it has none."""
         info = self.participants.get(participant)
         return None if info is None else info.alignment
 
-    def tip(self, robot: str) -> tuple[int, PoseTuple] | None:
+    def find_tip(self, robot: str) -> tuple[int, Pose] | None:
         """Row of the body that carries the robot's end-effector site, and `T_body_site`; `None`: no such robot."""
         info = self.robots.get(robot)
         index = None if info is None else self.index_of_id.get(info.site_body)
-        return None if info is None or index is None else (index, (info.T_body_site.p, info.T_body_site.q))
+        return None if info is None or index is None else (index, info.T_body_site)
 
-    def lease_version(self, target: str, participant: str) -> int | None:
+    def find_lease_version(self, target: str, participant: str) -> int | None:
         """The fencing token of `target` when `participant` holds it (alone or with others), else `None`."""
         lease = self.leases.get(target)
         if lease is None or not (lease.holder == participant or participant in lease.sub_holders):
@@ -195,7 +194,7 @@ class SessionMirror:
             case ParticipantJoined(participant=info) | ParticipantChanged(participant=info):
                 self.participants[info.id] = info
             case ParticipantLeft(participant=name, grace=grace):
-                self._leave(name, grace)
+                self._apply_left(name, grace)
             case LeaseChanged(lease=lease):
                 self.leases[lease.target] = lease
             case ScaleChanged(robot=robot, scale=scale):
@@ -222,7 +221,7 @@ class SessionMirror:
             case _:  # history only: nothing of it is in a snapshot
                 pass
 
-    def _leave(self, participant: str, grace: bool) -> None:
+    def _apply_left(self, participant: str, grace: bool) -> None:
         info = self.participants.get(participant)
         if info is None:
             return

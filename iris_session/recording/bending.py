@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
 from iris_session.recording.scene import WORLD, Pixels, Rgba8, colour
-from iris_session.scene import AssetError
+from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require
 from iris_session.scene.simplify import unit
 from iris_session.streams.deformable import DeformableDecoder
@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 
 
 class Bending:
-    """One deformable. `arrays`: of its asset. Raises `AssetError` for another one's."""
+    """One deformable. `arrays`: of its asset. Raises `AssetDecodeError` for another one's."""
 
     def __init__(
         self,
@@ -40,13 +40,13 @@ class Bending:
         self._rest: Floats = require(arrays, "position", "f4", (None, 3))
         elements = require(arrays, "elements", "u2 u4", (None, corners)).astype(np.int64)
         if elements.size and int(elements.max()) >= len(self._rest):
-            raise AssetError(f"deformable {deformable.name!r} has no vertex {int(elements.max())}")
+            raise AssetDecodeError(f"deformable {deformable.name!r} has no vertex {int(elements.max())}")
         try:
             topology = DeformableTopology.from_bytes(require(arrays, "plan", "u1", (None,)).tobytes())
         except StreamError as error:
-            raise AssetError(f"deformable {deformable.name!r}: {error}") from error
+            raise AssetDecodeError(f"deformable {deformable.name!r}: {error}") from error
         if topology.n_vertices != len(self._rest):
-            raise AssetError(f"deformable {deformable.name!r}: {topology.n_vertices} vertices are streamed")
+            raise AssetDecodeError(f"deformable {deformable.name!r}: {topology.n_vertices} vertices are streamed")
         self._decoder = DeformableDecoder(topology)
         self._last: Floats = self._rest
         self._radius, self._colour = deformable.radius, colour(deformable.rgba)

@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 import msgspec
 
 from iris_session.protocol.client_messages import Observation, Sample
+from iris_session.protocol.codec import BAD_BYTES
 from iris_session.protocol.common import Alignment, Pose, Vec3
-from iris_session.protocol.decoding import BAD_BYTES
 from iris_session.protocol.entries import AlignmentAlarm, Join, decode_entries
 from iris_session.protocol.names import AlarmKind, AlignmentKind, Device
 from iris_session.protocol.server_messages import (

@@ -15,8 +15,8 @@ from typing import Final
 
 import msgspec
 
+from iris_session.protocol.codec import decoder
 from iris_session.protocol.common import Applied, Count, Denial, Name, Nanoseconds
-from iris_session.protocol.decoding import decoder
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader
 

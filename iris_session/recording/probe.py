@@ -11,7 +11,6 @@ import atexit
 import json
 import os
 import select
-import subprocess
 import sys
 import warnings
 from contextlib import suppress
@@ -20,7 +19,7 @@ from threading import Lock
 from types import TracebackType
 from typing import Final, Self
 
-from iris_session.system import children
+from iris_session.system.process import DEVNULL, PIPE, ChildProcess
 
 READABLE: Final = "readable"
 RECORDINGS: Final = "recordings"
@@ -32,34 +31,17 @@ class _Child:
     """The process that is asked."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            children.command("iris_session.recording.probe"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=children.environment(),
-            text=True,
-        )
+        self._process = ChildProcess("iris_session.recording.probe", stdout=PIPE, stderr=DEVNULL)
 
     def ask(self, what: str, path: str | Path) -> str:
         """Its answer; empty when it has died, over this question or before."""
-        process = self._process
-        assert process.stdin is not None
-        assert process.stdout is not None
-        with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps([what, str(Path(path).absolute())]) + "\n")
-            process.stdin.flush()
-            return process.stdout.readline().strip()
+        with suppress(BrokenPipeError, EOFError):
+            self._process.write(json.dumps([what, str(Path(path).absolute())]).encode() + b"\n")
+            return self._process.read_line().decode().strip()
         return ""
 
     def end(self) -> None:
-        process = self._process
-        process.kill()
-        process.wait()
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                with suppress(BrokenPipeError):  # a question that it did not take
-                    stream.close()
+        self._process.close()
 
 
 class _Spare:

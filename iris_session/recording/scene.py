@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, compose
 from iris_session.protocol.common import Pose
-from iris_session.protocol.scene import Deformable, Geometry, SceneSpec, Visual, decode_scene
-from iris_session.protocol.scene_looks import Rgba
-from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.names import ArrayKind, AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.scene import Deformable, Geometry, Rgba, SceneSpec, Visual, decode_scene
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import os
-import select
 import shutil
-import subprocess
 import tempfile
-import time
 import uuid
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +14,7 @@ import msgspec
 from iris_session.recording.errors import RecorderError
 from iris_session.recording.messages import FAULT_PREFIX, RecorderConfig
 from iris_session.recording.paths import part_path
-from iris_session.system import children
+from iris_session.system.process import PIPE, ChildProcess
 
 #: Half a second, on a machine with time to spare.
 START_S: Final = 60.0
@@ -45,7 +41,7 @@ class RecorderProcess:
         self.vertices_endpoint = f"ipc://{self._folder}/vertices"
         self._log = Path(self._folder) / "recorder.log"
         self._recording_id = uuid.uuid4().hex
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
         self.starts = 0
 
     @property
@@ -66,12 +62,12 @@ class RecorderProcess:
     def alive(self) -> bool:
         """False before the start and once the process has ended. May be asked from another thread, as `pid`."""
         process = self._process
-        return process is not None and process.poll() is None
+        return process is not None and process.is_running
 
     @property
     def failure(self) -> str:
         """One line about how the process ended, empty while it runs and after a clean end."""
-        if self._process is None or not (code := self._process.poll()):
+        if self._process is None or not (code := self._process.exit_status):
             return ""
         how = f"killed by signal {-code}" if code < 0 else f"exit status {code}"
         return f"the recorder ended ({how}): {_reason(self._log) or 'no message'}"
@@ -123,54 +119,33 @@ class RecorderProcess:
             self.vertices_endpoint,
         )
         # RERUN=off in a user's shell would silence the stream. Nothing is drawn here: MuJoCo need not load OpenGL.
-        environment = children.environment(RERUN="on", RUST_LOG="error", MUJOCO_GL="disable")
+        environment = {"RERUN": "on", "RUST_LOG": "error", "MUJOCO_GL": "disable"}
         with open(self._log, "ab") as log:
-            self._process = subprocess.Popen(
-                children.command("iris_session.recording.process"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+            self._process = ChildProcess(
+                "iris_session.recording.process",
+                config=msgspec.msgpack.encode(config),
+                stdout=PIPE,
                 stderr=log,
-                env=environment,
-                start_new_session=True,
+                environment=environment,
+                own_session=True,
             )
         self.starts += 1
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it ended before reading; its answer says why
-            self._process.stdin.write(msgspec.msgpack.encode(config))
-            self._process.stdin.close()
 
     def _answer(self) -> str:
         """The first line on standard output: `ready`, or the reason why not."""
         process = self._process
         assert process is not None
-        assert process.stdout is not None
-        text = b""
-        ready = select.poll()  # `select.select` takes no descriptor above 1023
-        ready.register(process.stdout, select.POLLIN)
-        until = time.monotonic() + START_S
-        while b"\n" not in text and (left := until - time.monotonic()) > 0:
-            if ready.poll(left * 1e3):
-                chunk = os.read(process.stdout.fileno(), 4096)
-                if not chunk:
-                    break
-                text += chunk
-        line = text.decode(errors="replace").strip()
+        try:
+            line = process.read_line(START_S).decode(errors="replace").strip()
+        except (TimeoutError, EOFError):
+            line = ""
         return line or f"the recorder did not start within {START_S:g} s: {_reason(self._log) or 'no message'}"
 
     def _end(self, timeout_s: float) -> bool:
         process, self._process = self._process, None
         if process is None:
             return True
-        process.terminate()
-        try:
-            clean = process.wait(timeout_s) == 0
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            clean = False
-        if process.stdout is not None:
-            process.stdout.close()
-        return clean
+        return process.close(terminate_s=timeout_s) == 0
 
 
 def _reason(log: Path) -> str:

@@ -5,10 +5,11 @@
 `budget.choose_levels` fits it to what a client draws. Only modules named `mujoco_*` import MuJoCo.
 """
 
+from iris_session.assets.errors import AssetMissingError
 from iris_session.assets.store import AssetStore, Hold, default_root
 from iris_session.scene.arrays import decode_arrays, encode_arrays
 from iris_session.scene.build import Builder, EncodeOptions
-from iris_session.scene.errors import AssetError, AssetMissingError, SceneBuildError
+from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, encode_mesh, encode_mesh_quantised
 
@@ -27,6 +28,6 @@ __all__ = [
     "encode_arrays",
     "decode_arrays",
     "SceneBuildError",
-    "AssetError",
+    "AssetDecodeError",
     "AssetMissingError",
 ]

@@ -1,7 +1,7 @@
-"""Arrays to bytes and back: the container of `protocol.arrays`, filters and Zstandard. Layout in docs/scene.md.
+"""Encode arrays to bytes and back: the container of `protocol.arrays`, filters and Zstandard. Layout in docs/scene.md.
 
-Decoding is safe for bytes of anybody: it raises `AssetError` and nothing else, and allocates no more than the header
-says, which is checked against a limit first.
+Decoding is safe for untrusted bytes: it raises `AssetDecodeError` and nothing else, and allocates no more than the
+header states, which is checked against a limit first.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAGIC, MAX_ARRAY_BYTES, MAX_HEADER_BYTES, ArrayHeader, ArrayInfo
-from iris_session.protocol.decoding import decoder
-from iris_session.protocol.scene_names import ArrayCodec, ArrayFilter
-from iris_session.scene.errors import AssetError
+from iris_session.protocol.assets import ARRAYS_MAGIC, MAX_ARRAY_BYTES, MAX_ARRAY_HEADER_BYTES, ArrayHeader, ArrayInfo
+from iris_session.protocol.codec import decoder
+from iris_session.protocol.names import ArrayCodec, ArrayFilter
+from iris_session.scene.errors import AssetDecodeError
 
 Array = NDArray[Any]
 _DTYPES: Final = {name: np.dtype(f"<{name}") for name in ("u1", "i1", "u2", "u4", "f4")}
@@ -63,7 +63,7 @@ def encode_arrays(kind: str, arrays: Sequence[Stored], max_error: float = 0.0) -
         )
         bodies.append(packed)
     header = _encoder.encode(ArrayHeader(kind, tuple(infos), max_error))
-    return b"".join((_PREFIX.pack(MAGIC, len(header)), header, *bodies))
+    return b"".join((_PREFIX.pack(ARRAYS_MAGIC, len(header)), header, *bodies))
 
 
 def decode_arrays(
@@ -72,10 +72,10 @@ def decode_arrays(
     """The arrays of an asset by name, quantised ones as float32. `max_bytes`: of all arrays, as they are returned."""
     header, start = read_header(data)
     if header.kind != kind:
-        raise AssetError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
+        raise AssetDecodeError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
     total = sum(_size(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays)
     if total > max_bytes:
-        raise AssetError(f"arrays of {total} bytes, at most {max_bytes} are read")
+        raise AssetDecodeError(f"arrays of {total} bytes, at most {max_bytes} are read")
     view, found = memoryview(data), {}
     for info in header.arrays:
         found[info.name] = _scaled(info, _decode_one(info, view[start : start + info.bytes]))
@@ -86,21 +86,23 @@ def decode_arrays(
 def read_header(data: bytes | bytearray | memoryview) -> tuple[ArrayHeader, int]:
     """The header, and where the first array begins. The lengths in it fit `data` exactly."""
     if len(data) < _PREFIX.size:
-        raise AssetError(f"{len(data)} bytes are no asset of arrays")
+        raise AssetDecodeError(f"{len(data)} bytes are no asset of arrays")
     magic, length = _PREFIX.unpack_from(data)
-    if magic != MAGIC:
-        raise AssetError(f"no asset of arrays: it begins with {bytes(magic)!r}, not {MAGIC!r}")
+    if magic != ARRAYS_MAGIC:
+        raise AssetDecodeError(f"no asset of arrays: it begins with {bytes(magic)!r}, not {ARRAYS_MAGIC!r}")
     start = _PREFIX.size + length
-    if length > MAX_HEADER_BYTES or start > len(data):
-        raise AssetError(f"a header of {length} bytes in an asset of {len(data)}, at most {MAX_HEADER_BYTES}")
+    if length > MAX_ARRAY_HEADER_BYTES or start > len(data):
+        raise AssetDecodeError(
+            f"a header of {length} bytes in an asset of {len(data)}, at most {MAX_ARRAY_HEADER_BYTES}"
+        )
     try:
         header = _decode_header(memoryview(data)[_PREFIX.size : start])
     except msgspec.DecodeError as error:
-        raise AssetError(f"header of an asset: {error}") from None
+        raise AssetDecodeError(f"header of an asset: {error}") from None
     if start + sum(info.bytes for info in header.arrays) != len(data):
-        raise AssetError("the lengths in the header are not those of the asset")
+        raise AssetDecodeError("the lengths in the header are not those of the asset")
     if len({info.name for info in header.arrays}) != len(header.arrays):
-        raise AssetError("two arrays of the same name")
+        raise AssetDecodeError("two arrays of the same name")
     return header, start
 
 
@@ -108,10 +110,12 @@ def require(arrays: Mapping[str, Array], name: str, dtypes: str, shape: Sequence
     """The array `name`, whose dtype is one of `dtypes` (`u2 u4`) and whose shape fits (`None`: any length)."""
     array = arrays.get(name)
     if array is None:
-        raise AssetError(f"the array {name!r} is missing; there are {', '.join(sorted(arrays)) or 'none'}")
+        raise AssetDecodeError(f"the array {name!r} is missing; there are {', '.join(sorted(arrays)) or 'none'}")
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if array.dtype.str.lstrip("<|") not in dtypes.split() or not fits:
-        raise AssetError(f"the array {name!r} is {array.dtype.str} {array.shape}, expected {dtypes} {tuple(shape)}")
+        raise AssetDecodeError(
+            f"the array {name!r} is {array.dtype.str} {array.shape}, expected {dtypes} {tuple(shape)}"
+        )
     return array
 
 
@@ -163,18 +167,20 @@ def _unfiltered(info: ArrayInfo, plain: bytes | memoryview) -> Array:
 
 def _size(info: ArrayInfo) -> int:
     if info.dtype not in _DTYPES:
-        raise AssetError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
+        raise AssetDecodeError(f"unknown dtype {info.dtype!r}, known: {', '.join(_DTYPES)}")
     size = math.prod(info.shape)
     if not size and max(info.shape) > MAX_ARRAY_BYTES:  # which no array of nothing can be
-        raise AssetError(f"array {info.name!r} has the shape {info.shape}, at most {MAX_ARRAY_BYTES} along an axis")
+        raise AssetDecodeError(
+            f"array {info.name!r} has the shape {info.shape}, at most {MAX_ARRAY_BYTES} along an axis"
+        )
     return size * _DTYPES[info.dtype].itemsize
 
 
 def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
     if info.filter not in (ArrayFilter.NONE, ArrayFilter.SHUFFLE, ArrayFilter.DELTA, ArrayFilter.UP):
-        raise AssetError(f"unknown filter {info.filter!r}")
+        raise AssetDecodeError(f"unknown filter {info.filter!r}")
     if info.filter == ArrayFilter.DELTA and info.dtype == "f4":
-        raise AssetError("differences of float32 are not exact")
+        raise AssetDecodeError("differences of float32 are not exact")
     size = _size(info)
     plain: bytes | memoryview
     if info.codec == ArrayCodec.ZSTD:
@@ -182,9 +188,9 @@ def _decode_one(info: ArrayInfo, packed: memoryview) -> Array:
     elif info.codec == ArrayCodec.NONE:
         plain = packed
     else:
-        raise AssetError(f"unknown compression {info.codec!r}")
+        raise AssetDecodeError(f"unknown compression {info.codec!r}")
     if len(plain) != size:
-        raise AssetError(f"array {info.name!r} has {len(plain)} bytes, its shape and dtype need {size}")
+        raise AssetDecodeError(f"array {info.name!r} has {len(plain)} bytes, its shape and dtype need {size}")
     if not size:
         return np.zeros(info.shape, _DTYPES[info.dtype])
     return _unfiltered(info, plain)
@@ -194,10 +200,10 @@ def _decompress(packed: memoryview, size: int) -> bytes:
     try:
         # The frame says its size: checked before anything is allocated for it.
         if zstandard.get_frame_parameters(packed).content_size != size:
-            raise AssetError("a Zstandard frame of another size than the array")
+            raise AssetDecodeError("a Zstandard frame of another size than the array")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
-        raise AssetError(f"damaged Zstandard frame: {error}") from None
+        raise AssetDecodeError(f"damaged Zstandard frame: {error}") from None
 
 
 def _scaled(info: ArrayInfo, stored: Array) -> Array:
@@ -205,9 +211,9 @@ def _scaled(info: ArrayInfo, stored: Array) -> Array:
         return stored
     last = info.shape[-1]
     if len(info.scale) != last or len(info.offset) != last:
-        raise AssetError(f"array {info.name!r}: scale and offset need {last} values each")
+        raise AssetDecodeError(f"array {info.name!r}: scale and offset need {last} values each")
     if not np.isfinite((*info.scale, *info.offset)).all():
-        raise AssetError(f"array {info.name!r}: scale and offset are not finite")
+        raise AssetDecodeError(f"array {info.name!r}: scale and offset are not finite")
     values = np.empty(stored.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(last):  # twice as fast as rows of two or three at once

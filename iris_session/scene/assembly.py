@@ -16,19 +16,22 @@ from numpy.typing import NDArray
 from anchors.pose import compose, inverse
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Pose, Vec3
+from iris_session.protocol.names import GeometryKind, TextureKind
 from iris_session.protocol.scene import (
     Body,
     Deformable,
     Environment,
     Geometry,
+    Material,
+    Mesh,
     SceneError,
     SceneSpec,
+    Texture,
+    TextureUse,
     Visual,
     check_scene,
     encode_scene,
 )
-from iris_session.protocol.scene_looks import Material, Mesh, Texture, TextureUse
-from iris_session.protocol.scene_names import GeometryKind, TextureKind
 from iris_session.scene.build import Builder, EncodeOptions, MeshNote, Work
 from iris_session.scene.collected import Flexible, World
 from iris_session.scene.composed import ComposedScene, DeformableSource

@@ -7,9 +7,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from iris_session.protocol.scene import SceneSpec
-from iris_session.protocol.scene_looks import Mesh
-from iris_session.protocol.scene_names import GeometryKind
+from iris_session.protocol.names import GeometryKind
+from iris_session.protocol.scene import Mesh, SceneSpec
 from iris_session.scene.totals import bending, texture_memory, triangles
 
 #: Where a Quest 3 begins to struggle: objects (draw calls), triangles, memory of textures [bytes].

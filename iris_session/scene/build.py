@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Vec3
-from iris_session.protocol.scene_looks import MeshLevel, TextureLevel
-from iris_session.protocol.scene_names import AssetEncoding, TextureKind
+from iris_session.protocol.names import AssetEncoding, TextureKind
+from iris_session.protocol.scene import MeshLevel, TextureLevel
 from iris_session.scene.images import Pixels, encode_image, halved
 from iris_session.scene.meshes import MeshArrays, encode_mesh, encode_mesh_quantised
 from iris_session.scene.simplify import simplified
@@ -147,11 +147,11 @@ class Builder:
                 note = piece.make()
         else:
             note = piece.make()
-        self.store.remember(key, msgspec.msgpack.encode(note))
+        self.store.write_index(key, msgspec.msgpack.encode(note))
         return note, False
 
     def _recall(self, key: str, kind: type[Note]) -> Note | None:
-        remembered = self.store.recall(key)
+        remembered = self.store.read_index(key)
         if remembered is None:
             return None
         try:
@@ -159,7 +159,7 @@ class Builder:
         except msgspec.DecodeError:  # damaged: built anew
             return None
         assets = (note,) if isinstance(note, BlobNote) else note.levels
-        return note if all(self.store.used(asset.address, asset.bytes) for asset in assets) else None
+        return note if all(self.store.mark_used(asset.address, asset.bytes) for asset in assets) else None
 
     def _mesh(self, mesh: MeshArrays) -> MeshNote:
         levels = [self._mesh_level(mesh, encode_mesh(mesh), 0.0)]

@@ -15,9 +15,8 @@ import numpy as np
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import IDENTITY, Vec3
 from iris_session.protocol.media import MAX_STREAMS
-from iris_session.protocol.scene import Camera, Environment, Light
-from iris_session.protocol.scene_looks import Rgb
-from iris_session.protocol.scene_names import GeometryKind, LightKind, TextureKind
+from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
+from iris_session.protocol.scene import Camera, Environment, Light, Rgb
 from iris_session.scene.assembly import assemble
 from iris_session.scene.build import EncodeOptions
 from iris_session.scene.collected import Flexible, Thing, World

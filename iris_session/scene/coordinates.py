@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene import Geometry
-from iris_session.protocol.scene_looks import Material
-from iris_session.protocol.scene_names import GeometryKind
+from iris_session.protocol.names import GeometryKind
+from iris_session.protocol.scene import Geometry, Material
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 #: Distance from the axis, in radii, below which there is no angle around it.

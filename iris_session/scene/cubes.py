@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
-from iris_session.protocol.scene import Geometry, SceneSpec
-from iris_session.protocol.scene_looks import Texture
-from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, TextureKind
-from iris_session.scene.errors import AssetError
+from iris_session.protocol.names import AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.scene import Geometry, SceneSpec, Texture
+from iris_session.scene.errors import AssetDecodeError
 from iris_session.scene.images import Pixels, decode_image, halved
 from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.simplify import unit
@@ -104,9 +103,11 @@ def cube_texture(spec: SceneSpec, material: int) -> int:
 
 
 def faces_of(pixels: Pixels) -> Pixels:
-    """(6, side, side, channels) of six faces below one another. Raises `AssetError` where they are not."""
+    """(6, side, side, channels) of six faces below one another. Raises `AssetDecodeError` where they are not."""
     if not len(pixels) == _FACES * pixels.shape[1] > 0:
-        raise AssetError(f"a cube of {pixels.shape[1]} x {len(pixels)} pixels: six squares below one another are one")
+        raise AssetDecodeError(
+            f"a cube of {pixels.shape[1]} x {len(pixels)} pixels: six squares below one another are one"
+        )
     return pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName
 from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.streams.deformable_topology import DeformableTopology
 

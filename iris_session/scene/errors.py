@@ -1,20 +1,15 @@
-"""What can be wrong with assets and scenes. Each text says what would have been right.
+"""Errors of scenes. Each text says what is wrong and what would be right.
 
 SceneBuildError           base
-|-- AssetError            bytes of an asset that cannot be decoded: damaged, hostile, or made by a newer version
-`-- AssetMissingError     an asset that the store does not have
+`-- AssetDecodeError      bytes of an asset that cannot be decoded: damaged, hostile, or made by a newer version
 """
 
 from __future__ import annotations
 
 
 class SceneBuildError(Exception):
-    """Base of all errors of this room."""
+    """A scene cannot be built, read or written as asked. Base of the errors of this package."""
 
 
-class AssetError(SceneBuildError):
-    """The bytes are no asset of the kind that was asked for."""
-
-
-class AssetMissingError(SceneBuildError):
-    """The store has no such asset."""
+class AssetDecodeError(SceneBuildError):
+    """The bytes are not an asset of the expected kind."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Vec3
+from iris_session.protocol.names import ArrayKind, GeometryKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Visual
-from iris_session.protocol.scene_names import ArrayKind, GeometryKind
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.meshes import decode_mesh
 from iris_session.scene.parts import matrix_of, vec3

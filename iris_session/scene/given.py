@@ -15,7 +15,7 @@ from typing import Any, Final, TypedDict, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_names import TextureRole
+from iris_session.protocol.names import TextureRole
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.parts import GREY, MAX_TRIANGLES, Look, Picture, array_of

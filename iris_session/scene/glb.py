@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from anchors.pose import compose, inverse
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import Pose
+from iris_session.protocol.names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.protocol.scene import Body, SceneSpec, Visual
-from iris_session.protocol.scene_names import ArrayKind, AssetEncoding, TextureKind, TextureRole
 from iris_session.scene.arrays import decode_arrays
 from iris_session.scene.collected import composed
 from iris_session.scene.coordinates import on_deformable, with_coordinates
@@ -34,6 +34,7 @@ from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
 from iris_session.scene.shapes import height_field, primitive
 from iris_session.scene.simplify import unit
+from iris_session.system.files import write_atomic
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -53,13 +54,7 @@ def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
     if target.exists() and not target.is_file():  # a pipe or a device, or a folder, which says so
         target.write_bytes(data)
         return len(data)
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(data)
-        os.replace(part, target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    write_atomic(target, data, permissions=None)
     return len(data)
 
 

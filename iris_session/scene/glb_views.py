@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from anchors.lie import matrix_quat
 from anchors.pose import PoseTuple, apply, quat_conj, quat_mul, quat_rotate
 from iris_session.protocol.common import Quat, Vec3
+from iris_session.protocol.names import Follow, LightKind
 from iris_session.protocol.scene import Camera, Light, SceneSpec
-from iris_session.protocol.scene_names import Follow, LightKind
 from iris_session.scene.parts import vec3
 
 _LIGHTS: Final = {LightKind.DIRECTIONAL: "directional", LightKind.SPOT: "spot", LightKind.POINT: "point"}

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.common import IDENTITY
-from iris_session.protocol.scene import Camera, Light
-from iris_session.protocol.scene_looks import Rgb
-from iris_session.protocol.scene_names import LightKind
+from iris_session.protocol.names import LightKind
+from iris_session.protocol.scene import Camera, Light, Rgb
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.gltf_data import KNOWN_EXTENSIONS, GltfData
 from iris_session.scene.gltf_looks import Dress, GltfLooks, seen

@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_looks import Rgba
-from iris_session.protocol.scene_names import ColorSpace, TextureRole
+from iris_session.protocol.names import ColorSpace, TextureRole
+from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.gltf_data import GltfData
 from iris_session.scene.images import Pixels

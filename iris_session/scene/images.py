@@ -8,10 +8,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
+from iris_session.protocol.assets import MAX_ARRAY_BYTES
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, filtered, require
-from iris_session.scene.errors import AssetError
+from iris_session.scene.errors import AssetDecodeError
 
 Pixels = NDArray[np.uint8]
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -38,12 +38,12 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
         ok, data = cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     elif encoding == AssetEncoding.JPEG:
         if pixels.shape[2] not in (1, 3):
-            raise AssetError(f"JPEG holds 1 or 3 channels, not {pixels.shape[2]}: use PNG")
+            raise AssetDecodeError(f"JPEG holds 1 or 3 channels, not {pixels.shape[2]}: use PNG")
         ok, data = cv2.imencode(".jpg", swapped, [cv2.IMWRITE_JPEG_QUALITY, quality])
     else:
-        raise AssetError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
+        raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
     if not ok:
-        raise AssetError(f"an image of {pixels.shape} cannot be written as {encoding}")
+        raise AssetDecodeError(f"an image of {pixels.shape} cannot be written as {encoding}")
     encoded = data.tobytes()
     if encoding == AssetEncoding.PNG:
         return EncodedImage(encoded, encoding)
@@ -52,24 +52,30 @@ def encode_image(pixels: Pixels, encoding: str = AssetEncoding.ARRAYS, quality: 
 
 
 def decode_image(data: bytes | bytearray | memoryview, encoding: str, max_bytes: int = MAX_ARRAY_BYTES) -> Pixels:
-    """Pixels (height, width, channels). Raises `AssetError` for other bytes, or when they would exceed `max_bytes`."""
+    """Return pixels (height, width, channels).
+
+    Raises:
+        AssetDecodeError: The bytes are no such image, or its pixels would exceed `max_bytes`.
+    """
     if encoding == AssetEncoding.ARRAYS:
         arrays = decode_arrays(data, ArrayKind.IMAGE, max_bytes)
         return require(arrays, ArrayName.PIXELS, "u1", (None, None, None))
     if encoding not in (AssetEncoding.PNG, AssetEncoding.JPEG):
-        raise AssetError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
+        raise AssetDecodeError(f"unknown encoding {encoding!r} of an image: arrays, png or jpeg")
     width, height = _stated_size(bytes(data[:65_536]), encoding)
     if width * height * 4 > max_bytes:
-        raise AssetError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
+        raise AssetDecodeError(f"an image of {width} x {height} pixels, at most {max_bytes} bytes are read")
     cv2 = _opencv()
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise AssetError(f"damaged {encoding}: {error}") from None
+        raise AssetDecodeError(f"damaged {encoding}: {error}") from None
     if image is None or image.dtype != np.uint8:
-        raise AssetError(f"damaged {encoding}, or one with more than 8 bits a channel")
+        raise AssetDecodeError(f"damaged {encoding}, or one with more than 8 bits a channel")
     if image.shape[:2] != (height, width):
-        raise AssetError(f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}")
+        raise AssetDecodeError(
+            f"damaged {encoding}: {image.shape[1]} x {image.shape[0]} pixels, stated {width} x {height}"
+        )
     return _swapped(image if image.ndim == 3 else image[:, :, None])
 
 
@@ -100,12 +106,12 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
     """Width and height as the file says, before anything is decoded."""
     if encoding == AssetEncoding.PNG:
         if head[:8] != _PNG or len(head) < 24:
-            raise AssetError("these bytes are no PNG")
+            raise AssetDecodeError("these bytes are no PNG")
         width, height = struct.unpack(">II", head[16:24])
         return width, height
     at = 2
     if head[:2] != b"\xff\xd8":
-        raise AssetError("these bytes are no JPEG")
+        raise AssetDecodeError("these bytes are no JPEG")
     while at + 9 <= len(head) and head[at] == 0xFF:
         marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
         if marker == 0xFF:  # any number of them may stand before a marker
@@ -117,14 +123,14 @@ def _stated_size(head: bytes, encoding: str) -> tuple[int, int]:
             height, width = struct.unpack(">HH", head[at + 5 : at + 9])
             return width, height
         at += 2 + length
-    raise AssetError("a JPEG without a size in its first 64 KiB")
+    raise AssetDecodeError("a JPEG without a size in its first 64 KiB")
 
 
 def _swapped(pixels: Pixels) -> Pixels:
     """Red and blue exchanged: OpenCV's order to ours, and back."""
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2])
     if order is None:
-        raise AssetError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
+        raise AssetDecodeError(f"an image of {pixels.shape[2]} channels has no PNG or JPEG: 1, 3 or 4")
     return np.ascontiguousarray(pixels[:, :, order])
 
 
@@ -132,5 +138,5 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise AssetError("PNG and JPEG need OpenCV: pip install 'iris-session[scene]'") from None
+        raise AssetDecodeError("PNG and JPEG need OpenCV: pip install 'iris-session[scene]'") from None
     return cv2

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAX_ARRAY_BYTES
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName
+from iris_session.protocol.assets import MAX_ARRAY_BYTES
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, require
-from iris_session.scene.errors import AssetError
+from iris_session.scene.errors import AssetDecodeError
 
 #: Steps of a quantised coordinate, and of a component of a normal.
 _POSITION_STEPS: Final = 65_535
@@ -120,7 +120,7 @@ def encode_mesh_quantised(mesh: MeshArrays) -> tuple[bytes, float]:
 
 
 def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY_BYTES) -> MeshArrays:
-    """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetError` for bytes that are no mesh."""
+    """Inverse of `encode_mesh` and `encode_mesh_quantised`. Raises `AssetDecodeError` for bytes that are no mesh."""
     arrays = decode_arrays(data, ArrayKind.MESH, max_bytes)
     position = require(arrays, ArrayName.POSITION, "f4", (None, 3))
     normal = require(arrays, ArrayName.NORMAL, "f4", (len(position), 3))
@@ -128,9 +128,9 @@ def decode_mesh(data: bytes | bytearray | memoryview, max_bytes: int = MAX_ARRAY
     color = require(arrays, ArrayName.COLOR, "u1", (len(position), 4)) if ArrayName.COLOR in arrays else None
     index = require(arrays, ArrayName.INDEX, "u2 u4", (None, 3)).astype(np.uint32)
     if index.size and int(index.max()) >= len(position):
-        raise AssetError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
+        raise AssetDecodeError(f"a triangle has the corner {int(index.max())}, but there are {len(position)}")
     if not np.isfinite(position).all():
-        raise AssetError("a vertex is not finite")
+        raise AssetDecodeError("a vertex is not finite")
     return MeshArrays(position, normal, uv, index, color)
 
 

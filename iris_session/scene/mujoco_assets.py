@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_looks import HeightField, Mesh, Texture
-from iris_session.protocol.scene_names import ArrayFilter, ArrayKind, ArrayName, ColorSpace, TextureKind
+from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, ColorSpace, TextureKind
+from iris_session.protocol.scene import HeightField, Mesh, Texture
 from iris_session.scene.arrays import Stored, encode_arrays
 from iris_session.scene.build import Builder, MeshNote, Work
 from iris_session.scene.meshes import MeshArrays, index_corners

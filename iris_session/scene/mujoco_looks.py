@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 
 from iris_session.protocol.common import Pose, Vec3
-from iris_session.protocol.scene import Camera, Environment, Headlight, Light
-from iris_session.protocol.scene_looks import Material, Rgb, Rgba, Texture, TextureUse
-from iris_session.protocol.scene_names import Follow, LightKind, TextureKind
+from iris_session.protocol.names import Follow, LightKind, TextureKind
+from iris_session.protocol.scene import Camera, Environment, Headlight, Light, Material, Rgb, Rgba, Texture, TextureUse
 from iris_session.scene.mujoco_names import label
 
 #: MuJoCo's default colour: a geom that has it takes its material's.

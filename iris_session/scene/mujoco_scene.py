@@ -15,6 +15,7 @@ import numpy as np
 from iris_session.assets.store import AssetStore
 from iris_session.protocol.common import MAX_TEXT, Vec3
 from iris_session.protocol.media import MAX_STREAMS
+from iris_session.protocol.names import AssetEncoding, GeometryKind
 from iris_session.protocol.scene import (
     Body,
     Geometry,
@@ -25,7 +26,6 @@ from iris_session.protocol.scene import (
     asset_addresses,
     encode_scene,
 )
-from iris_session.protocol.scene_names import AssetEncoding, GeometryKind
 from iris_session.scene.build import Builder, EncodeOptions
 from iris_session.scene.mujoco_assets import hfields, meshes, textures
 from iris_session.scene.mujoco_deformables import deformables

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from anchors.lie import matrix_quat, quat_matrix
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose, Quat, Vec3
-from iris_session.protocol.scene import Camera, Light
-from iris_session.protocol.scene_looks import Rgba, Vec2
-from iris_session.protocol.scene_names import ColorSpace, GeometryKind, TextureKind
+from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind
+from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import Pixels
 from iris_session.scene.meshes import MeshArrays

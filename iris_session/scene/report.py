@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
+from iris_session.protocol.names import AssetEncoding, GeometryKind, LightKind
 from iris_session.protocol.scene import Body, SceneSpec, Totals
-from iris_session.protocol.scene_names import AssetEncoding, GeometryKind, LightKind
 from iris_session.scene.budget import QUEST_3, Choice, choose_levels
 from iris_session.scene.cubes import CUBE_SIDE, cube_texture
 from iris_session.scene.extent import Extent

@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene import Geometry
-from iris_session.protocol.scene_looks import HeightField
-from iris_session.protocol.scene_names import GeometryKind
+from iris_session.protocol.names import GeometryKind
+from iris_session.protocol.scene import Geometry, HeightField
 from iris_session.scene.meshes import MeshArrays, index_corners
 from iris_session.scene.simplify import unit
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_looks import Rgba
+from iris_session.protocol.scene import Rgba
 from iris_session.scene.meshes import MeshArrays, index_corners, unique_rows
 from iris_session.scene.parts import Matrix
 from iris_session.scene.simplify import unit

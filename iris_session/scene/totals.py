@@ -6,9 +6,8 @@ from typing import Final
 
 import msgspec
 
-from iris_session.protocol.scene import SceneSpec, Totals, asset_addresses
-from iris_session.protocol.scene_looks import Texture, TextureLevel
-from iris_session.protocol.scene_names import GeometryKind, TextureKind
+from iris_session.protocol.names import GeometryKind, TextureKind
+from iris_session.protocol.scene import SceneSpec, Texture, TextureLevel, Totals, asset_addresses
 
 #: Triangles of primitives at a usual tessellation, for estimates.
 PRIMITIVE_TRIANGLES: Final = {

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.scene_looks import Rgba
-from iris_session.protocol.scene_names import TextureRole
+from iris_session.protocol.names import TextureRole
+from iris_session.protocol.scene import Rgba
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.mesh_bytes import CHECKS, absolute_corners
 from iris_session.scene.meshes import index_corners, unique_rows

@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 
 from iris_session.protocol.common import Pose
-from iris_session.protocol.scene_looks import Rgba
-from iris_session.protocol.scene_names import GeometryKind, TextureRole
+from iris_session.protocol.names import GeometryKind, TextureRole
+from iris_session.protocol.scene import Rgba
 from iris_session.scene.articulation import Articulation, Part
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.files import ENDINGS, ROBOTS, ending, guarded, load_file, present, xacro_advice

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, TypeVar
@@ -14,6 +13,7 @@ import msgspec
 from filelock import FileLock, Timeout
 
 from iris_session.security.lines import trouble
+from iris_session.system.files import write_atomic
 
 LOCK: Final = "lock"
 #: How long a command waits for another process to finish its change; a change takes milliseconds.
@@ -80,19 +80,7 @@ class PrivateFolder:
         self.make()
         path = self.path / name
         try:
-            descriptor, temporary = tempfile.mkstemp(prefix=f".{name}-", dir=self.path)  # mode 0600
-            try:
-                with os.fdopen(descriptor, "wb") as file:
-                    file.write(data)
-                    if durable:
-                        file.flush()
-                        os.fsync(file.fileno())
-                os.replace(temporary, path)
-                if durable:
-                    _settle(self.path)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
+            write_atomic(path, data, durable=durable)
         except OSError as error:
             raise KeysError(f"{path} cannot be written: {error.strerror}") from error
 
@@ -123,19 +111,6 @@ class PrivateFolder:
             yield
         finally:
             lock.release()
-
-
-def _settle(folder: Path) -> None:
-    """Makes the names in a folder durable: else a power cut may bring back the file that was replaced."""
-    if os.name != "posix":
-        return  # folders cannot be opened there
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    except OSError:  # some network folders take none; the file itself is written
-        pass
-    finally:
-        os.close(descriptor)
 
 
 def check_private(path: Path, status: os.stat_result, remedy: str) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from iris_session.link.config import FrontConfig, FrontError
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import Role
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security import (
     DEFAULT_ROLES,
     AllowedKey,
@@ -72,7 +72,7 @@ class Keyring:
         self.watching: set[str] = set()
         self.files = FileWorker()
 
-    def turn(self, now_ns: int) -> None:
+    def tick(self, now_ns: int) -> None:
         """Tells those who had files changed."""
         self.files.turn(now_ns)
 

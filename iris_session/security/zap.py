@@ -13,7 +13,7 @@ import zmq
 from zmq.utils import z85
 
 from iris_session.link.sockets import ZAP_CONTROL, ZAP_STATE, readable
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import STRANGER, Keyring
 

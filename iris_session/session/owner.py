@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Self
 
 from iris_session.physics import Pacer
@@ -22,7 +23,6 @@ from iris_session.session.errors import OwnershipError
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.publishing import Publishing
 from iris_session.session.scene_change import ScenePatches
-from iris_session.session.scheduling import stop_signals
 from iris_session.session.status import SessionStatus, make_status
 from iris_session.session.stepper import Stepper
 
@@ -76,7 +76,7 @@ class Owner(Publishing, ScenePatches):
     @contextmanager
     def signals(self) -> Iterator[None]:
         """Inside, Ctrl-C and SIGTERM end `run()` in order, also when they come before it. Main thread only."""
-        with stop_signals(self._stop):
+        with stop_on_signals(self._stop):
             yield
 
     # --- what the owner says -----------------------------------------------------------------------------------------
@@ -141,3 +141,23 @@ class Owner(Publishing, ScenePatches):
             what = type(self).__name__
             raise OwnershipError(f"the session is not started: use `with {what}(...) as session`, or session.start()")
         return self._processes
+
+
+@contextmanager
+def stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Set `stop` on SIGINT and SIGTERM; a SIGINT after that raises `KeyboardInterrupt`. Main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        if stop.is_set() and number == signal.SIGINT:
+            raise KeyboardInterrupt  # the second Ctrl-C does not wait
+        stop.set()
+
+    previous = {s: signal.signal(s, on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for s, handler in previous.items():
+            signal.signal(s, handler)

@@ -13,13 +13,12 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from iris_session.protocol.scene import SceneError
-from iris_session.protocol.scene_names import GeometryKind
-from iris_session.protocol.scene_patch import MAX_OPS, AddVisual, PatchOp, SetVisual
+from iris_session.protocol.names import GeometryKind
+from iris_session.protocol.scene import MAX_OPS, AddVisual, PatchOp, SceneError, SetVisual
 
 #: How far a quaternion may be from unit length: it was rounded.
 UNIT: Final = 1e-3
-KINDS: Final = "SetVisual, AddVisual, RemoveVisual, AddMesh or AddMaterial of iris_session.protocol.scene_patch"
+KINDS: Final = "SetVisual, AddVisual, RemoveVisual, AddMesh or AddMaterial of iris_session.protocol.scene"
 
 
 def _plain(value: object) -> object:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import stat
-import tempfile
 import threading
 from pathlib import Path
 from typing import Final
@@ -18,6 +17,7 @@ import msgspec
 
 from iris_session.protocol.discovery import DISCOVERY_PORT
 from iris_session.recording.paths import split_part, split_resume
+from iris_session.system.files import Replacement
 
 FILE: Final = "resume.tokens"
 #: Changes that come faster are written together.
@@ -126,27 +126,15 @@ class NoteKeeper:
 
     def _write(self, note: ResumeNote) -> None:
         try:
-            descriptor, temporary = tempfile.mkstemp(prefix=f".{self._path.name}-", dir=self._path.parent)  # mode 0600
-            try:
-                with os.fdopen(descriptor, "wb") as file:
-                    file.write(msgspec.msgpack.encode(note))
-                    file.flush()
-                    os.fsync(file.fileno())
-                self._replace(temporary)
-            finally:
-                Path(temporary).unlink(missing_ok=True)
+            with Replacement(self._path, durable=True) as replacement:
+                replacement.file.write(msgspec.msgpack.encode(note))
+                replacement.finish()  # before the lock is taken: it may wait for a disk
+                with self._replacing:
+                    if self._given_up:
+                        replacement.discard()
+                    else:
+                        replacement.commit()
         except OSError as error:
             if not self._warned:
                 _log.warning("%s cannot be written (%s): nobody resumes after a restart", self._path, error.strerror)
             self._warned = True
-
-    def _replace(self, temporary: str) -> None:
-        with self._replacing:
-            if self._given_up:
-                return
-            os.replace(temporary, self._path)
-        folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)  # the new name, too, is to outlive a power cut
-        finally:
-            os.close(folder)

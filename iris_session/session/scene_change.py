@@ -16,8 +16,7 @@ from iris_session.authority.config import check_config
 from iris_session.physics import Pacer, find_objects, find_robots
 from iris_session.physics.load import load_model, model_bytes, scene_hash
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, ScenePatched, decode_entry, encode_entry
-from iris_session.protocol.scene import SceneError, SceneSpec
-from iris_session.protocol.scene_patch import PatchOp
+from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.recording import pack_model
 from iris_session.session.config import SessionConfig

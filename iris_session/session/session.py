@@ -42,10 +42,10 @@ from iris_session.session.errors import OwnershipError
 from iris_session.session.owner import Owner
 from iris_session.session.processes import SessionProcesses
 from iris_session.session.scene_change import SceneChanges, follow_timestep
-from iris_session.session.scheduling import quiet_collector, tick_priority
 from iris_session.session.stepper import MAX_HOST_ENTRIES, ROOM_FOR_OURS, Stepper, checked, session_clock
 from iris_session.session.tick_times import TickTimes
 from iris_session.session.user_loop import UserLoop
+from iris_session.system.priority import freeze_garbage_collector, tick_priority
 
 #: Zero-tick steps while paused come at 100 Hz (at least 50 Hz, so that leases and heartbeats go on).
 PAUSED_STEP_S: Final = 0.01
@@ -139,7 +139,7 @@ class Session(Owner, SceneChanges):
         check_timestep(self.model)
         blas.use_one_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
-        with self.signals(), quiet_collector(), tick_priority(self.config.realtime) as self._scheduling:
+        with self.signals(), freeze_garbage_collector(), tick_priority(self.config.realtime) as self._scheduling:
             # Counted from here: collecting garbage in a large process takes longer than a short run.
             end_ns = None if seconds is None else self.clock() + int(seconds * 1e9)
             pacer = self._pacer = Pacer(stepper.core.world.tick_period_ns, self.clock())

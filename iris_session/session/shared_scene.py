@@ -17,8 +17,16 @@ import numpy as np
 
 from iris_session.link import SceneInfo
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, encode_scene
-from iris_session.protocol.scene_patch import MAX_PATCHES, PatchOp, merged, patched
+from iris_session.protocol.scene import (
+    MAX_PATCHES,
+    PatchOp,
+    SceneError,
+    SceneSpec,
+    asset_addresses,
+    encode_scene,
+    merged,
+    patched,
+)
 from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -135,7 +143,7 @@ class SharedScenes:
                 self._hold(store, shown.info.assets)
                 if shown.patches:
                     address = shown.info.scene_hash
-                    self._looks.append(_Look(address, store.used_at(address), time.monotonic()))
+                    self._looks.append(_Look(address, store.last_used_ns(address), time.monotonic()))
                 self._forget_looks(store)
             while len(self._holds) > 2:
                 self._holds.pop(0).release()

@@ -1,1 +1,4 @@
-"""What several rooms ask of the operating system in the same way."""
+"""What several rooms need of the operating system: child processes, files, priorities, back-off, logging.
+
+Standard library only. Not here: sockets (`link`, `front`, `client`), keys and permissions of their folder (`security`).
+"""

@@ -1,44 +1,93 @@
-"""Threads that give way to others, so that what can wait does not delay state and control."""
+"""Priority of threads: the tick loop runs before other work, and what can wait runs after it.
+
+On a busy machine the scheduler, not our code, decides whether a 2 ms tick is met. Linux: `SCHED_RR` needs root,
+`CAP_SYS_NICE` or an `rtprio` line in /etc/security/limits.d; without it nothing is changed. The result is shown in the
+session's status, so that late ticks can be explained.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final, TypeVar
 
-#: Added to the nice value of a thread that gives way: a tenth of the weight. Not less, as those of Python hold its lock
-#: for moments, and whoever needs it then waits for them.
-NICER: Final = 10
-_LAST: Final = 19
+#: Any real-time priority runs before all ordinary threads; a low one stays below the kernel's own threads.
+TICK_PRIORITY: Final = 5
+#: Added to the nice value of a thread at low priority: a tenth of the weight. Not less, as threads of Python hold its
+#: lock for moments, and every other thread then waits for them.
+LOW_PRIORITY_NICE: Final = 10
+_LAST_NICE: Final = 19
 
 T = TypeVar("T")
 
 
-def give_way() -> None:
-    """Lowers the priority of the calling thread, where threads have one (Linux). It cannot be raised again."""
+def lower_thread_priority() -> None:
+    """Lower the priority of the calling thread, where threads have one (Linux). It cannot be raised again."""
     with contextlib.suppress(OSError, AttributeError):
-        nice = min(_LAST, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
+        nice = min(_LAST_NICE, os.getpriority(os.PRIO_PROCESS, 0) + LOW_PRIORITY_NICE)
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
 
 
-def made_below(make: Callable[[], T]) -> T:
-    """What `make` gives, in a thread that gives way and then ends: threads that are started meanwhile inherit its
-    priority, as those of libzmq are with the first socket of a context. Raises what `make` raises."""
-    made: list[T] = []
-    failed: list[BaseException] = []
+def run_at_low_priority(function: Callable[[], T]) -> T:
+    """Call `function` in a temporary thread at low priority; return its result, or raise its error.
 
-    def work() -> None:
-        give_way()
+    Threads that are started meanwhile inherit the priority, such as those that libzmq starts with the first socket of a
+    context.
+    """
+    results: list[T] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        lower_thread_priority()
         try:
-            made.append(make())
-        except BaseException as error:  # raised where somebody waits
-            failed.append(error)
+            results.append(function())
+        except BaseException as error:  # raised in the calling thread
+            errors.append(error)
 
-    thread = threading.Thread(target=work, name="iris-made-below")
+    thread = threading.Thread(target=run, name="iris-low-priority")
     thread.start()
     thread.join()
-    if failed:
-        raise failed[0]
-    return made[0]
+    if errors:
+        raise errors[0]
+    return results[0]
+
+
+@contextlib.contextmanager
+def tick_priority(enabled: bool = True) -> Iterator[str]:
+    """Run the calling thread at real-time priority. Yields `realtime`, or `normal` where that is not permitted.
+
+    Processes and threads started inside do not inherit it.
+    """
+    # On a single processor an overloaded loop at raised priority would starve the front, and with it the e-stop.
+    if not enabled or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
+        yield "normal"
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(TICK_PRIORITY))
+    except PermissionError:
+        yield "normal"
+        return
+    try:
+        yield "realtime"
+    finally:
+        try:
+            os.sched_setscheduler(0, *before)
+        except PermissionError:  # ordinary users may give back the priority, but not that children never inherit it
+            with contextlib.suppress(PermissionError):
+                os.sched_setscheduler(0, before[0] | os.SCHED_RESET_ON_FORK, before[1])
+
+
+@contextlib.contextmanager
+def freeze_garbage_collector() -> Iterator[None]:
+    """Exempt what exists now from garbage collection: it lives as long as the loop inside."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

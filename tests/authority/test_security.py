@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.protocol.client_messages import Acquire, Assign, ClearEStop, Control, EStop, SetMode
+from iris_session.protocol.client_messages import (
+    Acquire,
+    Assign,
+    ClearEStop,
+    Control,
+    EStop,
+    RemoveParticipant,
+    SetMode,
+)
 from iris_session.protocol.common import MAX_TEXT
 from iris_session.protocol.entries import Audit, Entry, Join, Lost
 from iris_session.protocol.names import AuditKind, DenialReason, RefusalCode
-from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import LeaseChanged, ParticipantLeft, Refused
+from iris_session.protocol.server_messages import Audited, LeaseChanged, ParticipantLeft, Refused
 from iris_session.protocol.steps import Dropped
 
 from .table import SECOND, Person, Table

@@ -9,9 +9,8 @@ import pytest
 
 from anchors.lie import quat_log, quat_multiply
 from anchors.pose import PoseTuple, apply
-from iris_session.bench.alignment import CASES, MARKS, run_alignment
-from iris_session.bench.alignment_world import PER_VIEWPOINT, TIP_SIGMA_M, Headset
-from iris_session.bench.contract import BenchReport, flat
+from iris_session.bench.alignment import CASES, MARKS, PER_VIEWPOINT, TIP_SIGMA_M, SimulatedHeadset, run_alignment
+from iris_session.bench.report import BenchReport, flatten
 
 KEYS = {"sheet_mm_p95", "sheet_deg_p95", "at_1m_mm_p95", "at_2m_mm_p95", "refused_share", "coverage_share"}
 
@@ -37,9 +36,9 @@ def test_every_case_has_every_key_and_bar(report: BenchReport) -> None:
     timed = {f"{load}{what}_us_p50" for load in ("", "loaded_") for what in ("update", "add", "estimate")}
     assert timed <= set(report.results)
     assert ("loaded_update_us_p50", "<=") in held
-    values = flat(report.as_dict()["results"])
+    values = flatten(report.as_dict()["results"])
     assert all(b.value == values[b.key] for b in report.bars)
-    assert "one_sheet.sheet_mm_p95" in report.lines()
+    assert "one_sheet.sheet_mm_p95" in report.format()
 
 
 def test_ours_is_better_than_naive_ways(report: BenchReport) -> None:
@@ -56,10 +55,10 @@ def test_headsets_report_with_the_noise_that_is_fixed() -> None:
     """Standard deviations of 150 looks; wrong detections told by their size."""
     errors, turns, wrong, n = [], [], 0, 0
     for seed in range(150):
-        headset = Headset(np.random.default_rng(seed))
+        headset = SimulatedHeadset(np.random.default_rng(seed))
         p0, q0 = headset.T_world_tracking(0.0)
         assert abs(float(np.linalg.norm(headset.velocity)) - 0.003 / 60.0) < 1e-12
-        for o in headset.look("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])):
+        for o in headset.observe_sheet("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])):
             T = (tuple(p0.tolist()), tuple(q0.tolist()))
             seen, head = apply(T, o.pose[0]), np.array(apply(T, o.p_head))
             d = float(np.linalg.norm(head))
@@ -83,9 +82,9 @@ def test_half_of_each_variance_is_constant_per_viewpoint_and_a_third_of_the_sigm
     """Variances of the means of looks and about them, along the view (without the error of scale) and across it."""
     means, about = [], []
     for seed in range(200):
-        headset = Headset(np.random.default_rng(seed))
+        headset = SimulatedHeadset(np.random.default_rng(seed))
         T: PoseTuple = (tuple(headset.p0.tolist()), tuple(headset.q0.tolist()))
-        seen = headset.look("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        seen = headset.observe_sheet("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         view = -np.median([apply(T, o.p_head) for o in seen], axis=0)
         d = float(np.linalg.norm(view))
         p = np.array([apply(T, o.pose[0]) for o in seen])
@@ -102,8 +101,8 @@ def test_a_touch_is_where_the_mark_is() -> None:
     rng = np.random.default_rng(0)
     off = []
     for _ in range(200):
-        headset = Headset(rng)
-        (tip,) = headset.touch(np.array(MARKS["a"]), TIP_SIGMA_M)
+        headset = SimulatedHeadset(rng)
+        (tip,) = headset.touch_mark(np.array(MARKS["a"]), TIP_SIGMA_M)
         p, q = headset.T_world_tracking(0.0)
         off.append(np.array(apply((tuple(p.tolist()), tuple(q.tolist())), tip)) - MARKS["a"])
     assert np.std(off) == pytest.approx(TIP_SIGMA_M, rel=0.15)

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from iris_session.bench import cloth_motion as motion_module
-from iris_session.bench.cloth_motion import ClothMotion, cloth_motion, simulate
-from iris_session.bench.contract import BenchError
-from iris_session.bench.deformable import _max_error_m, _Source
+from iris_session.bench.cloth_motion import ClothMotion, load_cloth_motion, simulate_cloth
+from iris_session.bench.deformable import _ClothSource, _compute_max_error_m
+from iris_session.bench.report import BenchError
 from iris_session.cli.main import main
 from iris_session.streams.deformable import DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
@@ -58,7 +58,7 @@ def test_report(tmp_path: Path) -> None:
 
 
 def test_the_same_seed_gives_the_same_motion_and_another_another() -> None:
-    one, same, other = simulate(6, 1), simulate(6, 1), simulate(6, 2)
+    one, same, other = simulate_cloth(6, 1), simulate_cloth(6, 1), simulate_cloth(6, 2)
     assert np.array_equal(one.nodes, same.nodes)
     assert not np.array_equal(one.nodes, other.nodes)
     vertices = np.stack([one.vertices(i) for i in range(len(one.nodes))])
@@ -71,24 +71,24 @@ def test_the_same_seed_gives_the_same_motion_and_another_another() -> None:
 
 def test_the_motion_is_kept_and_a_damaged_file_made_anew(home: Path) -> None:
     said: list[str] = []
-    made = cloth_motion(5, 0, said.append)
+    made = load_cloth_motion(5, 0, said.append)
     (file,) = home.iterdir()
     assert any("simulated" in text for text in said)
     said.clear()
-    kept = cloth_motion(5, 0, said.append)
+    kept = load_cloth_motion(5, 0, said.append)
     assert not said
     assert np.array_equal(kept.nodes, made.nodes)
     assert (kept.scale, kept.origin.tolist()) == (made.scale, made.origin.tolist())
     file.write_bytes(file.read_bytes()[:1000])
-    again = cloth_motion(5, 0, said.append)
+    again = load_cloth_motion(5, 0, said.append)
     assert "made anew" in said[0]
     assert np.array_equal(again.nodes, made.nodes)
-    assert np.array_equal(cloth_motion(5, 0, said.append).faces, made.faces)
+    assert np.array_equal(load_cloth_motion(5, 0, said.append).faces, made.faces)
 
 
 def test_the_motion_runs_to_its_end_and_back() -> None:
     motion = ClothMotion(np.zeros((4, 9, 3), np.uint16), np.zeros(3), 1.0, np.zeros((0, 3), np.int32))
-    assert [motion.index(frame) for frame in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
+    assert [motion.frame_index(frame) for frame in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
 
 
 def test_errors_are_against_the_motion_and_a_client_that_decodes_otherwise_is_noticed() -> None:
@@ -97,7 +97,7 @@ def test_errors_are_against_the_motion_and_a_client_that_decodes_otherwise_is_no
         rng.integers(0, 2**16, (2, 9, 3)).astype(np.uint16), np.zeros(3), 2e-5, np.zeros((0, 3), np.int32)
     )
     topology = DeformableTopology(9)
-    source = _Source(motion, topology)
+    source = _ClothSource(motion, topology)
     source.frames = {700: 0}
     made = DeformableEncoder(topology).encode(motion.vertices(0))
     assert made is not None
@@ -108,11 +108,11 @@ def test_errors_are_against_the_motion_and_a_client_that_decodes_otherwise_is_no
         "sizes": np.array([len(payload)]),
         "payloads": np.frombuffer(payload, np.uint8),
     }
-    assert 0.0 < _max_error_m({"a": log}, source) <= 0.0005
+    assert 0.0 < _compute_max_error_m({"a": log}, source) <= 0.0005
     source.frames = {700: 1}
-    assert _max_error_m({"a": log}, source) > 0.1
+    assert _compute_max_error_m({"a": log}, source) > 0.1
     with pytest.raises(BenchError, match="b decoded a frame to other vertices"):
-        _max_error_m({"a": log, "b": {**log, "checksums": log["checksums"] + 1}}, source)
+        _compute_max_error_m({"a": log, "b": {**log, "checksums": log["checksums"] + 1}}, source)
 
 
 def test_numbers_that_no_cloth_has_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

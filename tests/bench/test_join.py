@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.test_contract import _bench, _check
+from tests.bench.test_report import _bench, _check
 
 KEYS = {
     *("ready_s", "server_rss_mib", "first_picture_s", "complete_s", "bytes", "warm_complete_s", "warm_bytes"),

@@ -15,10 +15,10 @@ import cv2
 import pytest
 from zmq.auth import create_certificates
 
-from iris_session.cli.common import CommandError, expect_session, own_sessions
+from iris_session.cli.common import CommandError, check_session_reachable, describe_own_sessions
 from iris_session.cli.main import main
 from iris_session.client.address import Address
-from iris_session.doctor.examination import LOCAL, here
+from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
 from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, SessionNote
 from iris_session.security.files import PrivateFolder
@@ -73,20 +73,20 @@ def test_who_serves_lets_in_themselves(home: KeyHome, capsys: Capture) -> None:
 def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> None:
     """A session that listens on one network is not at 127.0.0.1, where a command looks by itself."""
     home.sessions.add(SessionNote("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.server_key().fingerprint))
-    assert here() == "192.0.2.7:7721"
+    assert find_default_address() == "192.0.2.7:7721"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         nobody = f"127.0.0.1:{free.getsockname()[1]}"
     with pytest.raises(CommandError) as told:
-        expect_session(argparse.Namespace(session="", address=nobody))
+        check_session_reachable(argparse.Namespace(session="", address=nobody))
     assert "your session" not in str(told.value)
-    assert own_sessions() == "; your session 'lab-1' is at 192.0.2.7:7721"
+    assert describe_own_sessions() == "; your session 'lab-1' is at 192.0.2.7:7721"
     home.sessions.add(SessionNote("s2", "lab-2", os.getpid(), ("192.0.2.8",), 7731, home.server_key().fingerprint))
-    assert here() == LOCAL
+    assert find_default_address() == LOCAL
     home.sessions.remove("s1", os.getpid())
     home.sessions.remove("s2", os.getpid())
-    assert here() == LOCAL
-    assert "--session NAME" in own_sessions()
+    assert find_default_address() == LOCAL
+    assert "--session NAME" in describe_own_sessions()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from iris_session.cli.live import LiveView, Noteworthy, _table, event_line
+from iris_session.cli.live import EventFilter, LiveView, _render_table, format_event
 from iris_session.protocol.common import Lease
 from iris_session.protocol.server_messages import (
     Event,
@@ -40,25 +40,25 @@ STATUS = {
 
 def test_events_are_lines_to_read() -> None:
     info = ParticipantInfo("p1", "ann", "operator", True)
-    joined = event_line(Event(1, 0, 1_500_000_000, ParticipantJoined(info, False)))
+    joined = format_event(Event(1, 0, 1_500_000_000, ParticipantJoined(info, False)))
     assert "1.50 s" in joined
     assert "participant=p1 name=ann role=operator" in joined
     lease = Lease("left", "robot", "exclusive", "p1", 1)
-    assert "target=left holder=p1 cause=acquired" in event_line(Event(2, 0, 0, LeaseChanged(lease, "acquired")))
-    assert "text=hello" in event_line(Event(3, 0, 0, MarkerAdded("p1", "hello")))
-    assert "giver=left receiver=right" in event_line(
+    assert "target=left holder=p1 cause=acquired" in format_event(Event(2, 0, 0, LeaseChanged(lease, "acquired")))
+    assert "text=hello" in format_event(Event(3, 0, 0, MarkerAdded("p1", "hello")))
+    assert "giver=left receiver=right" in format_event(
         Event(4, 0, 0, Handover("hammer", "left", "right", "p1", "p2", 2_000_000))
     )
 
 
 def test_numbers_are_rounded() -> None:
     compared = HeadsetsCompared("p1", "p2", "table", 0.0012345678, 1e-7, 0.0059999999, (0.1234567, -1e-9, 1.0), 40)
-    line = event_line(Event(1, 0, 0, compared))
+    line = format_event(Event(1, 0, 0, compared))
     assert "error_m=0.001235 error_rad=0.0 expected_p95_m=0.006 p_world=[0.1235, 0.0, 1.0] n=40" in line
 
 
 def test_headsets_that_agree_as_before_are_not_worth_a_line() -> None:
-    noteworthy = Noteworthy()
+    noteworthy = EventFilter()
 
     def told(error_m: float, a: str = "p1", b: str = "p2") -> bool:
         return noteworthy(Event(1, 0, 0, HeadsetsCompared(a, b, "table", error_m, 0.0, 0.006, (0.0, 0.0, 0.0), 40)))
@@ -75,7 +75,7 @@ def test_the_table_says_who_is_lost_and_that_everything_stopped() -> None:
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=140)
-    console.print(_table("lab", STATUS, ["something happened"]))
+    console.print(_render_table("lab", STATUS, ["something happened"]))
     assert isinstance(console.file, io.StringIO)
     text = console.file.getvalue()
     for part in ("ann (p1) [lost]", "4.2 mm", "21 ms", "E-STOP", "late 0.10 %", "drops 3", "something happened"):
@@ -136,5 +136,5 @@ def test_a_display_that_does_not_read_delays_nothing(monkeypatch: pytest.MonkeyP
 
 
 def test_nothing_that_a_stranger_wrote_reaches_the_terminal_as_a_command() -> None:
-    line = event_line(Event(1, 0, 0, MarkerAdded("p1", "a\x1b[2Jb\nc\u202ed")))
+    line = format_event(Event(1, 0, 0, MarkerAdded("p1", "a\x1b[2Jb\nc\u202ed")))
     assert line.endswith("text=a\ufffd[2Jb\ufffdc\ufffdd")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from iris_session.cli.main import build_parser, main
-from iris_session.cli.serve import session_config
+from iris_session.cli.serve import make_session_config
 
 COMMANDS = ("demo", "serve", "sessions", "verify", "emulate", "robots", "bench")
 
@@ -167,18 +167,18 @@ def test_a_model_without_robots_is_served_and_explained(tmp_path: Path, capfd: p
 
 def test_assigned_robots_reach_the_configuration() -> None:
     options = ["--assign", "ann=left", "--assign", "bob=right,third", "--assign", "ann=right,left"]
-    config = session_config(build_parser().parse_args(["serve", "scene.xml", *options]), "scene")
+    config = make_session_config(build_parser().parse_args(["serve", "scene.xml", *options]), "scene")
     assert config.authority.policy == "config"
     assert config.authority.assignments == {"ann": ("left", "right"), "bob": ("right", "third")}
-    plain = session_config(build_parser().parse_args(["serve", "scene.xml"]), "scene")
+    plain = make_session_config(build_parser().parse_args(["serve", "scene.xml"]), "scene")
     assert (plain.authority.policy, plain.authority.assignments) == ("join-order", {})
 
 
 def test_sites_and_tendons_are_asked_for() -> None:
     parser = build_parser()
-    config = session_config(parser.parse_args(["serve", "scene.xml", "--sites", "--tendons"]), "scene")
+    config = make_session_config(parser.parse_args(["serve", "scene.xml", "--sites", "--tendons"]), "scene")
     assert (config.sites, config.tendons) == (True, True)
-    plain = session_config(parser.parse_args(["demo", "handover"]), "scene")
+    plain = make_session_config(parser.parse_args(["demo", "handover"]), "scene")
     assert (plain.sites, plain.tendons) == (False, False)
 
 

@@ -21,10 +21,10 @@ def test_the_file_takes_the_place_of_the_scenes_anchors(tmp_path: Path) -> None:
     path = tmp_path / "anchors.toml"
     path.write_text(DOOR)
     arguments = build_parser().parse_args(["serve", "arm", "--no-record", "--anchors", str(path)])
-    config = serve.new_session(arguments).config
+    config = serve.create_session(arguments).config
     assert config.anchors == {"door": ((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))}
     assert config.sheet_sizes() == {"door": 0.12}
-    plain = serve.new_session(build_parser().parse_args(["serve", "arm", "--no-record"])).config
+    plain = serve.create_session(build_parser().parse_args(["serve", "arm", "--no-record"])).config
     assert set(plain.anchors) == {"table"}
 
 
@@ -35,10 +35,10 @@ def test_the_example_is_read_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixt
         path = tmp_path / "example.toml"
         path.write_text(text)
         arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
-        config = serve.new_session(arguments).config
+        config = serve.create_session(arguments).config
         assert set(config.anchors) == {"table"}
         assert config.sheet_sizes() == {"table": 0.16}
-    own = serve.new_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
+    own = serve.create_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
     assert config.anchors == own.anchors, "that of the scene"
     assert main(["anchors", "example", "arms4", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"toml": text}
@@ -65,6 +65,6 @@ def test_a_resumed_session_is_given_anchors_anew(tmp_path: Path, monkeypatch: py
     opened: list[SessionConfig] = []
     monkeypatch.setattr("iris_session.session.session.Session", lambda model, config: opened.append(config))
     for given in (["--anchors", str(path)], []):
-        serve.resumed_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
+        serve.resume_session(build_parser().parse_args(["serve", "--resume", str(tmp_path), *given]))
     assert [set(config.anchors) for config in opened] == [{"door"}, {"table"}]
     assert opened[0].resume == tmp_path

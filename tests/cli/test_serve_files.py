@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from iris_session.cli import scene_files
+from iris_session.cli import scene
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
-from iris_session.cli.scene_files import file_of
+from iris_session.cli.scene import find_scene_file
 from iris_session.scene import report
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
@@ -31,15 +31,15 @@ def part(tmp_path: Path) -> Path:
 def test_what_is_given_is_a_file_a_model_or_a_name(tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("scene.xml", "scene.MJCF", "scene.mjb"):
         (tmp_path / name).write_text("")
-        assert file_of(str(tmp_path / name)) is None
-    assert file_of(str(part)) == part
+        assert find_scene_file(str(tmp_path / name)) is None
+    assert find_scene_file(str(part)) == part
     (tmp_path / "arms3").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert file_of("arms3") is None, "a folder is not in the way of a scene's name"
-    assert file_of("nowhere") is None, "whoever looks for names says what there is"
-    assert file_of("missing.xml") is None
+    assert find_scene_file("arms3") is None, "a folder is not in the way of a scene's name"
+    assert find_scene_file("nowhere") is None, "whoever looks for names says what there is"
+    assert find_scene_file("missing.xml") is None
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert file_of(f"~/{part.name}") == part
+    assert find_scene_file(f"~/{part.name}") == part
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_what_is_no_file_is_told_with_what_there_is(tmp_path: Path, part: Path, 
     if name == "empty.glb":
         (tmp_path / name).write_text("")
     with pytest.raises(CommandError) as raised:
-        file_of(name if name.startswith("~") else str(tmp_path / name))
+        find_scene_file(name if name.startswith("~") else str(tmp_path / name))
     assert says in str(raised.value)
     assert raised.value.status == 2
     assert part.is_file()
@@ -179,8 +179,8 @@ def test_serve_and_inspect_tell_one_extent(tmp_path: Path, capfd: pytest.Capture
 def test_what_takes_long_is_told_before(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_files, "_LARGE_BYTES", 1000)
-    monkeypatch.setattr(scene_files, "_MANY_TRIANGLES", 1000)
+    monkeypatch.setattr(scene, "_LARGE_BYTES", 1000)
+    monkeypatch.setattr(scene, "_MANY_TRIANGLES", 1000)
     monkeypatch.setattr(report, "LARGE_MESH", 1000)
     path = tmp_path / "scan.stl"
     trimesh.creation.icosphere(subdivisions=3).export(path)

@@ -10,7 +10,7 @@ import pytest
 
 from iris_session.cli.common import CommandError
 from iris_session.cli.main import build_parser, main
-from iris_session.cli.serve import session_config
+from iris_session.cli.serve import make_session_config
 from iris_session.client import FoundSession
 from iris_session.security import KeyHome, KeyPair, fingerprint, raw_key
 
@@ -59,16 +59,16 @@ def options(*words: str) -> argparse.Namespace:
 
 
 def test_a_block_of_ports_is_chosen_as_one() -> None:
-    config = session_config(options("--port-base", "7730"), "x")
+    config = make_session_config(options("--port-base", "7730"), "x")
     assert (config.control_port, config.state_port, config.beacon_port) == (7731, 7732, 7720)
-    config = session_config(options(), "x")
+    config = make_session_config(options(), "x")
     assert (config.control_port, config.state_port) == (7721, 7722)
     demo = build_parser().parse_args(["demo", "handover"])
-    assert session_config(demo, "x").control_port == 0
+    assert make_session_config(demo, "x").control_port == 0
     demo = build_parser().parse_args(["demo", "handover", "--port-base", "7730"])
-    assert session_config(demo, "x").control_port == 7731
+    assert make_session_config(demo, "x").control_port == 7731
     with pytest.raises(CommandError, match="names all ports"):
-        session_config(options("--port-base", "7730", "--state-port", "9"), "x")
+        make_session_config(options("--port-base", "7730", "--state-port", "9"), "x")
     for text in ("0", "65535", "x", "-1"):
         with pytest.raises(SystemExit):
             options("--port-base", text)
@@ -76,10 +76,10 @@ def test_a_block_of_ports_is_chosen_as_one() -> None:
 
 def test_where_to_listen_is_said_once() -> None:
     given = options("--interface", "eth0", "--interface", "10.0.0.5", "--advertise", "lab.example", "--no-beacon")
-    config = session_config(given, "x")
+    config = make_session_config(given, "x")
     assert (config.interfaces, config.advertise, config.beacon_port) == (("eth0", "10.0.0.5"), "lab.example", 0)
     with pytest.raises(CommandError, match="give one of them"):
-        session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
+        make_session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
 
 
 def test_emulated_people_say_what_is_wrong_with_where_they_go(capsys: pytest.CaptureFixture[str]) -> None:

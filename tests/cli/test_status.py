@@ -7,10 +7,10 @@ import re
 import msgspec
 import pytest
 
-from iris_session.cli.doctor import lines, verdict
+from iris_session.cli.doctor import format_findings, format_verdict
 from iris_session.cli.main import main
-from iris_session.cli.metrics import exposition
-from iris_session.cli.status import screen
+from iris_session.cli.metrics import format_metrics
+from iris_session.cli.status import format_status
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.media import StreamBudget
 from iris_session.protocol.status import (
@@ -69,7 +69,7 @@ SAMPLE = re.compile(r'iris_session_[a-z_]+(\{[a-z_]+="(\\.|[^"\\])*"(,[a-z_]+="(
 
 
 def test_one_screen_says_it_all() -> None:
-    shown = screen(REPORT)
+    shown = format_status(REPORT)
     text = "\n".join(shown)
     assert len(shown) < 25
     for words in ("lab", "measured 4 mm, 3 s", "1.5/4.0", "LOST silent", "void for 4 s", "no_lease", "physics 9"):
@@ -80,10 +80,10 @@ def test_one_screen_says_it_all() -> None:
 
 
 def test_assets_are_shown_where_there_are_some() -> None:
-    assert "assets:" not in screen(msgspec.structs.replace(REPORT, assets=AssetsReport()))
+    assert "assets:" not in format_status(msgspec.structs.replace(REPORT, assets=AssetsReport()))
     report = msgspec.structs.replace(REPORT, assets=AssetsReport(183, 17_500_000, 400, 3, 2))
-    assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients wait for some" in screen(report)
-    assert "iris_session_assets_bytes_total 17500000" in exposition(report)
+    assert "assets: 183 served, 17.5 MB sent, 3 refused; 2 clients wait for some" in format_status(report)
+    assert "iris_session_assets_bytes_total 17500000" in format_metrics(report)
 
 
 def test_media_are_shown_with_who_gets_what() -> None:
@@ -92,13 +92,13 @@ def test_media_are_shown_with_who_gets_what() -> None:
         "p2", "bob", "observer", True, media=(StreamBudget("cloud", "quarter", 5.0),), media_drops=7
     )
     streams = (MediaStreamReport("cloud", 30.0, 20.0, "cam-1", 2), MediaStreamReport("cloth", 60.0, 2.0))
-    text = screen(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams))
+    text = format_status(msgspec.structs.replace(REPORT, participants=(ann, bob), media=streams))
     assert "media cloud: 30 Hz, 20.0 Mbit/s from cam-1; ann (p1) full, bob (p2) quarter, 7 dropped" in text
     assert "media cloth: 60 Hz, 2.0 Mbit/s; nobody" in text
 
 
 def test_names_of_strangers_move_no_cursor() -> None:
-    assert all(line.isprintable() for line in screen(REPORT))
+    assert all(line.isprintable() for line in format_status(REPORT))
 
 
 @pytest.mark.parametrize(
@@ -113,17 +113,17 @@ def test_names_of_strangers_move_no_cursor() -> None:
     ],
 )
 def test_what_matters_most_is_on_top(fields: dict[str, object], words: str) -> None:
-    assert words in screen(msgspec.structs.replace(REPORT, **fields))[0]
+    assert words in format_status(msgspec.structs.replace(REPORT, **fields))[0]
 
 
 def test_a_report_of_nothing_can_be_shown() -> None:
     empty = StatusReport(0, "", "", 0)
-    assert screen(empty)
-    assert "iris_session_late_tick_share 0" in exposition(empty)
+    assert format_status(empty)
+    assert "iris_session_late_tick_share 0" in format_metrics(empty)
 
 
 def test_metrics_are_well_formed() -> None:
-    text = exposition(REPORT)
+    text = format_metrics(REPORT)
     assert text.endswith("\n")
     names: list[str] = []
     for line in text.splitlines():
@@ -137,7 +137,7 @@ def test_metrics_are_well_formed() -> None:
 
 
 def test_metrics_of_everything() -> None:
-    text = exposition(REPORT)
+    text = format_metrics(REPORT)
     assert 'iris_session_late_ticks{cause="physics"} 9' in text
     assert 'iris_session_robot_held{robot="left",holder="ann"} 1' in text
     assert 'iris_session_robot_state{robot="right",state="hold",reason="no_lease"} 1' in text
@@ -149,7 +149,7 @@ def test_metrics_of_everything() -> None:
 
 
 def test_what_was_not_measured_is_left_out() -> None:
-    lines_of_bob = [line for line in exposition(REPORT).splitlines() if 'name="bob"' in line]
+    lines_of_bob = [line for line in format_metrics(REPORT).splitlines() if 'name="bob"' in line]
     assert not any("state_age" in line or "missed" in line for line in lines_of_bob)
 
 
@@ -160,13 +160,13 @@ def test_lines_of_the_doctor() -> None:
         failed("key", "unknown", "", "pair"),
         Finding("join", "skipped", "not looked at"),
     ]
-    shown = lines(found)
+    shown = format_findings(found)
     assert [line.split()[0] for line in shown] == ["ok", "WARNING", "why:", "do:", "FAILED", "do:"]
     assert all(line.isprintable() for line in shown)
-    assert verdict(found) == "FAILED: key; to look at: age; 1 not possible"
-    assert len(lines(found, show_skipped=True)) == len(shown) + 1
-    assert verdict(found[:2]) == "nothing failed; to look at: age"
-    assert verdict(found[:1]) == "all well"
+    assert format_verdict(found) == "FAILED: key; to look at: age; 1 not possible"
+    assert len(format_findings(found, show_skipped=True)) == len(shown) + 1
+    assert format_verdict(found[:2]) == "nothing failed; to look at: age"
+    assert format_verdict(found[:1]) == "all well"
 
 
 def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.client import AssetCache, AssetError
+from iris_session.client import AssetError, AssetStore
 from iris_session.client.assets import AssetFetch
-from tests.assets.test_cache import stored
+from tests.assets.test_store import stored
 
 LOST, WAITED = "0" * 64, "1" * 64
 
 
 def test_what_is_here_can_be_read_or_looked_at_where_it_lies(tmp_path: Path) -> None:
-    cache = AssetCache(tmp_path)
+    cache = AssetStore(tmp_path)
     here = stored(cache, b"bytes of an asset")
     fetch = AssetFetch(cache, [here, LOST, WAITED], {here: 17}, None, None)
     fetch.on_found(here, 17, (), fetched=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import AssetStore, Client
 from iris_session.client.core import asset_loader as asset_loading
 from iris_session.protocol.assets import AssetRequest
 from tests.client.harness import LiveSession
@@ -95,7 +95,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
     monkeypatch.setattr(asset_loading, "PATIENCE_NS", 10**18)  # whatever helps, it is not that one
     addresses, n_cuts = live.front.scene.assets, len(cuts)
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.assets.cache = AssetCache(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     welcome = client.connection.welcome
     assert welcome is not None
@@ -119,7 +119,7 @@ def test_a_connection_that_ends_costs_what_was_under_way_and_no_time(
 
 def test_a_function_that_decodes_may_use_the_client_until_it_is_closed(live: LiveSession, tmp_path: Path) -> None:
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.assets.cache = AssetCache(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     address = live.front.scene.assets[1]
     begun, lets_go, seen = threading.Event(), threading.Event(), []
@@ -154,7 +154,7 @@ def test_a_connection_without_answers_is_made_anew(
         return [chunk(request, len(data), data)] if len(asked) > 1 else []
 
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.assets.cache = AssetCache(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     client.connect(DEADLINE_S)
     other, welcome = Liar(answers), client.connection.welcome
     assert welcome is not None

@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-from iris_session.client import AssetCache
+from iris_session.client import AssetStore
 from iris_session.client.asset_workers import AssetFailed, AssetMissing, AssetWorkers, BytesStored, Result
-from tests.assets.test_cache import ADDRESS, DATA
+from tests.assets.test_store import ADDRESS, DATA
 
 
 def test_bytes_that_cannot_be_stored_are_let_go_of_before_it_is_told_why(tmp_path: Path) -> None:
     news = threading.Event()
-    workers = AssetWorkers(AssetCache(tmp_path, max_bytes=1), news.set)
+    workers = AssetWorkers(AssetStore(tmp_path, max_bytes=1), news.set)
     found: list[Result] = []
 
     def until(kind: type[Result]) -> None:

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.client import AssetCache, AssetError, AssetFetch, Client, InvalidMessageError, NotConnectedError
+from iris_session.client import AssetError, AssetFetch, AssetStore, Client, InvalidMessageError, NotConnectedError
 from iris_session.client.core import asset_loader as asset_loading
 from iris_session.client.group import ClientGroup
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, AssetChunk, AssetRequest
@@ -64,7 +64,7 @@ def join(live: LiveSession, tmp_path: Path) -> Iterator[Callable[..., Client]]:
 
     def make(name: str = "ann", cache: str = "cache") -> Client:
         client = Client(live.address, name=name, role="observer", alignment="not_needed")
-        client.assets.cache = AssetCache(tmp_path / cache)
+        client.assets.cache = AssetStore(tmp_path / cache)
         clients.append(client)
         return client.connect(DEADLINE_S)
 
@@ -169,7 +169,7 @@ def test_what_will_not_come_says_why_and_the_rest_comes(store: Store, join: Call
     with pytest.raises(InvalidMessageError, match="no address"):
         client.assets.fetch(["../../etc/passwd"])
     path.write_bytes(store.data[damaged])
-    folder = client.assets.cache.folder
+    folder = client.assets.cache.root
     assert client.wait_for(lambda _: not list(folder.glob("??/*.part")), DEADLINE_S), "of those nothing is kept open"
     client.close()
     with pytest.raises(NotConnectedError):
@@ -193,11 +193,11 @@ def test_a_session_without_assets_refuses_and_a_cache_that_cannot_be_used_says_s
 ) -> None:
     client = join()
     (tmp_path / "file").write_bytes(b"")
-    client.assets.cache = AssetCache(tmp_path / "file")
+    client.assets.cache = AssetStore(tmp_path / "file")
     fetch = client.assets.fetch(store.addresses[:2])
     until_done(client, fetch)
     assert {error.reason for error in fetch.failed.values()} == {"cache"}
-    client.assets.cache = AssetCache(tmp_path / "folder")
+    client.assets.cache = AssetStore(tmp_path / "folder")
     fetch = client.assets.fetch(store.addresses[:2])
     until_done(client, fetch)
     fetch.check()
@@ -265,7 +265,7 @@ def test_the_cache_is_not_exchanged_under_what_is_on_its_way(
 ) -> None:
     client = join()
     fetch = client.assets.fetch(store.addresses)
-    client.assets.cache = AssetCache(tmp_path / "another")
+    client.assets.cache = AssetStore(tmp_path / "another")
     with pytest.raises(AssetError, match="exchanged"):
         client.assets.fetch(store.addresses[:1])
     until_done(client, fetch)

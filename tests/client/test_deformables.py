@@ -10,12 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.client import AssetCache, Client
+from iris_session.client import Client
 from iris_session.client.deformables import FIRST_PAUSE_S, MAX_ASSET_BYTES, Deformables, _Mesh, deformable_keys
-from iris_session.protocol.names import MediaEncoding
+from iris_session.protocol.names import ArrayKind, MediaEncoding
 from iris_session.protocol.scene import Deformable, SceneSpec, asset_addresses, encode_scene
-from iris_session.protocol.scene_names import ArrayKind
-from iris_session.scene import AssetError, AssetStore
+from iris_session.scene import AssetDecodeError, AssetStore
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
@@ -65,7 +64,7 @@ def joined(tmp_path: Path) -> Iterator[list[Client]]:
 
 def watch(live: LiveSession, joined: list[Client], cache: Path) -> tuple[Client, Deformables]:
     client = Client(live.address, role="observer", alignment="not_needed")
-    client.assets.cache = AssetCache(cache)
+    client.assets.cache = AssetStore(cache)
     joined.append(client)
     return client.connect(DEADLINE_S), Deformables(client)
 
@@ -158,7 +157,7 @@ def test_triangles_that_cannot_be_are_refused(tmp_path: Path, name: str, values:
     arrays = decode_arrays(store.get(part.address), ArrayKind.DEFORMABLE)
     kept = [Stored(key, array) for key, array in arrays.items() if key != name]
     bad = encode_arrays(ArrayKind.DEFORMABLE, kept if values is None else [*kept, Stored(name, values)])
-    with pytest.raises((AssetError, ValueError), match=f"{name}|vertices"):
+    with pytest.raises((AssetDecodeError, ValueError), match=f"{name}|vertices"):
         _Mesh("cloth", part, memoryview(bad))
 
 
@@ -333,7 +332,7 @@ def test_a_small_asset_that_becomes_large_is_refused(tmp_path: Path) -> None:
     padding = Stored("padding", np.zeros(MAX_ASSET_BYTES, np.uint8))
     bomb = encode_arrays(ArrayKind.DEFORMABLE, [*(Stored(*item) for item in arrays.items()), padding])
     assert len(bomb) < 100_000
-    with pytest.raises(AssetError, match=f"at most {MAX_ASSET_BYTES}"):
+    with pytest.raises(AssetDecodeError, match=f"at most {MAX_ASSET_BYTES}"):
         _Mesh("a", part, memoryview(bomb))
 
 
@@ -368,7 +367,7 @@ def test_what_stays_of_two_on_one_stream_goes_on(tmp_path: Path) -> None:
 
 def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after_a_pause(tmp_path: Path) -> None:
     client = Client("127.0.0.1:1", role="observer", name="screen")
-    client.assets.cache = AssetCache(tmp_path)
+    client.assets.cache = AssetStore(tmp_path)
     shapes, (one, two, three) = Deformables(client), ("1" * 64, "2" * 64, "3" * 64)
     shapes._use([], one)
     shapes._follow(one, ("a", 1))
@@ -378,12 +377,12 @@ def test_a_scene_that_comes_back_is_shown_and_one_that_failed_is_asked_for_after
     assert (shapes._parked, shapes._fetch) == (False, None)
     shapes._follow(two, ("a", 3))
     client.mirror.scene_hash = three
-    shapes._failed(AssetError("of a scene that is no more"))
+    shapes._failed(AssetDecodeError("of a scene that is no more"))
     assert shapes.fault == ""
     client.mirror.scene_hash = two
     for pause_s in (FIRST_PAUSE_S, 2 * FIRST_PAUSE_S):
         before = time.monotonic()
-        shapes._failed(AssetError("unknown"))
+        shapes._failed(AssetDecodeError("unknown"))
         assert shapes._retry_s >= before + pause_s
     assert shapes.fault == "unknown"
     client.close()

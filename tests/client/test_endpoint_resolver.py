@@ -22,8 +22,7 @@ from iris_session.protocol import pairing
 from iris_session.protocol.codec import encode_server
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Paired
-from iris_session.protocol.server_messages import Refused, ServerEnvelope
+from iris_session.protocol.server_messages import Paired, Refused, ServerEnvelope
 from iris_session.security import KeyHome, KeyPair
 from tests.client.harness import LiveSession
 

@@ -11,7 +11,7 @@ import msgspec
 import mujoco
 import pytest
 
-from iris_session.client import AssetCache, AssetError, Client, ClientError, NotConnectedError, fetched_scene
+from iris_session.client import AssetError, Client, ClientError, NotConnectedError, fetched_scene
 from iris_session.client.assets import AssetFetch
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.protocol.assets import AssetRefused, AssetRequest
@@ -63,7 +63,7 @@ def join(tmp_path: Path, store: AssetStore, sessions: list[LiveSession]) -> Iter
         opened.append(live)
         sessions.append(live)
         client = Client(live.address, name="ann", role="observer", alignment="not_needed")
-        client.assets.cache = AssetCache(tmp_path / "cache")
+        client.assets.cache = AssetStore(tmp_path / "cache")
         opened.append(client)
         return client.connect(30.0)
 
@@ -92,7 +92,7 @@ def test_what_cannot_be_had_is_said(
         raise AssertionError("a session could fill the memory with it before it is refused")
 
     monkeypatch.setattr(fetched_scene, "REFUSED_S", 0.2)
-    monkeypatch.setattr(AssetCache, "read", copied)
+    monkeypatch.setattr(AssetStore, "get", copied)
     monkeypatch.setattr(AssetFetch, "read", copied)
     with pytest.raises(NotConnectedError, match="shares no specification"):
         fetch_scene(join("model"))

@@ -145,7 +145,9 @@ def test_a_fault_ends_the_wait_for_an_answer(session: LiveSession, join: Join) -
     def tell(_: Client) -> bool:
         if not told:
             told.append(True)
-            ann.connection._fault(ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns())
+            ann.connection._process_fault(
+                ProtocolFault(FaultCode.MALFORMED, "acquire: robots is wrong"), time.monotonic_ns()
+            )
         return False
 
     polling, ann.poll = ann.poll, lambda timeout_s=0.0: tell(ann) or polling(min(timeout_s, 0.01))  # type: ignore[method-assign]

@@ -16,7 +16,7 @@ import pytest
 import zstandard
 
 from iris_session.codegen.arrays_golden import golden
-from iris_session.scene import AssetError, decode_arrays
+from iris_session.scene import AssetDecodeError, decode_arrays
 
 FILE = Path(__file__).parents[2] / "docs" / "protocol" / "arrays.json"
 CONTENT = json.loads(FILE.read_text())
@@ -88,7 +88,7 @@ def test_another_reader(row: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("row", [pytest.param(row, id=row["name"]) for row in CONTENT["malformed"]])
 def test_what_is_malformed_is_refused(row: dict[str, Any]) -> None:
-    with pytest.raises(AssetError):
+    with pytest.raises(AssetDecodeError):
         decode_arrays(bytes.fromhex(row["hex"]), "mesh")
 
 

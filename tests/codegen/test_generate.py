@@ -12,17 +12,7 @@ import pytest
 
 from iris_session.codegen import __main__ as generate
 from iris_session.codegen import csharp, schema, tables, typescript
-from iris_session.protocol import (
-    arrays,
-    client_messages,
-    codec,
-    names,
-    scene,
-    scene_looks,
-    scene_names,
-    scene_patch,
-    server_messages,
-)
+from iris_session.protocol import assets, client_messages, codec, names, scene, server_messages
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,7 +59,7 @@ def test_generator_needs_a_checkout_and_its_markers(tmp_path: Path, capsys: pyte
 def test_every_struct_is_in_the_schema() -> None:
     """A struct that is defined for the wire and not listed would be missing in every generated file."""
     listed = {struct.name for struct in schema.all_structs()}
-    for module in (client_messages, server_messages, scene, scene_looks, scene_patch, arrays):
+    for module in (client_messages, server_messages, scene, assets):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, msgspec.Struct) and value.__module__ == module.__name__:
                 assert name in listed | {"Message", "EventBody"}, name
@@ -80,7 +70,7 @@ def test_open_enumerations_are_explained_whole() -> None:
     """Not up to the first line, which may end within a sentence."""
     for name in schema.enums():
         doc = schema.enum_doc(name)
-        kind = getattr(names, name, None) or getattr(scene_names, name)
+        kind = getattr(names, name)
         assert doc.split() == (kind.__doc__ or "").split()
         assert not doc or doc.endswith("."), name
     document = (ROOT / "docs/protocol.md").read_text()

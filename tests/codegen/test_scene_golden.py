@@ -12,18 +12,19 @@ import msgspec
 import pytest
 
 from iris_session.codegen import schema
-from iris_session.protocol import scene_names
+from iris_session.protocol import names
 from iris_session.protocol.scene import (
     MAX_SCENE_BYTES,
     MAX_THINGS,
+    Material,
+    PatchOp,
     SceneError,
     SceneSpec,
     check_scene,
     decode_scene,
     encode_scene,
+    patched,
 )
-from iris_session.protocol.scene_looks import Material
-from iris_session.protocol.scene_patch import PatchOp, patched
 from tests.codegen.test_interop import reordered, same, unpack
 
 GOLDEN = json.loads((Path(__file__).parents[2] / "docs" / "protocol" / "scene.json").read_text())
@@ -134,11 +135,11 @@ def test_every_struct_and_kind_of_thing_has_a_vector() -> None:
     whole = decode_scene(bytes.fromhex(SCENES["every kind of thing"]["hex"]))
     for field in whole.__struct_fields__:
         assert getattr(whole, field) != getattr(SceneSpec(), field) or field == "version", field
-    kinds = scene_names.GeometryKind.ALL
+    kinds = names.GeometryKind.ALL
     assert {visual.geometry.kind for visual in whole.visuals} - kinds == {"torus"}, "and one that nobody knows"
     assert {visual.geometry.kind for visual in whole.visuals} >= kinds
-    assert {light.kind for light in whole.lights} == scene_names.LightKind.ALL
-    assert {texture.kind for texture in whole.textures} == scene_names.TextureKind.ALL
+    assert {light.kind for light in whole.lights} == names.LightKind.ALL
+    assert {texture.kind for texture in whole.textures} == names.TextureKind.ALL
     assert {part.dim for part in whole.deformables} == {1, 2, 3}
     encodings = {level.encoding for texture in whole.textures for level in texture.levels}
     assert encodings == set(schema.enums()["AssetEncoding"].values())

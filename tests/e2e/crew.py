@@ -84,7 +84,7 @@ def views(crew: list[Emulated], watcher: Client, point: Vec3) -> list[View] | No
     out = []
     for person in crew:
         report = person.report
-        alignment = watcher.mirror.alignment(report.participant)
+        alignment = watcher.mirror.find_alignment(report.participant)
         if alignment is None or report.T_true_shown is None or report.alignment_version != alignment.version:
             return None
         out.append(View(report, alignment.covariance, person.spec.T_world_anchor[0], point))

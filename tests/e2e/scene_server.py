@@ -15,8 +15,7 @@ import mujoco
 from iris_session import Session, SessionConfig
 from iris_session.demo.scenes import n_arms_scene, scene_path
 from iris_session.protocol.common import Pose
-from iris_session.protocol.scene import Geometry, Visual
-from iris_session.protocol.scene_patch import AddVisual, SetVisual
+from iris_session.protocol.scene import AddVisual, Geometry, SetVisual, Visual
 
 RED = (1.0, 0.0, 0.0, 1.0)
 

@@ -113,7 +113,7 @@ class Table:
 
     def aligned_anew(self, name: str, since_version: int) -> bool:
         person = self.crew[name].report
-        alignment = self.watcher.mirror.alignment(person.participant)
+        alignment = self.watcher.mirror.find_alignment(person.participant)
         return alignment is not None and alignment.version > since_version
 
     def close(self) -> None:

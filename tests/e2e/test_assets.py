@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.client import AssetCache, AssetFetch, Client
+from iris_session.client import AssetFetch, AssetStore, Client
 from iris_session.netsim.process import ImpairmentProcess
 from tests.e2e.conftest import DEADLINE_S, Server, Stage, end_all
 from tests.front.asset_rig import noise, put
@@ -38,7 +38,7 @@ def serving(tmp_path: Path, data: dict[str, bytes]) -> Iterator[Stage]:
 
 def watcher(stage: Stage, name: str, address: str, cache: Path) -> Client:
     client = Client(address, role="observer", name=name, alignment="not_needed")
-    client.assets.cache = AssetCache(cache)
+    client.assets.cache = AssetStore(cache)
     stage.clients.append(client)
     return client.connect(DEADLINE_S)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.protocol.security import Audited
+from iris_session.protocol.server_messages import Audited
 from iris_session.protocol.status import ParticipantReport
 from tests.e2e.conftest import Hand, Server, Stage, end_all, serve_command
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from iris_session import Client, SceneBuilder, ScenePublisher, Session, SessionConfig
-from iris_session.client import AssetCache
+from iris_session.client import AssetStore
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
 from iris_session.demo.scenes import n_arms_scene, scene_path
-from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.scene import SetVisual
 from tests.e2e.publisher import cloth, grid
 
 pytestmark = pytest.mark.e2e
@@ -84,7 +84,7 @@ def opened() -> Iterator[list[Client]]:
 
 def joined(session: Session | ScenePublisher, opened: list[Client], cache: Path) -> Client:
     client = Client(session.address, role="observer", name=cache.name, alignment="not_needed")
-    client.assets.cache = AssetCache(cache)
+    client.assets.cache = AssetStore(cache)
     opened.append(client)
     return client.connect(DEADLINE_S)
 
@@ -123,7 +123,7 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
     shapes = Deformables(ann)
     world.restless.set()
     assert ann.wait_for(lambda _: bool(shapes.update()), DEADLINE_S), "also who comes while it is"
-    feed = ann.media.subscribe(shapes._meshes[0].stream)
+    feed = ann.media(shapes._meshes[0].stream).subscribe.subscribe
     looks, drawn = {ann.mirror.scene_hash}, {shapes.scene_hash}
     moved = 0
 
@@ -144,7 +144,7 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
         return shapes.scene_hash == client.mirror.scene_hash
 
     assert ann.wait_for(newest, DEADLINE_S)
-    assert ann.media.subscribe(feed.stream) is feed, "it is the same subscription"
+    assert ann.media(feed.stream).subscribe.subscribe is feed, "it is the same subscription"
     assert shapes.capture_ns["cloth"] > 0
     assert np.isfinite(shapes.vertices["cloth"]).all()
 

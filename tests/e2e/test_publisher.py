@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from anchors.pose import compose
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.store import AssetStore
 from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.protocol.scene import asset_addresses, decode_scene
 from iris_session.protocol.server_messages import SceneChanged
-from iris_session.scene import AssetStore
 from iris_session.session.deformables import BOUND_M
 from iris_session.streams.rigid import MAX_POSITION_ERROR_M, MAX_ROTATION_ERROR_RAD
 from tests.e2e import publisher
@@ -47,7 +46,7 @@ class Watcher:
     def __init__(self, stage: Stage, name: str, stream: str) -> None:
         self.client = stage.join(name, role="observer")
         self.shapes = Deformables(self.client)
-        self.feed = self.client.media.subscribe(stream)
+        self.feed = self.client.media(stream).subscribe.subscribe
         self.poses = self.vertices = 0
         self._time_of: dict[int, float] = {}  # session time -> time of the world
         self._seen = -1
@@ -106,7 +105,7 @@ def test_everybody_sees_a_world_that_mujoco_does_not_know(stage: Stage, tmp_path
     looks(stage, [ann, late])
 
     client = late.client
-    client.assets.cache = AssetCache(tmp_path / "cache")
+    client.assets.cache = AssetStore(tmp_path / "cache")
     assert client.mirror.scene_hash == composed.scene_hash, "the scene is the builder's"
     fetch = client.assets.fetch([composed.scene_hash])
     stage.run(lambda: fetch.done, "the specification has come")

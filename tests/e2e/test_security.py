@@ -13,11 +13,26 @@ import zmq
 
 from anchors.pose import distance
 from iris_session.client import Client, CurveKeys, DeniedError, RefusedError
-from iris_session.protocol.client_messages import Assign, ClientMessage, EStop, Hello, Sample, SetMode, envelope
+from iris_session.protocol.client_messages import (
+    Assign,
+    ClientMessage,
+    EStop,
+    Hello,
+    RemoveParticipant,
+    Sample,
+    SetMode,
+    envelope,
+)
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.names import AuditKind, DenialReason, FaultCode, RefusalCode, RejectReason
-from iris_session.protocol.security import Audited, RemoveParticipant
-from iris_session.protocol.server_messages import LeaseChanged, ParticipantLeft, ProtocolFault, Refused, SamplesRejected
+from iris_session.protocol.server_messages import (
+    Audited,
+    LeaseChanged,
+    ParticipantLeft,
+    ProtocolFault,
+    Refused,
+    SamplesRejected,
+)
 from iris_session.security import KeyHome, KeyPair
 from tests.e2e.conftest import COMMAND, DEADLINE_S, Hand, Server, Stage, wait
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iris_session.assets.cache import AssetCache
+from iris_session.assets.store import AssetStore
 from iris_session.client import Client
 from iris_session.client.deformables import Deformables
 from iris_session.client.fetched_scene import fetch_scene
+from iris_session.protocol.names import ArrayKind
 from iris_session.protocol.scene import SceneSpec, asset_addresses, decode_scene
-from iris_session.protocol.scene_names import ArrayKind
 from iris_session.recording import Recording
 from iris_session.scene import decode_arrays, decode_mesh
 from tests.e2e.conftest import Server, Stage
@@ -46,7 +46,7 @@ def stage(tmp_path: Path, serve: Callable[..., Server]) -> Iterator[Stage]:
 
 def fetched(stage: Stage, client: Client, cache: Path) -> SceneSpec:
     """The scene that the session says is the present one, and all its assets in `cache`."""
-    client.assets.cache = AssetCache(cache)
+    client.assets.cache = AssetStore(cache)
     address = client.mirror.scene_hash
     fetch = client.assets.fetch([address])
     stage.run(lambda: fetch.done, "the specification has come")
@@ -96,14 +96,14 @@ def test_a_client_draws_what_the_session_has(stage: Stage, tmp_path: Path) -> No
 def test_who_comes_again_or_late_needs_nothing_anew(stage: Stage, tmp_path: Path) -> None:
     ann, bob = stage.join("ann", role="observer"), stage.join("bob", role="observer")
     spec = fetched(stage, ann, tmp_path / "cache")
-    bob.assets.cache = AssetCache(tmp_path / "cache")
+    bob.assets.cache = AssetStore(tmp_path / "cache")
     again = bob.assets.fetch([bob.mirror.scene_hash, *asset_addresses(spec)])
     stage.run(lambda: again.done, "all of it is there")
     assert (again.bytes_received, again.cached) == (0, len(again.addresses))
     stage.server.children()["front.main"].kill()
     stage.run(lambda: not ann.ready, "the front is gone")
     stage.run(lambda: ann.ready and bob.ready, "another one is there")
-    bob.assets.cache = AssetCache(tmp_path / "other")
+    bob.assets.cache = AssetStore(tmp_path / "other")
     late = bob.assets.fetch(asset_addresses(spec))
     stage.run(lambda: late.done, "the front that replaced it serves the scene too")
     late.check()

@@ -1,4 +1,4 @@
-"""The short form of `tools/soak.py`, and that its checks can fail. An hour of it is run by hand: docs/links.md."""
+"""The short form of `tools/soak.py`, and that its checks can fail. docs/evidence/links.md has the long one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
-from soak_checks import check_log, check_memory  # noqa: E402
+from soak import check_log, check_memory  # noqa: E402
 
 RECORDED = {1: 11, 2: 22, 3: 33, 4: 44, 5: 55}
 

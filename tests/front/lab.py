@@ -6,9 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import EStop, Hello, Marker
+from iris_session.protocol.client_messages import EStop, Hello, Marker, Pair
 from iris_session.protocol.entries import Audit
-from iris_session.protocol.security import Pair
 from iris_session.protocol.server_messages import Refused
 from iris_session.security import KeyHome, KeyPair
 from tests.front.harness import FrontSession, RawClient

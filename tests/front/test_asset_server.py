@@ -15,9 +15,9 @@ import psutil
 import pytest
 import zmq
 
-from iris_session.assets.mapped_files import AssetFiles
-from iris_session.front.asset_server import AssetServer, AssetSockets, Table, open_below
-from iris_session.front.media.connection_guard import MediaDoors
+from iris_session.assets.store import ServedAssets
+from iris_session.front.asset_server import AssetAccess, AssetServer, AssetSockets, open_asset_sockets
+from iris_session.front.connection_guard import ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
 from iris_session.protocol.assets import MAX_ASSET_CHUNK_BYTES, MAX_ASSET_REQUESTS, AssetRequest
@@ -28,7 +28,7 @@ from iris_session.protocol.server_messages import Event, SceneChanged
 from iris_session.protocol.status import GetStatus, StatusReport
 from iris_session.protocol.steps import Decision
 from iris_session.security import KeyPair
-from iris_session.system.priority import NICER
+from iris_session.system.priority import LOW_PRIORITY_NICE
 from tests.e2e.conftest import unavailable
 from tests.front.asset_rig import Curve, Fetcher, noise, put, with_assets
 from tests.front.harness import FrontSession, RawClient
@@ -275,11 +275,11 @@ def test_only_the_own_key_fetches_and_a_revoked_one_does_not(lab: Lab, tmp_path:
 @pytest.fixture
 def alone(tmp_path: Path) -> Iterator[tuple[AssetServer, AssetSockets, str]]:
     """The thread without a front; it serves one asset to connection 1."""
-    sockets = open_below(FrontConfig(), None)
-    doors = MediaDoors(sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
-    server = AssetServer(sockets, doors, time.monotonic_ns)
+    sockets = open_asset_sockets(FrontConfig(), None)
+    guard = ChannelGuard(sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
+    server = AssetServer(sockets, guard, time.monotonic_ns)
     address = put(tmp_path, b"asset")
-    server.publish(Table({1: ""}, frozenset(), ((str(tmp_path), (address,)),)))
+    server.set_access(AssetAccess({1: ""}, frozenset(), ((str(tmp_path), (address,)),)))
     server.start()
     yield server, sockets, address
     server.close()
@@ -315,19 +315,19 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         def fail(*_: object) -> None:
             raise ZeroDivisionError("planted")
 
-        broken.setattr(AssetFiles, "chunk", fail)
+        broken.setattr(ServedAssets, "chunk", fail)
         assert [_fetched(sockets, address) for _ in range(2)] == [None, None]
     assert _fetched(sockets, address) == b"asset"
-    assert server.tallied().reasons["assets_fault"] == 2
+    assert server.read_counters().reasons["assets_fault"] == 2
     assert capfd.readouterr().err.count("a fault in the thread of assets, which goes on: ZeroDivisionError") == 1
 
 
 def test_libzmq_sends_assets_below_everything_else(alone: tuple[AssetServer, AssetSockets, str]) -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
-    if ours + NICER > 19:
+    if ours + LOW_PRIORITY_NICE > 19:
         unavailable("these tests run at the lowest priority already")
     found = Counter(os.getpriority(os.PRIO_PROCESS, thread.id) for thread in psutil.Process().threads())
-    assert found[ours + NICER] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
+    assert found[ours + LOW_PRIORITY_NICE] >= 2  # libzmq's I/O thread and its reaper; none that holds Python's lock
     python = [thread.native_id for thread in threading.enumerate() if thread.native_id is not None]
     assert {os.getpriority(os.PRIO_PROCESS, number) for number in python} == {ours}
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import zmq
 
-from iris_session.front.asset_server import Table, Tallied
+from iris_session.front.asset_server import AssetAccess, AssetCounters
 from iris_session.front.asset_service import (
     LATE_NS,
-    LATE_TURN_NS,
-    LOOK_NS,
+    LATE_TICK_NS,
     MAX_REPLACED,
+    PERIOD_NS,
     REPLACED_NS,
-    AssetDesk,
+    AssetService,
 )
-from iris_session.front.connections import ClientTable, Connection, Peer, Route
+from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.client_messages import Hello
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import AllowedKey, KeyPair
 from iris_session.security.keyring import Keyring
 
@@ -28,16 +28,16 @@ class Told:
     """In place of the thread: keeps what it is told, at the time that it is."""
 
     def __init__(self) -> None:
-        self.table = Table()
+        self.table = AssetAccess()
         self.late_until_ns = 0
 
     def start(self) -> None: ...
 
-    def publish(self, table: Table) -> None:
-        self.table = table
+    def set_access(self, access: AssetAccess) -> None:
+        self.table = access
 
-    def tallied(self) -> Tallied:
-        return Tallied(0, 0, 0, 0, {})
+    def read_counters(self) -> AssetCounters:
+        return AssetCounters(0, 0, 0, 0, {})
 
     @property
     def served(self) -> set[str]:
@@ -48,10 +48,10 @@ class Desk:
     def __init__(self, keyring: Keyring | None = None) -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self.publisher = StatePublisher(context.socket(zmq.PUB), look(0), lambda: 0)
-        self.publisher.use_socket(None)
-        self.told, self.drops, self.clients = Told(), Drops(), ClientTable()
+        self.publisher.replace_socket(None)
+        self.told, self.drops, self.clients = Told(), Drops(), ConnectionTable()
         self.revoked: set[str] = set()
-        self.desk = AssetDesk(
+        self.desk = AssetService(
             self.told,  # type: ignore[arg-type]
             self.clients,
             keyring or Keyring(),
@@ -62,13 +62,13 @@ class Desk:
 
     def join(self, number: int, key: str, gateway: int = 0) -> None:
         route, peer = Route(b"%d" % number), Peer(number, key)
-        connection = Connection(number, route, peer, ("127.0.0.1", 1), key, Hello("observer", "Ann"), gateway)
+        connection = FrontConnection(number, route, peer, ("127.0.0.1", 1), key, Hello("observer", "Ann"), gateway)
         connection.admitted = True
         self.clients.add(connection)
 
     def show(self, info: SceneInfo) -> set[str]:
         self.publisher.set_scene(info)
-        self.desk.look()
+        self.desk.sync_clients()
         return self.told.served
 
 
@@ -90,16 +90,16 @@ def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_th
 
 def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
     desk = Desk()
-    desk.desk.turn(0)
+    desk.desk.tick(0)
     for number in range(3):
         desk.show(look(number))
-    desk.desk.turn(REPLACED_NS)
+    desk.desk.tick(REPLACED_NS)
     assert "look0" in desk.told.served
     desk.show(look(3))
-    desk.desk.turn(REPLACED_NS + LOOK_NS)
+    desk.desk.tick(REPLACED_NS + PERIOD_NS)
     assert desk.told.served >= {"look1", "look2", "look3"}
     assert "look0" not in desk.told.served
-    desk.desk.turn(2 * REPLACED_NS + LOOK_NS)
+    desk.desk.tick(2 * REPLACED_NS + PERIOD_NS)
     assert desk.told.served == {"look2", "mesh2", "look3", "mesh3"}
 
 
@@ -118,11 +118,11 @@ def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked
     desk.join(2, "gate")
     desk.join(3, "bob", gateway=2)
     desk.revoked.add("eve")
-    desk.desk.turn(0)
+    desk.desk.tick(0)
     assert desk.told.table.marks == {"ann", "gate"}
     assert desk.told.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
     desk.revoked.add("ann")
-    desk.desk.turn(LOOK_NS)
+    desk.desk.tick(PERIOD_NS)
     assert desk.told.table.marks == {"gate"}
 
 
@@ -138,12 +138,12 @@ def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
             steps.frames += 1
             steps._delays.append((now_ns, delay_ns))
         desk.told.late_until_ns = 0
-        desk.desk.turn(now_ns)
+        desk.desk.tick(now_ns)
         return desk.told.late_until_ns > now_ns
 
     assert not yields(0, delay_ns=None)
-    assert not yields(LATE_TURN_NS, delay_ns=LATE_NS)
+    assert not yields(LATE_TICK_NS, delay_ns=LATE_NS)
     assert yields(1, delay_ns=LATE_NS + 1)
     assert not yields(1, delay_ns=None), "of a state that was late long ago"
-    assert yields(LATE_TURN_NS + 1, delay_ns=None)
-    assert yields(LATE_TURN_NS + 1, delay_ns=0), "state in time does not make up for a loop that was late"
+    assert yields(LATE_TICK_NS + 1, delay_ns=None)
+    assert yields(LATE_TICK_NS + 1, delay_ns=0), "state in time does not make up for a loop that was late"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from iris_session.front.asset_server import CHUNKS, YIELD_MS, AssetServer, Table, open_below
-from iris_session.front.media.connection_guard import MAX_SAID, MediaDoors
+from iris_session.front.asset_server import CHUNKS, YIELD_MS, AssetAccess, AssetServer, open_asset_sockets
+from iris_session.front.connection_guard import MAX_COUNTED_MESSAGES, ChannelGuard
 from iris_session.link import FrontConfig, FrontLimits
 from iris_session.link.sockets import bound_port
 from iris_session.protocol.assets import AssetRequest
@@ -22,24 +22,24 @@ class Still:
     """The server before its thread has begun: this thread does its work, step by step, at `now_ns`."""
 
     def __init__(self, root: Path) -> None:
-        self.sockets = open_below(FrontConfig(), None)
-        doors = MediaDoors(self.sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
+        self.sockets = open_asset_sockets(FrontConfig(), None)
+        guard = ChannelGuard(self.sockets.monitor, FrontLimits(), 8, 65_536, curve=False, name="assets")
         self.now_ns = 1
-        self.server = AssetServer(self.sockets, doors, lambda: self.now_ns)
+        self.server = AssetServer(self.sockets, guard, lambda: self.now_ns)
         self.address = put(root, b"asset")
-        self.server.publish(Table({1: ""}, frozenset(), ((str(root), (self.address,)),)))
+        self.server.set_access(AssetAccess({1: ""}, frozenset(), ((str(root), (self.address,)),)))
         self.context = zmq.Context()
         self.dealer = self.context.socket(zmq.DEALER)
         self.dealer.connect(f"tcp://127.0.0.1:{bound_port(self.sockets.socket)}")
 
     def take(self, n: int) -> None:
         """Asks so often, until all of it is taken."""
-        wanted = self.server.tallied().requests + n
+        wanted = self.server.read_counters().requests + n
         for _ in range(n):
             self.dealer.send(encode_asset_request(AssetRequest(1, 1, 1, self.address, 0, 100)))
-        while self.server.tallied().requests < wanted and self.sockets.socket.poll(30_000):
-            self.server._take_requests()
-        assert self.server.tallied().requests == wanted
+        while self.server.read_counters().requests < wanted and self.sockets.socket.poll(30_000):
+            self.server._receive_requests()
+        assert self.server.read_counters().requests == wanted
 
 
 @pytest.fixture
@@ -51,33 +51,33 @@ def still(tmp_path: Path) -> Iterator[Still]:
 
 
 def test_a_refusal_that_nobody_is_there_to_hear_is_counted(still: Still) -> None:
-    still.server._refuse(b"gone", 7, "", AssetRefusal.NOT_ALLOWED)
-    assert still.server.tallied().reasons == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
+    still.server._queue_refusal(b"gone", 7, "", AssetRefusal.NOT_ALLOWED)
+    assert still.server.read_counters().reasons == {"assets_not_allowed": 1, "assets_refusal_unsent": 1}
 
 
 def test_nobody_waits_who_is_gone(still: Still) -> None:
     still.take(1)
-    assert still.server._hub.ask(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
-    assert still.server.tallied().waiting == 2
+    assert still.server._scheduler.ask(b"gone", 99, "", AssetRequest(1, 1, 7, still.address, 0, 100), 1) == ""
+    assert still.server.read_counters().waiting == 2
     still.server._send_chunks()
-    assert (still.server.tallied().chunks, still.server.tallied().waiting) == (1, 0)
+    assert (still.server.read_counters().chunks, still.server.read_counters().waiting) == (1, 0)
 
 
 def test_while_the_loop_is_late_one_chunk_goes_out_in_a_while(still: Still) -> None:
     still.take(4)
-    assert still.server.tallied().reasons == {}, "whoever asks after a table was published is answered by it"
+    assert still.server.read_counters().reasons == {}, "whoever asks after a table was published is answered by it"
     still.server.late_until_ns = 2
     still.server._send_chunks()
-    assert (still.server.tallied().chunks, still.server._patience_ms()) == (1, YIELD_MS)
+    assert (still.server.read_counters().chunks, still.server._poll_timeout_ms()) == (1, YIELD_MS)
     still.server.late_until_ns = 0
     still.server._send_chunks()
-    assert (still.server.tallied().chunks, still.server._patience_ms()) == (1 + CHUNKS, 0)
+    assert (still.server.read_counters().chunks, still.server._poll_timeout_ms()) == (1 + CHUNKS, 0)
 
 
 def test_only_what_is_refused_counts_as_a_flood(still: Still) -> None:
-    for n in range(1, MAX_SAID + 10):
+    for n in range(1, MAX_COUNTED_MESSAGES + 10):
         still.now_ns += 10_000_000  # slower than any rate
         still.take(1)
         still.server._send_chunks()
-        assert still.server.tallied().chunks == n
-    assert still.server.tallied().reasons == {}
+        assert still.server.read_counters().chunks == n
+    assert still.server.read_counters().reasons == {}

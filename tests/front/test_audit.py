@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iris_session.front.audit import MANY, MAX_LINES, PERIOD_NS, AuditTrail
+from iris_session.front.audit import MANY_ADDRESSES, MAX_PENDING, PERIOD_NS, AuditTrail
 from iris_session.protocol.entries import HOST, Audit, Entry
 
 
@@ -27,16 +27,16 @@ class Trail:
 def test_the_first_is_told_at_once_and_those_of_a_second_together() -> None:
     t = Trail()
     for i in range(5):
-        t.trail.note("code_refused", i, address="10.0.0.9", detail=str(i))
+        t.trail.record("code_refused", i, address="10.0.0.9", detail=str(i))
     assert t.told == [Entry(HOST, HOST, 0, Audit("code_refused", "", "", "10.0.0.9", "0", 1))]
-    t.trail.turn(PERIOD_NS - 1)
+    t.trail.tick(PERIOD_NS - 1)
     assert len(t.told) == 1
-    t.trail.turn(PERIOD_NS)
+    t.trail.tick(PERIOD_NS)
     assert t.audits[1] == Audit("code_refused", "", "", "10.0.0.9", "4", 4)
-    t.trail.turn(2 * PERIOD_NS)
-    t.trail.turn(3 * PERIOD_NS)
+    t.trail.tick(2 * PERIOD_NS)
+    t.trail.tick(3 * PERIOD_NS)
     assert len(t.told) == 2
-    t.trail.note("code_refused", 3 * PERIOD_NS, address="10.0.0.9")
+    t.trail.record("code_refused", 3 * PERIOD_NS, address="10.0.0.9")
     assert len(t.told) == 3, "after a quiet second the next is a first one again"
 
 
@@ -48,20 +48,20 @@ def test_bounded_and_nothing_is_lost_in_the_sum(steps: list[tuple[str, int, int]
     now = 0
     for kind, address, dt in steps:
         now += dt
-        t.trail.turn(now)
-        t.trail.note(kind, now, address=str(address))
+        t.trail.tick(now)
+        t.trail.record(kind, now, address=str(address))
     for second in (1, 2):
-        t.trail.turn(now + second * PERIOD_NS)
+        t.trail.tick(now + second * PERIOD_NS)
     assert sum(audit.count for audit in t.audits) == len(steps)
     seconds = now // PERIOD_NS + 2
-    assert len(t.told) <= (MAX_LINES + 2) * 2 * seconds
+    assert len(t.told) <= (MAX_PENDING + 2) * 2 * seconds
 
 
 def test_many_addresses_are_told_as_one() -> None:
     t = Trail()
     for i in range(1000):
-        t.trail.note("key_refused", 0, address=f"10.0.{i // 256}.{i % 256}")
-    assert len(t.told) == MAX_LINES + 1
-    t.trail.turn(PERIOD_NS)
-    assert t.audits[-1].address == MANY
+        t.trail.record("key_refused", 0, address=f"10.0.{i // 256}.{i % 256}")
+    assert len(t.told) == MAX_PENDING + 1
+    t.trail.tick(PERIOD_NS)
+    assert t.audits[-1].address == MANY_ADDRESSES
     assert sum(audit.count for audit in t.audits) == 1000

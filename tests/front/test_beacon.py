@@ -7,11 +7,11 @@ import socket
 
 import pytest
 
-from iris_session.front.beacon import LOOK_AGAIN_NS, PERIOD_NS, BeaconSender
+from iris_session.front.beacon import BEACON_PERIOD_NS, INTERFACES_PERIOD_NS, BeaconSender
 from iris_session.link.interfaces import Interface
 from iris_session.protocol.codec import decode_beacon
 from iris_session.protocol.discovery import Beacon
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 BEACON = Beacon(1, "s1", "lab-1", "live", "", 7721, 7722, 0, 0, 0, "mark")
 LO = Interface("lo", "127.0.0.1", "127.255.255.255")
@@ -49,7 +49,7 @@ def sender(hosts: list[str], *have: Interface, advertise: str = "") -> tuple[Bea
 
 def test_every_network_hears_its_own_address_and_this_machine_that_of_the_first() -> None:
     beacon, wire, _ = sender(["0.0.0.0"], LO, ETH, WLAN, TUNNEL)
-    beacon.turn(1)
+    beacon.tick(1)
     assert wire.hosts() == {
         "127.255.255.255": "10.1.2.3",
         "10.1.2.255": "10.1.2.3",
@@ -60,16 +60,16 @@ def test_every_network_hears_its_own_address_and_this_machine_that_of_the_first(
 
 def test_only_the_chosen_interface_and_only_loopback_for_loopback() -> None:
     beacon, wire, _ = sender(["192.168.0.9"], LO, ETH, WLAN)
-    beacon.turn(1)
+    beacon.tick(1)
     assert wire.hosts() == {"127.255.255.255": "192.168.0.9", "192.168.0.255": "192.168.0.9"}
     beacon, wire, _ = sender(["127.0.0.1"], LO, ETH, WLAN)
-    beacon.turn(1)
+    beacon.tick(1)
     assert wire.hosts() == {"127.255.255.255": "127.0.0.1"}
 
 
 def test_an_advertised_address_is_told_to_others() -> None:
     beacon, wire, _ = sender(["0.0.0.0"], LO, ETH, advertise="lab.example.org")
-    beacon.turn(1)
+    beacon.tick(1)
     assert wire.hosts() == {"127.255.255.255": "10.1.2.3", "10.1.2.255": "lab.example.org"}
 
 
@@ -77,11 +77,11 @@ def test_five_times_a_second_and_networks_that_come_later() -> None:
     have = [LO, ETH]
     beacon = BeaconSender(BEACON, ["0.0.0.0"], 7720, Drops(), "", lambda: list(have))
     wire = Wire(beacon)
-    for now_ns in range(0, 10 * PERIOD_NS, PERIOD_NS // 20):
-        beacon.turn(now_ns)
+    for now_ns in range(0, 10 * BEACON_PERIOD_NS, BEACON_PERIOD_NS // 20):
+        beacon.tick(now_ns)
     assert len(wire.sent) == 2 * 10
     have.append(WLAN)
-    beacon.turn(LOOK_AGAIN_NS + PERIOD_NS)
+    beacon.tick(INTERFACES_PERIOD_NS + BEACON_PERIOD_NS)
     assert "192.168.0.255" in wire.hosts()
 
 
@@ -89,16 +89,16 @@ def test_a_network_that_fails_is_told_once_and_harms_no_other(capsys: pytest.Cap
     beacon, wire, drops = sender(["0.0.0.0"], LO, ETH, WLAN)
     wire.fails["10.1.2.255"] = OSError(101, "Network is unreachable")
     for turn in range(1, 6):
-        beacon.turn(turn * PERIOD_NS)
+        beacon.tick(turn * BEACON_PERIOD_NS)
     assert drops.by_reason == {"beacon_unsent": 1}
     assert capsys.readouterr().err.count("no beacons to 10.1.2.255 (Network is unreachable)") == 1
     assert beacon.problems == {"10.1.2.255": "Network is unreachable"}
     assert [where for where, _ in wire.sent].count("192.168.0.255") == 5
     del wire.fails["10.1.2.255"]
-    beacon.turn(6 * PERIOD_NS)
+    beacon.tick(6 * BEACON_PERIOD_NS)
     assert not beacon.problems
     wire.fails["10.1.2.255"] = BlockingIOError(11, "full")
-    beacon.turn(7 * PERIOD_NS)
+    beacon.tick(7 * BEACON_PERIOD_NS)
     assert drops.by_reason == {"beacon_unsent": 1}
 
 
@@ -113,6 +113,6 @@ def test_every_listener_on_this_machine_hears_it() -> None:
         listeners[0].bind(("", 0))
         listeners[1].bind(("", listeners[0].getsockname()[1]))
         real = BeaconSender(BEACON, ["127.0.0.1"], listeners[0].getsockname()[1], Drops())
-        real.turn(1)
+        real.tick(1)
         real.close()
         assert [decode_beacon(one.recv(2000)).session_name for one in listeners] == ["lab-1", "lab-1"]

@@ -16,6 +16,7 @@ from iris_session.protocol.client_messages import (
     Heartbeat,
     Marker,
     Release,
+    RemoveParticipant,
     Sample,
     TrackingEpoch,
 )
@@ -31,8 +32,7 @@ from iris_session.protocol.entries import (
     Join,
     Lost,
 )
-from iris_session.protocol.security import RemoveParticipant
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 
 SAMPLE = Sample("controller/right", "pose", 1, 0, 1, 0, 1, pose=IDENTITY, targets=(Target("left", 1),))
 
@@ -59,8 +59,8 @@ def test_only_the_newest_pose_of_a_device_waits() -> None:
     for seq in (1, 2, 3):
         waiting.offer(entry(sample(seq)))
     waiting.offer(entry(sample(9, device="head")))
-    assert seqs(waiting.take()) == [3, 9]
-    assert waiting.take() == []
+    assert seqs(waiting.take_batch()) == [3, 9]
+    assert waiting.take_batch() == []
 
 
 @pytest.mark.parametrize(
@@ -84,14 +84,14 @@ def test_every_edge_is_kept(change: dict[str, object]) -> None:
     waiting.offer(entry(sample(2, **change)))
     waiting.offer(entry(sample(3)))
     waiting.offer(entry(sample(4)))
-    assert seqs(waiting.take()) == [1, 2, 4]
+    assert seqs(waiting.take_batch()) == [1, 2, 4]
 
 
 def test_a_small_change_of_the_gripper_is_motion() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(sample(1, gripper=0.1)))
     waiting.offer(entry(sample(2, gripper=0.4)))
-    assert seqs(waiting.take()) == [2]
+    assert seqs(waiting.take_batch()) == [2]
 
 
 def test_old_sequence_numbers_and_forged_epochs_replace_nothing() -> None:
@@ -99,7 +99,7 @@ def test_old_sequence_numbers_and_forged_epochs_replace_nothing() -> None:
     waiting.offer(entry(sample(5)))
     waiting.offer(entry(sample(4)))
     waiting.offer(entry(sample(6), epoch=99))
-    assert seqs(waiting.take()) == [5, 4, 6]
+    assert seqs(waiting.take_batch()) == [5, 4, 6]
 
 
 def test_messages_keep_their_place_among_samples() -> None:
@@ -108,7 +108,7 @@ def test_messages_keep_their_place_among_samples() -> None:
     waiting.offer(entry(Acquire(1, ("left",))))
     waiting.offer(entry(sample(2)))
     waiting.offer(entry(TrackingEpoch(1)))
-    kinds = [type(e.message) for e in waiting.take()]
+    kinds = [type(e.message) for e in waiting.take_batch()]
     assert kinds == [Acquire, Sample, TrackingEpoch]
 
 
@@ -118,16 +118,16 @@ def test_urgent_comes_first_and_alone_when_credit_is_short() -> None:
     waiting.offer(entry(Marker(1, "x"), connection=2))
     waiting.offer(entry(EStop("stop")))
     assert waiting.urgent
-    assert [type(e.message) for e in waiting.take(urgent_only=True)] == [EStop]
+    assert [type(e.message) for e in waiting.take_batch(urgent_only=True)] == [EStop]
     assert not waiting.urgent
-    assert [type(e.message) for e in waiting.take()] == [Sample, Marker]
+    assert [type(e.message) for e in waiting.take_batch()] == [Sample, Marker]
 
 
 def test_release_overtakes_no_acquire_of_its_own() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(Acquire(1, ("left",))))
     waiting.offer(entry(Release(2)))
-    assert [type(e.message) for e in waiting.take(urgent_only=True)] == [Acquire, Release]
+    assert [type(e.message) for e in waiting.take_batch(urgent_only=True)] == [Acquire, Release]
 
 
 def test_loss_comes_after_what_was_said_and_drops_the_samples() -> None:
@@ -136,7 +136,7 @@ def test_loss_comes_after_what_was_said_and_drops_the_samples() -> None:
     waiting.offer(entry(sample(1)))
     waiting.offer(entry(Heartbeat()))
     waiting.offer(entry(Lost("closed")))
-    assert [type(e.message) for e in waiting.take()] == [Marker, Lost]
+    assert [type(e.message) for e in waiting.take_batch()] == [Marker, Lost]
 
 
 def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> None:
@@ -144,7 +144,7 @@ def test_a_connection_that_ends_before_the_authority_heard_of_it_never_was() -> 
     waiting.offer(entry(Join("key", "operator", "Ann")))
     waiting.offer(entry(Lost("closed")))
     assert not waiting
-    assert waiting.take() == []
+    assert waiting.take_batch() == []
 
 
 @pytest.mark.parametrize("how", ["lost before it was let in", "let go by the authority"])
@@ -160,9 +160,9 @@ def test_an_estop_counts_whatever_becomes_of_its_sender(how: str) -> None:
     if how == "lost before it was let in":
         waiting.offer(entry(Lost("closed")))
     else:
-        waiting.forget(1)
+        waiting.remove_connection(1)
     assert waiting.urgent
-    assert [type(e.message) for e in waiting.take()] == [EStop]
+    assert [type(e.message) for e in waiting.take_batch()] == [EStop]
     assert not waiting
 
 
@@ -172,7 +172,7 @@ def test_an_estop_always_has_room_and_is_said_once() -> None:
         waiting.offer(entry(Release(1)))
     for _ in range(100):
         waiting.offer(entry(EStop()))
-    batch = waiting.take()
+    batch = waiting.take_batch()
     assert [type(e.message) for e in batch] == [Release, Release, EStop]
     assert drops.by_reason == {"urgent_pending": 3}
 
@@ -187,7 +187,7 @@ def test_bounds_are_counted_and_the_last_state_survives() -> None:
     waiting.offer(entry(sample(1, device="hand/left")))
     assert drops.by_reason == {"messages_pending": 2, "samples_pending": 5, "devices_pending": 1}
     assert drops.by_connection == {1: 8}
-    assert seqs(waiting.take()) == [1, 2, 8, 1]
+    assert seqs(waiting.take_batch()) == [1, 2, 8, 1]
 
 
 def test_a_full_batch_leaves_the_rest_for_the_next_one() -> None:
@@ -195,19 +195,19 @@ def test_a_full_batch_leaves_the_rest_for_the_next_one() -> None:
     for connection in (1, 2, 3):
         for i in range(3):
             waiting.offer(entry(Marker(i, "x"), connection))
-    assert [e.connection for e in waiting.take()] == [1, 1, 1, 2, 2, 2]
+    assert [e.connection for e in waiting.take_batch()] == [1, 1, 1, 2, 2, 2]
     for i in range(3):
         waiting.offer(entry(Marker(i, "x"), 1))
-    assert [e.connection for e in waiting.take()] == [3, 3, 3, 1, 1, 1]
-    assert not waiting.take()
+    assert [e.connection for e in waiting.take_batch()] == [3, 3, 3, 1, 1, 1]
+    assert not waiting.take_batch()
 
 
 def test_forget_drops_what_waits_of_one_connection() -> None:
     waiting, _ = coalescer()
     waiting.offer(entry(Bye(), 1))
     waiting.offer(entry(sample(1), 2))
-    waiting.forget(1)
-    assert [e.connection for e in waiting.take()] == [2]
+    waiting.remove_connection(1)
+    assert [e.connection for e in waiting.take_batch()] == [2]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3), st.booleans()), max_size=60))
@@ -219,8 +219,8 @@ def test_edges_and_final_state_survive_any_interleaving(steps: list[tuple[bool, 
         sent.append((clutch, buttons))
         waiting.offer(entry(sample(seq, clutch=clutch, buttons=buttons)))
         if take:
-            received += waiting.take()
-    received += waiting.take()
+            received += waiting.take_batch()
+    received += waiting.take_batch()
     edges = [s for i, s in enumerate(sent) if i == 0 or s != sent[i - 1]]
     got = [(e.message.clutch, e.message.buttons) for e in received if isinstance(e.message, Sample)]
     assert [s for i, s in enumerate(got) if i == 0 or s != got[i - 1]] == edges
@@ -234,7 +234,7 @@ def test_a_tracking_epoch_replaces_the_one_before_and_is_never_dropped_for_want_
     waiting.offer(entry(Marker(1, "x")))
     for epoch in range(1, 100):
         assert waiting.offer(entry(TrackingEpoch(epoch)))
-    assert [e.message for e in waiting.take()] == [Marker(1, "x"), TrackingEpoch(99)]
+    assert [e.message for e in waiting.take_batch()] == [Marker(1, "x"), TrackingEpoch(99)]
     assert not drops.by_reason
 
 
@@ -247,8 +247,8 @@ def test_a_removal_passes_a_flood_of_audits_and_what_audits_lose_is_counted() ->
         assert waiting.offer(removal)
         assert waiting.offer(removal), "said twice, to be done once"
     assert waiting.urgent
-    assert waiting.take(urgent_only=True) == removals
-    assert waiting.take() == audits[:4]
+    assert waiting.take_batch(urgent_only=True) == removals
+    assert waiting.take_batch() == audits[:4]
     assert drops.by_reason == {"audit_lost": 6}
 
 
@@ -257,9 +257,9 @@ def test_removals_are_bounded_and_a_directors_word_is_a_request_like_others() ->
     for i in range(5):
         waiting.offer(Entry(HOST, HOST, 1, RemoveParticipant(0, f"p{i}")))
     waiting.offer(Entry(7, 7, 1, RemoveParticipant(1, "p9")))
-    assert len(waiting.take(urgent_only=True)) == 3
+    assert len(waiting.take_batch(urgent_only=True)) == 3
     assert drops.by_reason == {"urgent_pending": 2}
-    assert len(waiting.take()) == 1
+    assert len(waiting.take_batch()) == 1
 
 
 def proposal(n: int, refused: bool = False) -> AlignmentProposal:
@@ -274,7 +274,7 @@ def test_of_proposals_and_comparisons_the_newest_waits_and_takes_no_room_from_re
         assert waiting.offer(entry(CrossChecked(2 + n % 2, "sheet", 0.01, 0.0, 0.02, (0.0, 0.0, 0.0), n)))
     assert waiting.offer(entry(Acquire(1)))
     assert waiting.offer(entry(Acquire(2)))
-    messages = [e.message for e in waiting.take()]
+    messages = [e.message for e in waiting.take_batch()]
     assert [m for m in messages if isinstance(m, AlignmentProposal)] == [proposal(99), proposal(99, refused=True)]
     assert [m.n for m in messages if isinstance(m, CrossChecked)] == [98, 99]
     assert len(messages) == 6
@@ -288,7 +288,7 @@ def test_alarms_are_never_dropped_and_come_before_later_proposals() -> None:
         assert waiting.offer(entry(AlignmentAlarm("changed", 1, "sheet", size)))
     assert waiting.offer(entry(AlignmentAlarm("changed", 1, "other", 0.01)))
     waiting.offer(entry(proposal(1)))
-    alarms = [e.message for e in waiting.take()]
+    alarms = [e.message for e in waiting.take_batch()]
     assert alarms == [
         Acquire(1),
         AlignmentAlarm("changed", 1, "sheet", 0.02),
@@ -306,7 +306,7 @@ def test_a_jump_is_urgent_whatever_else_is() -> None:
     for size in (0.1, 0.2):
         assert waiting.offer(entry(AlignmentAlarm("jump", 1, "sheet", size)))
     assert waiting.urgent
-    batch = [e.message for e in waiting.take(urgent_only=True)]
+    batch = [e.message for e in waiting.take_batch(urgent_only=True)]
     assert batch == [Release(1), Release(2), AlignmentAlarm("jump", 1, "sheet", 0.2)]
-    assert [e.message for e in waiting.take()] == [proposal(1)]
+    assert [e.message for e in waiting.take_batch()] == [proposal(1)]
     assert drops.by_reason == {}

@@ -10,18 +10,18 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import Doors
-from iris_session.front.connections import ClientTable, Connection, Outbox, Peer, Route
-from iris_session.front.disconnects import LAST_WORDS_NS, Departures
-from iris_session.link.config import FrontConfig, FrontLimits
+from iris_session.front.connection_guard import ConnectionGuard
+from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, Peer, Route
+from iris_session.front.disconnects import LAST_WORDS_NS, DisconnectHandler
+from iris_session.link.config import FrontLimits
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.codec import decode_server
 from iris_session.protocol.entries import Lost
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import Message, ProtocolFault
-from iris_session.protocol.token_bucket import Drops
 
 
 class Door:
@@ -29,7 +29,7 @@ class Door:
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         self.now_ns = 0
-        self.drops, self.clients = Drops(), ClientTable()
+        self.drops, self.clients = Drops(), ConnectionTable()
         self.sent: list[Message] = []
         self.coalescer = Coalescer(FrontLimits(), self.drops)
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -38,7 +38,7 @@ class Door:
         near.connect("inproc://monitor")
         self._near = near
         self.open: list[socket.socket] = [self.listener]
-        self.departures = Departures(
+        self.departures = DisconnectHandler(
             near,
             self.clients,
             Outbox(self, FrontLimits(), self.drops),  # type: ignore[arg-type]
@@ -46,24 +46,24 @@ class Door:
             self.coalescer,
             self.drops,
             self,  # type: ignore[arg-type]
-            Anchoring(FrontConfig(), self.clients, self.coalescer.offer, self.drops),
+            AlignmentService(self.coalescer.offer, self.drops),
             lambda: self.now_ns,
-            Doors(self.clients, self.drops, AuditTrail(self.coalescer.offer), FrontLimits()),
+            ConnectionGuard(self.clients, self.drops, AuditTrail(self.coalescer.offer), FrontLimits()),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
         self.sent.append(decode_server(frames[1]).message)
 
-    def forget_peer(self, _descriptor: int) -> None:
+    def remove_peer(self, _descriptor: int) -> None:
         """As the admission."""
 
-    def lost(self, _connection: Connection, _reason: str) -> None:
+    def record_disconnect(self, _connection: FrontConnection, _reason: str) -> None:
         """As the status desk."""
 
-    def join(self, number: int, behind: Connection | None = None) -> tuple[Connection, socket.socket]:
+    def join(self, number: int, behind: FrontConnection | None = None) -> tuple[FrontConnection, socket.socket]:
         """A connection over a new TCP connection, and our end of it in place of libzmq's."""
         if behind is not None:
-            connection = Connection(
+            connection = FrontConnection(
                 number, Route(b"1", f"tab{number}"), behind.peer, behind.address, "key", HELLO, behind.number
             )
             self.clients.add(connection)
@@ -71,7 +71,7 @@ class Door:
         peer = socket.create_connection(self.listener.getsockname())
         ours, address = self.listener.accept()
         self.open += [peer, ours]
-        connection = Connection(number, Route(b"%d" % number), Peer(ours.fileno(), ""), address, "key", HELLO, 0)
+        connection = FrontConnection(number, Route(b"%d" % number), Peer(ours.fileno(), ""), address, "key", HELLO, 0)
         self.clients.add(connection)
         return connection, ours
 
@@ -80,8 +80,8 @@ class Door:
         self.departures.drain_monitor()
 
     def leave(self) -> list[tuple[int, object]]:
-        self.departures.take_leave([], drained=True)
-        return [(e.connection, e.message) for e in self.coalescer.take()]
+        self.departures.process_disconnects([], drained=True)
+        return [(e.connection, e.message) for e in self.coalescer.take_batch()]
 
     def close(self) -> None:
         self.monitor.close()
@@ -131,8 +131,8 @@ def test_those_behind_a_gateway_that_is_let_go_leave_with_it_and_are_told(door: 
     gateway, _ = door.join(1)
     door.join(2, behind=gateway)
     door.join(3)
-    door.departures.forget(gateway, "heartbeat")
-    assert [(e.connection, e.message) for e in door.coalescer.take()] == [(2, Lost("gateway"))]
+    door.departures.remove(gateway, "heartbeat")
+    assert [(e.connection, e.message) for e in door.coalescer.take_batch()] == [(2, Lost("gateway"))]
     assert list(door.clients.by_number) == [3]
     (fault,) = door.sent
     assert isinstance(fault, ProtocolFault)
@@ -142,10 +142,10 @@ def test_those_behind_a_gateway_that_is_let_go_leave_with_it_and_are_told(door: 
 @pytest.mark.parametrize(("reason", "stops"), [("heartbeat", True), ("removed", False), ("bye", False)])
 def test_only_who_was_given_up_may_stop_after_the_end(door: Door, reason: str, stops: bool) -> None:
     connection, ours = door.join(1)
-    door.departures.forget(connection, reason)
-    assert (door.clients.given_up(connection.route, connection.peer) is connection) is stops
+    door.departures.remove(connection, reason)
+    assert (door.clients.find_kept(connection.route, connection.peer) is connection) is stops
     descriptor = ours.fileno()
     ours.close()
     door.report_closed(descriptor)
     door.leave()
-    assert door.clients.given_up(connection.route, connection.peer) is None
+    assert door.clients.find_kept(connection.route, connection.peer) is None

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
-from iris_session.front.connections import ClientTable
+from iris_session.alignment.service import AlignmentService
+from iris_session.front.connections import ConnectionTable
 from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
-from iris_session.link.config import FrontConfig, SceneInfo
+from iris_session.link.config import SceneInfo
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
-from iris_session.protocol.token_bucket import Drops
 
 
 class Far:
@@ -34,7 +34,7 @@ class Far:
         unused = None
         self.downlink = Downlink(
             near,
-            ClientTable(),
+            ConnectionTable(),
             unused,  # type: ignore[arg-type]
             unused,  # type: ignore[arg-type]
             self.publisher,
@@ -42,7 +42,7 @@ class Far:
             lambda: 77,
             lambda connection: None,
             unused,  # type: ignore[arg-type]
-            Anchoring(FrontConfig(), ClientTable(), lambda entry: True, self.drops),
+            AlignmentService(lambda entry: True, self.drops),
             lambda: self.heard_of.append(self.publisher.scene.scene_hash),
         )
 
@@ -116,13 +116,13 @@ def test_another_scene_is_told_of_inside_before_anybody_outside_hears(far: Far) 
 def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(far: Far) -> None:
     far.state(1)
     far.downlink.drain()
-    assert far.publisher.keyframe()[0] == 1
+    assert far.publisher.read_keyframe()[0] == 1
     far.scene(2)
     far.downlink.drain()
-    assert far.publisher.keyframe() == (0, np.ones((2, 7)).tobytes())
+    assert far.publisher.read_keyframe() == (0, np.ones((2, 7)).tobytes())
     far.state(3, n=2)
     far.downlink.drain()
-    assert far.publisher.keyframe()[0] == 2
+    assert far.publisher.read_keyframe()[0] == 2
 
 
 def test_acknowledgements_and_the_end_are_noticed(far: Far) -> None:
@@ -146,12 +146,12 @@ def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) ->
 def test_delays_are_those_of_the_last_seconds(far: Far) -> None:
     now = [10]
     publisher = StatePublisher(far, scene(1), lambda: now[0])  # type: ignore[arg-type]
-    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([], 0)
+    assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([], 0)
     for at_ns, session_time in ((10, 1), (RECENT_NS, RECENT_NS - 20), (RECENT_NS + 20, RECENT_NS + 13)):
         now[0] = at_ns
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
         assert publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert (publisher.delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
+    assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
 
 
 def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: Far) -> None:
@@ -159,5 +159,5 @@ def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: F
     for session_time in (7, 7, 7, 9):
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
         assert far.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert far.publisher.delays_ns() == [70, 68]
+    assert far.publisher.read_recent_delays_ns() == [70, 68]
     assert [header.session_time for header in far.headers()] == [7, 7, 7, 9]

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.client_messages import Hello, Marker
+from iris_session.protocol.client_messages import Hello, Marker, RemoveParticipant
 from iris_session.protocol.entries import Join, Lost
 from iris_session.protocol.names import FaultCode
-from iris_session.protocol.security import RemoveParticipant
 from iris_session.protocol.server_messages import ProtocolFault, Welcome
 from iris_session.protocol.steps import Decision, Dropped
 from iris_session.security import KeyPair

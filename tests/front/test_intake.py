@@ -8,15 +8,15 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.alignment.service import Anchoring
+from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
 from iris_session.front.audit import AuditTrail
 from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import Doors
-from iris_session.front.connections import ClientTable, Outbox, Peer
+from iris_session.front.connection_guard import ConnectionGuard
+from iris_session.front.connections import ConnectionTable, Outbox, Peer
 from iris_session.front.intake import Intake, RawFeed
-from iris_session.front.pairing import PairingDesk
-from iris_session.front.status import StatusDesk, Telling
+from iris_session.front.pairing import PairingService
+from iris_session.front.status import StatusService, Telling
 from iris_session.link import FrontConfig, FrontLimits, Ports
 from iris_session.protocol.client_messages import (
     ClientMessage,
@@ -29,9 +29,9 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Audit, Entry, Join
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.protocol.token_bucket import Drops
 from iris_session.security.keyring import Keyring
 from iris_session.security.resume_tokens import ResumeTokens
 
@@ -49,19 +49,19 @@ class Desk:
         self.now_ns = 1_000_000_000
         self.limits = config.limits
         self.drops = Drops()
-        self.clients = ClientTable()
+        self.clients = ConnectionTable()
         self.sent: list[tuple[bytes, Message, list[bytes]]] = []
         outbox = Outbox(self, config.limits, self.drops)  # type: ignore[arg-type]
         self.coalescer = Coalescer(config.limits, self.drops)
         self.tokens = ResumeTokens(8)
         keyring, audit = Keyring(), AuditTrail(self.coalescer.offer)
-        doors = self.doors = Doors(self.clients, self.drops, audit, config.limits)
+        guard = self.guard = ConnectionGuard(self.clients, self.drops, audit, config.limits)
         self.admission = Admission(
-            config, Ports("127.0.0.1", 1, 2), self.clients, outbox, self.drops, self.tokens, keyring, audit, doors
+            config, Ports("127.0.0.1", 1, 2), self.clients, outbox, self.drops, self.tokens, keyring, audit, guard
         )
-        pairing = PairingDesk(keyring, outbox, audit, self.drops)
+        pairing = PairingService(keyring, outbox, audit, self.drops)
         raw = RawFeed(context, "", self.drops)
-        status = StatusDesk(config, self.clients, outbox, self.drops, Telling)
+        status = StatusService(config, self.clients, outbox, self.drops, Telling)
         self.intake = Intake(
             config,
             self.clients,
@@ -74,8 +74,8 @@ class Desk:
             status,
             pairing,
             audit,
-            doors,
-            Anchoring(config, self.clients, self.coalescer.offer, self.drops),
+            guard,
+            AlignmentService(self.coalescer.offer, self.drops, anchors=config.anchors),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
@@ -83,19 +83,19 @@ class Desk:
 
     def take(self, message: ClientMessage, peer: Peer = ANN, epoch: int = 0, behalf: str = "", extra: int = 0) -> None:
         data = encode_client(envelope(message, epoch, behalf))
-        self.intake.take(ROUTE, peer, memoryview(data), extra)
+        self.intake.handle_message(ROUTE, peer, memoryview(data), extra)
 
     def join(self, peer: Peer = ANN, **hello: object) -> Welcome:
         self.take(msgspec.structs.replace(Hello("operator", "Ann", secret=b"s" * 16), **hello), peer)
-        (entry,) = self.coalescer.take()
+        (entry,) = self.coalescer.take_batch()
         assert isinstance(entry.message, Join)
-        self.admission.welcome(Admitted(entry.connection, "p1", "operator", False), self.now_ns, 2_000_000)
+        self.admission.send_welcome(Admitted(entry.connection, "p1", "operator", False), self.now_ns, 2_000_000)
         welcome = self.sent[-1][1]
         assert isinstance(welcome, Welcome)
         return welcome
 
     def entries(self) -> list[Entry]:
-        return self.coalescer.take()
+        return self.coalescer.take_batch()
 
     def last(self) -> Message:
         return self.sent[-1][1]
@@ -178,7 +178,7 @@ def test_the_hellos_of_one_peer_are_bounded_until_it_is_gone(desk: Desk) -> None
     assert [m.code for _, m, _ in desk.sent if isinstance(m, Refused)] == ["identity"] * 10 + ["rate"] * 2
     desk.take(Hello("operator", "Eve"), EVE)
     assert desk.last() == desk.sent[0][1]
-    desk.admission.forget_peer(ANN.descriptor)
+    desk.admission.remove_peer(ANN.descriptor)
     desk.take(Hello("operator", "Ann"))
     assert desk.last() == desk.sent[0][1]
 
@@ -215,15 +215,15 @@ def test_a_stop_of_who_was_given_up_lately_counts_until_the_tcp_connection_is_cl
     desk.clients.remove(lost)
     desk.take(EStop("unknown"), epoch=number)
     assert not desk.coalescer
-    desk.clients.give_up(lost)
+    desk.clients.keep_for_estop(lost)
     desk.take(EStop("by another"), EVE, epoch=number)
     assert not desk.coalescer
     desk.take(EStop("now"), epoch=number)
-    assert desk.coalescer.take() == [Entry(number, number, desk.now_ns, EStop("now"))]
+    assert desk.coalescer.take_batch() == [Entry(number, number, desk.now_ns, EStop("now"))]
     fault = desk.sent[-1][1]
     assert isinstance(fault, ProtocolFault)
     assert fault.code == "hello", "it is told to come back all the same"
-    desk.clients.closed(ANN.descriptor, ("10.0.0.1", 5))
+    desk.clients.remove_closed(ANN.descriptor, ("10.0.0.1", 5))
     desk.take(EStop("somebody else"), epoch=number)
     assert not desk.coalescer
 
@@ -233,7 +233,7 @@ def test_requests_above_their_rate_or_without_room_are_answered_by_a_denial(desk
     for i in range(200):
         desk.take(Marker(i + 1, "x"), epoch=number)
     denied = {m.request_id: m.denial for _, m, _ in desk.sent if isinstance(m, Reply)}
-    taken = {e.message.request_id for e in desk.coalescer.take() if isinstance(e.message, Marker)}
+    taken = {e.message.request_id for e in desk.coalescer.take_batch() if isinstance(e.message, Marker)}
     assert taken == set(range(1, 41))
     assert set(denied) == set(range(41, 81)), "at a bounded rate"
     assert all(d is not None and d.reason == "quota" and "marker" in d.message for d in denied.values())
@@ -251,12 +251,12 @@ def test_the_newest_tracking_epoch_gets_through_whatever_its_rate(desk: Desk) ->
     number = desk.join().connection_epoch
     for epoch in range(1, 101):
         desk.take(TrackingEpoch(epoch), epoch=number)
-    assert [e.message for e in desk.coalescer.take()] == [TrackingEpoch(10)]
+    assert [e.message for e in desk.coalescer.take_batch()] == [TrackingEpoch(10)]
     desk.now_ns += 1_000_000_000
     desk.take(Heartbeat(), epoch=number)
-    assert {type(e.message): e.message for e in desk.coalescer.take()}[TrackingEpoch] == TrackingEpoch(100)
+    assert {type(e.message): e.message for e in desk.coalescer.take_batch()}[TrackingEpoch] == TrackingEpoch(100)
     desk.take(Heartbeat(), epoch=number)
-    assert [e.message for e in desk.coalescer.take()] == [Heartbeat()]
+    assert [e.message for e in desk.coalescer.take_batch()] == [Heartbeat()]
 
 
 def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
@@ -264,17 +264,17 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
     for i in range(desk.limits.connections - 1):
         desk.now_ns += 1_000_000_000
         hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
-        desk.intake.take(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
+        desk.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
     assert len(desk.clients) == desk.limits.connections
     desk.now_ns += 1_000_000_000
-    desk.coalescer.take()
+    desk.coalescer.take_batch()
     late, back = Peer(7, ""), Peer(8, "")
     data = encode_client(envelope(HELLO))
-    desk.intake.take(b"late", late, memoryview(data), 0)
+    desk.intake.handle_message(b"late", late, memoryview(data), 0)
     assert isinstance(desk.sent[-1][1], Refused)
     data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
-    desk.intake.take(b"back", back, memoryview(data), 0)
-    (entry,) = desk.coalescer.take()
+    desk.intake.handle_message(b"back", back, memoryview(data), 0)
+    (entry,) = desk.coalescer.take_batch()
     assert isinstance(entry.message, Join)
     assert entry.message.resume_of == "p1"
 
@@ -282,11 +282,11 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
 def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(desk: Desk) -> None:
     for i in range(1000):
         data = encode_client(envelope(Hello("operator", "Eve")))
-        desk.intake.take(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
+        desk.intake.handle_message(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
     refused = desk.last()
     assert isinstance(refused, Refused)
     assert refused.code == "rate"
-    desk.coalescer.take()
+    desk.coalescer.take_batch()
     assert desk.join(Peer(5, "key-of-ann")).participant_id == "p1"
 
 

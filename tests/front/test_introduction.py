@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from iris_session.front.introduction import ROUND, Introducer, listen, open_with_introduction
+from iris_session.front.introduction import ANSWERS_PER_TICK, IntroductionServer, open_listeners, open_with_introduction
 from iris_session.link.config import FrontError, PortInUseError
 from iris_session.protocol.codec import decode_introduction
 from iris_session.protocol.discovery import Beacon, Introduction
@@ -18,9 +18,9 @@ BEACON = Beacon(1, "s1", "lab-1", "live", "10.1.2.3", 7721, 7722, 0, 0, 0, "mark
 
 
 @pytest.fixture
-def introducer() -> Iterator[tuple[Introducer, int]]:
-    listeners = listen(["127.0.0.1"], 0)
-    made = Introducer(listeners, lambda: Introduction(BEACON, "k" * 40, True, 3))
+def introducer() -> Iterator[tuple[IntroductionServer, int]]:
+    listeners = open_listeners(["127.0.0.1"], 0)
+    made = IntroductionServer(listeners, lambda: Introduction(BEACON, "k" * 40, True, 3))
     yield made, listeners[0].getsockname()[1]
     made.close()
 
@@ -33,10 +33,10 @@ def read(visitor: socket.socket) -> bytes:
     return data
 
 
-def test_everything_is_said_at_once_and_the_connection_closed(introducer: tuple[Introducer, int]) -> None:
+def test_everything_is_said_at_once_and_the_connection_closed(introducer: tuple[IntroductionServer, int]) -> None:
     service, port = introducer
     with socket.create_connection(("127.0.0.1", port)) as visitor:
-        service.turn(0)
+        service.tick(0)
         data = read(visitor)
     introduction = decode_introduction(data)
     assert introduction == Introduction(BEACON, "k" * 40, True, 3)
@@ -45,18 +45,18 @@ def test_everything_is_said_at_once_and_the_connection_closed(introducer: tuple[
 
 
 def test_a_turn_is_bounded_and_those_who_say_nothing_or_much_or_hang_up_hold_nothing(
-    introducer: tuple[Introducer, int],
+    introducer: tuple[IntroductionServer, int],
 ) -> None:
     service, port = introducer
-    visitors = [socket.create_connection(("127.0.0.1", port)) for _ in range(3 * ROUND)]
+    visitors = [socket.create_connection(("127.0.0.1", port)) for _ in range(3 * ANSWERS_PER_TICK)]
     visitors[0].close()
     visitors[1].sendall(b"GET / HTTP/1.1\r\n" * 100)
     before = threading.active_count()
-    service.turn(0)
+    service.tick(0)
     answered = [v for v in visitors[2:] if _has_data(v)]
-    assert len(answered) == ROUND - 2
-    service.turn(1)
-    service.turn(2)
+    assert len(answered) == ANSWERS_PER_TICK - 2
+    service.tick(1)
+    service.tick(2)
     assert all(decode_introduction(read(v)) is not None for v in visitors[2:])
     assert threading.active_count() == before
     for visitor in visitors:
@@ -85,10 +85,10 @@ def test_a_port_in_use_is_an_error_with_advice_and_frees_what_was_opened() -> No
             open_with_introduction(["127.0.0.1"], port + 1, lambda _: 0)
     with pytest.raises(PortInUseError):
         open_with_introduction(["127.0.0.1"], port + 1, _in_use)
-    for listener in listen(["127.0.0.1"], port):  # it was closed again
+    for listener in open_listeners(["127.0.0.1"], port):  # it was closed again
         listener.close()
     with pytest.raises(FrontError, match=r"cannot listen on 203\.0\.113\.9"):
-        listen(["203.0.113.9"], 0)
+        open_listeners(["203.0.113.9"], 0)
 
 
 def test_a_front_introduces_itself_on_every_address_it_listens_on() -> None:

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import zmq
 
+from iris_session.front.connection_guard import ChannelGuard
 from iris_session.front.media import proxy as media_module
-from iris_session.front.media.connection_guard import MediaDoors
 from iris_session.front.media.proxy import MediaProxy
-from iris_session.front.media.scheduler import Listener
+from iris_session.front.media.scheduler import MediaSubscriber
 from iris_session.link import FrontLimits
 from iris_session.link.media_source import MediaSource
 from iris_session.link.sockets import watch_tcp
@@ -482,16 +482,16 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
         port = out.bind_to_random_port("tcp://127.0.0.1")
         local.bind(endpoint)
         remote.bind_to_random_port("tcp://127.0.0.1")
-        doors = [
-            MediaDoors(watch_tcp(one, name), limits, 8, 1 << 20, curve=False)
+        guard = [
+            ChannelGuard(watch_tcp(one, name), limits, 8, 1 << 20, curve=False)
             for one, name in ((out, "fault-out"), (remote, "fault-in"))
         ]
-        proxy = MediaProxy(out, *doors, local, remote, time.monotonic_ns, encrypted=False)
+        proxy = MediaProxy(out, *guard, local, remote, time.monotonic_ns, encrypted=False)
         faults = iter([True] * 3)
         send = proxy._send
         monkeypatch.setattr(proxy, "_send", lambda *frame: 1 // 0 if next(faults, False) else send(*frame))
         with proxy.lock:
-            proxy.hub.allow({1: Listener("", {})})
+            proxy.scheduler.set_subscribers({1: MediaSubscriber("", {})})
         proxy.start()
         source = MediaSource(endpoint)
         with context.socket(zmq.SUB) as viewer:
@@ -502,7 +502,7 @@ def test_a_fault_costs_what_was_under_way_and_is_told_once(
                 assert time.monotonic() < deadline, "media go on"
                 source.publish("cloud", b"points", time.monotonic_ns(), 1, "bytes")
         with proxy.lock:
-            counted = proxy.hub.take_drops()[0]["media_fault"]
+            counted = proxy.scheduler.pop_drops()[0]["media_fault"]
         source.close()
         proxy.close()
     said = capfd.readouterr().err

@@ -12,13 +12,13 @@ from iris_session.front.media.budget import (
     CLIMB_NS,
     NOTHING,
     BudgetController,
-    Grant,
-    Measure,
+    BudgetGrant,
+    LinkMeasure,
     Rates,
-    Report,
-    cost,
-    fit,
-    ladder,
+    StateReport,
+    build_ladder,
+    compute_cost,
+    select_levels,
 )
 
 MBIT = 125_000.0  # bytes per second
@@ -37,23 +37,23 @@ class Link:
         self.waiting = 0.0
         self.controller = BudgetController()
         self.now_ns = 0
-        self.grants: list[tuple[int, Grant]] = []
+        self.grants: list[tuple[int, BudgetGrant]] = []
         self._taken = (0, 0)
 
-    def play(self, seconds: float, rates: Rates = CLOUD, limit: float = 0.0) -> Grant:
+    def play(self, seconds: float, rates: Rates = CLOUD, limit: float = 0.0) -> BudgetGrant:
         """The last grant of that time. A report every second, a look every quarter."""
         for _ in range(int(seconds * 4)):
             self.now_ns += STEP_NS
             levels = self.grants[-1][1].levels if self.grants else dict.fromkeys(rates, 0)
-            sent = cost(rates, levels) / 4
+            sent = compute_cost(rates, levels) / 4
             room = max(0.0, 262_144 - self.waiting + self.capacity / 4)
             taken = min(sent, room)
             self.waiting = max(0.0, self.waiting + taken - self.capacity / 4)
             report = None
             if self.now_ns % SECOND == 0 and self.capacity:
-                report = Report(self.age_ms + 1e3 * self.waiting / self.capacity, 0.0)
+                report = StateReport(self.age_ms + 1e3 * self.waiting / self.capacity, 0.0)
             due = 15 if sent else 0
-            look = Measure(report, round(due * taken / sent) if sent else 0, due, limit)
+            look = LinkMeasure(report, round(due * taken / sent) if sent else 0, due, limit)
             self.grants.append((self.now_ns, self.controller.update(7, look, rates, self.now_ns)))
         return self.grants[-1][1]
 
@@ -65,7 +65,7 @@ class Link:
 
 def test_enough_for_everything_stays_so() -> None:
     grant = Link(100).play(60, BOTH)
-    assert grant == Grant({"cloud": 0, "cloth": 0})
+    assert grant == BudgetGrant({"cloud": 0, "cloth": 0})
 
 
 def test_a_link_for_a_part_gets_a_part_within_two_seconds_and_no_more() -> None:
@@ -85,7 +85,7 @@ def test_what_was_lowered_comes_back_when_the_link_does() -> None:
     link.play(20)
     link.capacity = 100 * MBIT
     link.play(60)
-    assert link.grants[-1][1] == Grant({"cloud": 0})
+    assert link.grants[-1][1] == BudgetGrant({"cloud": 0})
 
 
 def test_a_dead_link_gets_nothing_and_a_silent_client_neither() -> None:
@@ -94,8 +94,8 @@ def test_a_dead_link_gets_nothing_and_a_silent_client_neither() -> None:
     link.capacity = 0.0
     assert link.play(4).levels == {"cloud": NOTHING}
     silent = BudgetController()
-    silent.update(1, Measure(Report(10.0, 0.0)), CLOUD, 0)
-    grant = silent.update(1, Measure(None), CLOUD, 4 * SECOND)
+    silent.update(1, LinkMeasure(StateReport(10.0, 0.0)), CLOUD, 0)
+    grant = silent.update(1, LinkMeasure(None), CLOUD, 4 * SECOND)
     assert (grant.levels, grant.reason) == ({"cloud": NOTHING}, "the client has not reported for 3 s")
 
 
@@ -112,15 +112,15 @@ def test_trouble_that_media_do_not_make_is_learnt() -> None:
 
 def test_missed_state_counts() -> None:
     controller = BudgetController()
-    controller.update(1, Measure(Report(10.0, 0.0)), CLOUD, 0)
-    grant = controller.update(1, Measure(Report(10.0, 0.7)), CLOUD, SECOND)
+    controller.update(1, LinkMeasure(StateReport(10.0, 0.0)), CLOUD, 0)
+    grant = controller.update(1, LinkMeasure(StateReport(10.0, 0.7)), CLOUD, SECOND)
     assert (grant.levels["cloud"], grant.reason) == (1, "70 % of state was missed")
 
 
 def test_a_display_of_30_hz_misses_half_of_it_always() -> None:
     controller = BudgetController()
     for second in range(30):
-        grant = controller.update(1, Measure(Report(18.0, 0.5)), CLOUD, second * SECOND)
+        grant = controller.update(1, LinkMeasure(StateReport(18.0, 0.5)), CLOUD, second * SECOND)
     assert grant.levels["cloud"] == 0
 
 
@@ -141,19 +141,19 @@ def test_a_new_stream_waits_where_there_is_too_much() -> None:
     link.play(0.25, BOTH)
     assert link.grants[-1][1].levels["cloth"] == NOTHING
     controller = link.controller
-    controller.forget(7)
-    assert controller.update(7, Measure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
+    controller.remove(7)
+    assert controller.update(7, LinkMeasure(None), BOTH, link.now_ns).levels == {"cloud": 0, "cloth": 0}
 
 
 def test_the_ladder_begins_with_what_costs_most() -> None:
-    steps = ladder(BOTH)
+    steps = build_ladder(BOTH)
     assert (steps[0], steps[1], steps[-1]) == (
         {"cloth": 0, "cloud": 0},
         {"cloth": 0, "cloud": 1},
         {"cloth": NOTHING, "cloud": NOTHING},
     )
-    assert fit(BOTH, 8 * MBIT) == {"cloth": 0, "cloud": 2}
-    assert fit(BOTH, 0.0) == {"cloth": NOTHING, "cloud": NOTHING}
+    assert select_levels(BOTH, 8 * MBIT) == {"cloth": 0, "cloud": 2}
+    assert select_levels(BOTH, 0.0) == {"cloth": NOTHING, "cloud": NOTHING}
 
 
 rates_of_streams = st.dictionaries(
@@ -165,9 +165,9 @@ rates_of_streams = st.dictionaries(
 @settings(max_examples=40, deadline=None)
 def test_more_budget_is_never_less_of_any_stream(rates: dict[str, tuple[float, ...]], one: float, other: float) -> None:
     less, more = sorted((one, other))
-    low, high = fit(rates, less), fit(rates, more)
+    low, high = select_levels(rates, less), select_levels(rates, more)
     assert all(high[stream] <= low[stream] for stream in rates)
-    assert cost(rates, low) <= less
+    assert compute_cost(rates, low) <= less
 
 
 @given(st.floats(0.3, 60.0), st.floats(1.0, 120.0))
@@ -179,8 +179,8 @@ def test_a_constant_link_is_not_tried_often(mbit: float, age_ms: float) -> None:
     assert all(b - a >= CLIMB_NS for a, b in itertools.pairwise(rises))
     last_minute = [now for now in rises if now > 60 * SECOND]
     assert len(last_minute) <= 8
-    fitting = cost(CLOUD, fit(CLOUD, 0.95 * link.capacity))
-    means = [cost(CLOUD, grant.levels) for now, grant in link.grants if now > 60 * SECOND]
+    fitting = compute_cost(CLOUD, select_levels(CLOUD, 0.95 * link.capacity))
+    means = [compute_cost(CLOUD, grant.levels) for now, grant in link.grants if now > 60 * SECOND]
     assert sum(means) / len(means) >= 0.5 * fitting, "what fits is given most of the time"
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from iris_session.front.media.budget import NOTHING, SECOND
-from iris_session.front.media.scheduler import Listener, MediaHub, Tally
+from iris_session.front.media.scheduler import DeliveryCounters, MediaScheduler, MediaSubscriber
 from iris_session.protocol.codec import decode_media_header
 from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, media_topic, parse_topic
 
@@ -19,14 +19,14 @@ class Wire:
     """Connections that take what they are asked to, by number."""
 
     def __init__(self, **levels: int) -> None:
-        self.hub = MediaHub()
+        self.hub = MediaScheduler()
         self.now_ns = 5 * SECOND
         self.full: set[int] = set()
         self.got: dict[int, list[tuple[MediaHeader, bytes]]] = {ANN: [], BOB: []}
         self.allow(**levels)
 
     def allow(self, ann: int = 0, bob: int = 0) -> None:
-        self.hub.allow({ANN: Listener("a", {"cloud": ann}), BOB: Listener("b", {"cloud": bob})})
+        self.hub.set_subscribers({ANN: MediaSubscriber("a", {"cloud": ann}), BOB: MediaSubscriber("b", {"cloud": bob})})
 
     def send(self, topic: bytes, header: bytes, frame: bytes) -> bool:
         number = int(topic.split(b"/")[1])
@@ -80,21 +80,21 @@ def test_a_full_connection_gets_the_newest_later_and_delays_nobody() -> None:
     wire.full = {BOB}
     wire.push(5)
     assert (len(wire.got[ANN]), len(wire.got[BOB])) == (5, 0)
-    assert wire.hub.tally(BOB) == Tally(0, 5, 0)
+    assert wire.hub.read_counters(BOB) == DeliveryCounters(0, 5, 0)
     wire.full = set()
     assert not wire.hub.flush(wire.send, wire.now_ns)
     ((header, _),) = wire.got[BOB]
     assert (header.seq, header.dropped) == (wire.got[ANN][-1][0].seq, 4)
-    assert wire.hub.take_drops() == ({}, {BOB: 4})
-    assert wire.hub.take_drops() == ({}, {})
+    assert wire.hub.pop_drops() == ({}, {BOB: 4})
+    assert wire.hub.pop_drops() == ({}, {})
 
 
 def test_only_the_key_of_a_connection_may_subscribe_to_it() -> None:
     wire = Wire()
     assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
     assert not wire.hub.subscribe(99, "cloud", "a", 1)
-    assert wire.hub.take_drops()[0] == {"media_refused": 2}
-    assert wire.hub.wanted(ANN) == []
+    assert wire.hub.pop_drops()[0] == {"media_refused": 2}
+    assert wire.hub.list_subscriptions(ANN) == []
 
 
 def test_who_is_gone_gets_nothing_any_more() -> None:
@@ -102,11 +102,11 @@ def test_who_is_gone_gets_nothing_any_more() -> None:
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.full = {ANN}
     wire.push()
-    wire.hub.allow({BOB: Listener("b", {})})
+    wire.hub.set_subscribers({BOB: MediaSubscriber("b", {})})
     wire.full = set()
     wire.push()
     assert wire.got[ANN] == []
-    assert wire.hub.tally(ANN) == Tally()
+    assert wire.hub.read_counters(ANN) == DeliveryCounters()
 
 
 def test_one_of_two_readers_of_a_client_leaves() -> None:
@@ -114,14 +114,14 @@ def test_one_of_two_readers_of_a_client_leaves() -> None:
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.hub.subscribe(ANN, "cloud", "a", 3)
-    wire.hub.left(1)
+    wire.hub.remove_reader(1)
     wire.push()
     assert len(wire.got[ANN]) == 1
     wire.hub.unsubscribe(ANN, "cloud", 3)
     wire.hub.unsubscribe(ANN, "cloud", 3)
     wire.push()
     assert len(wire.got[ANN]) == 1
-    assert wire.hub.tally(ANN).taken == 1
+    assert wire.hub.read_counters(ANN).taken == 1
 
 
 def test_nobody_takes_back_a_subscription_of_another() -> None:
@@ -129,7 +129,7 @@ def test_nobody_takes_back_a_subscription_of_another() -> None:
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     assert not wire.hub.subscribe(ANN, "cloud", "b", 2)
     wire.hub.unsubscribe(ANN, "cloud", 2)
-    wire.hub.left(2)
+    wire.hub.remove_reader(2)
     wire.push()
     assert len(wire.got[ANN]) == 1
 
@@ -138,17 +138,17 @@ def test_when_memory_runs_short_media_let_go_of_everything_for_a_while() -> None
     wire = Wire()
     wire.hub.subscribe(ANN, "cloud", "a", 1)
     wire.hub.subscribe(BOB, "cloud", "b", 2)
-    assert not wire.hub.give_way(wire.now_ns + SECOND), "there is nothing"
+    assert not wire.hub.release_frames(wire.now_ns + SECOND), "there is nothing"
     wire.full = {BOB}
     assert wire.push()
-    assert wire.hub.give_way(wire.now_ns + SECOND)
-    assert wire.hub.take_stuck() == {2}
-    assert wire.hub.take_stuck() == set()
+    assert wire.hub.release_frames(wire.now_ns + SECOND)
+    assert wire.hub.pop_stuck() == {2}
+    assert wire.hub.pop_stuck() == set()
     wire.full = set()
     assert not wire.push()
-    assert not wire.hub.give_way(wire.now_ns + SECOND)
+    assert not wire.hub.release_frames(wire.now_ns + SECOND)
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [1, 0]
-    assert wire.hub.take_drops()[0] == {"media_memory": 2}
+    assert wire.hub.pop_drops()[0] == {"media_memory": 2}
     wire.now_ns += SECOND
     assert wire.push()
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [2, 1]
@@ -167,7 +167,7 @@ def test_after_a_fault_everybody_gets_what_comes_next() -> None:
     with pytest.raises(OSError):
         wire.hub.flush(fault, wire.now_ns)
     wire.full.clear()
-    wire.hub.begin_anew()
+    wire.hub.reset()
     assert not wire.hub.flush(wire.send, wire.now_ns), "what was under way is lost"
     wire.push(2)
     assert [len(got) for got in wire.got.values()] == [2, 2]
@@ -188,8 +188,8 @@ def test_frames_that_do_not_fit_are_counted(stream: str, frames: dict[str, bytes
     assert not wire.push(stream=stream, frames=frames)
     push = MediaPush("cloud", 0, 0, ("full",))
     assert not wire.hub.push(push, [], "", wire.now_ns)
-    assert wire.hub.take_drops()[0] == {"media_malformed": 2}
-    assert wire.hub.streams() == {}
+    assert wire.hub.pop_drops()[0] == {"media_malformed": 2}
+    assert wire.hub.read_streams() == {}
 
 
 def test_streams_and_subscriptions_are_bounded() -> None:
@@ -197,10 +197,10 @@ def test_streams_and_subscriptions_are_bounded() -> None:
     for n in range(MAX_STREAMS + 1):
         assert wire.push(stream=f"s{n}") == (n < MAX_STREAMS)
         assert wire.hub.subscribe(ANN, f"s{n}", "a", 1) == (n < MAX_STREAMS)
-    assert wire.hub.take_drops()[0] == {"media_streams_full": 1, "media_subscriptions_full": 1}
+    assert wire.hub.pop_drops()[0] == {"media_streams_full": 1, "media_subscriptions_full": 1}
     wire.now_ns += 100 * SECOND
-    wire.hub.look(wire.now_ns)
-    assert wire.hub.streams() == {}
+    wire.hub.sample_rates(wire.now_ns)
+    assert wire.hub.read_streams() == {}
     assert wire.push(stream="another")
 
 
@@ -208,19 +208,19 @@ def test_a_stream_belongs_to_its_source_while_that_sends() -> None:
     wire = Wire()
     assert wire.push(source="camera-1")
     assert not wire.push(source="camera-2")
-    assert wire.hub.take_drops()[0] == {"media_stream_taken": 1}
+    assert wire.hub.pop_drops()[0] == {"media_stream_taken": 1}
     wire.now_ns += 4 * SECOND
     assert wire.push(source="camera-2")
     wire.hub.stop_sources({"camera-2"})
-    assert wire.hub.streams() == {}
+    assert wire.hub.read_streams() == {}
 
 
 def test_rates_are_those_of_the_last_seconds() -> None:
     wire = Wire()
     for _ in range(12):
         wire.push(16)
-        wire.hub.look(wire.now_ns)
-    facts = wire.hub.streams()["cloud"]
+        wire.hub.sample_rates(wire.now_ns)
+    facts = wire.hub.read_streams()["cloud"]
     assert facts.hz == pytest.approx(62.5)
     assert facts.rates == pytest.approx((6250.0, 3125.0, 1562.5))
 

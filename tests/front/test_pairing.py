@@ -12,14 +12,15 @@ import pytest
 
 from iris_session.front import pairing as pairing_desk
 from iris_session.front.audit import AuditTrail
-from iris_session.front.connections import ClientTable, Peer, Route
-from iris_session.front.pairing import AGAIN_S, BURST, MAX_WAITING, PATIENCE_NS, PairingDesk
-from iris_session.front.revocation import LOOK_NS, Revocation
+from iris_session.front.connections import ConnectionTable, Peer, Route
+from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, RETRY_S, PairingService
+from iris_session.front.revocation import CHECK_PERIOD_NS, RevocationService
 from iris_session.link.config import SECOND, FrontConfig
 from iris_session.protocol import pairing
+from iris_session.protocol.client_messages import Pair
+from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.security import Pair, Paired
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
 from iris_session.security.keyring import STRANGER, Keyring, open_keyring
 from iris_session.security.resume_tokens import ResumeTokens
@@ -55,11 +56,11 @@ class Desk:
         self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature, self.drops)
         self.tokens = ResumeTokens(16)
         audit = AuditTrail(lambda _entry: True)
-        self.desk = PairingDesk(self.keyring, self.outbox, audit, self.drops)
+        self.desk = PairingService(self.keyring, self.outbox, audit, self.drops)
         publisher: Any = Publisher()
-        self.revocation = Revocation(
+        self.revocation = RevocationService(
             self.keyring,
-            ClientTable(),
+            ConnectionTable(),
             self.outbox,
             self.tokens,
             audit,
@@ -72,16 +73,16 @@ class Desk:
 
     def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
         peer = Peer(descriptor, STRANGER + own.public)
-        self.desk.take(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
+        self.desk.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
 
     def proof(self, code: str, own: KeyPair) -> bytes:
         secret = pairing.stretch(code, self.server.raw_public)
         return pairing.client_proof(secret, self.server.raw_public, own.raw_public)
 
     def turn(self, _now_ns: int = 0) -> None:
-        self.now_ns += LOOK_NS
+        self.now_ns += CHECK_PERIOD_NS
         for service in (self.keyring, self.desk, self.revocation):
-            service.turn(self.now_ns)
+            service.tick(self.now_ns)
 
     def answers(self, own: KeyPair) -> list[Any]:
         return list(self.outbox.sent.get(own.public.encode(), []))
@@ -317,7 +318,7 @@ def test_one_address_cannot_use_up_what_all_may_ask(desk: Desk) -> None:
 
 def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     code, _ = desk.home.codes.make(desk.server)
-    first, *others = [KeyPair.new() for _ in range(MAX_WAITING + 3)]
+    first, *others = [KeyPair.new() for _ in range(MAX_PENDING + 3)]
     desk.asks(first, desk.proof(code, first), descriptor=0)
     with slow_disk(monkeypatch) as disk:
         turns(desk.turn, disk.waits.is_set)
@@ -351,10 +352,10 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
         patch.setattr(desk.home.codes, "of", fails)
         patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
         for _ in range(3):
-            assert not desk.desk.open
-        now_s += AGAIN_S
-        assert not desk.desk.open
+            assert not desk.desk.has_open_code
+        now_s += RETRY_S
+        assert not desk.desk.has_open_code
     assert tries == 2
     assert capsys.readouterr().err.count("Too many open files") == 1
-    monkeypatch.setattr(pairing_desk.time, "monotonic", lambda: now_s + AGAIN_S)
-    assert desk.desk.open
+    monkeypatch.setattr(pairing_desk.time, "monotonic", lambda: now_s + RETRY_S)
+    assert desk.desk.has_open_code

@@ -12,11 +12,10 @@ import zmq
 from zmq.auth import create_certificates
 
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker
+from iris_session.protocol.client_messages import EStop, Heartbeat, Hello, Marker, Pair, RemoveParticipant
 from iris_session.protocol.entries import Audit, Join, Lost
 from iris_session.protocol.names import AuditKind, FaultCode, RefusalCode
-from iris_session.protocol.security import Pair, Paired, RemoveParticipant
-from iris_session.protocol.server_messages import ProtocolFault, Refused
+from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused
 from iris_session.protocol.steps import Decision, Dropped
 from iris_session.security import KeyPair, load_public, load_secret
 from tests.front.harness import FrontSession

@@ -56,11 +56,11 @@ def publish(publisher: StatePublisher, times: int) -> None:
 
 
 def test_a_patch_moves_no_body_and_sends_none_again(publisher: StatePublisher, sent: Sent) -> None:
-    seq, poses = publisher.keyframe()
+    seq, poses = publisher.read_keyframe()
     assert (np.frombuffer(poses).reshape(N, 7)[:, 0] == 5.0).all()
     publisher.set_scene(info("patched", 1))
     assert publisher.scene.scene_hash == "patched"
-    assert publisher.keyframe() == (seq, poses), "who joins now sees them where they are"
+    assert publisher.read_keyframe() == (seq, poses), "who joins now sees them where they are"
     publish(publisher, 3)
     assert max(map(len, sent.payloads[-3:])) < 100
     assert len(sent.payloads[0]) > 12 * N
@@ -69,7 +69,7 @@ def test_a_patch_moves_no_body_and_sends_none_again(publisher: StatePublisher, s
 @pytest.mark.parametrize("other", [info("another", 0), info("patched", 1, first="another")], ids=["loaded", "bodies"])
 def test_another_scene_begins_where_it_begins(publisher: StatePublisher, sent: Sent, other: SceneInfo) -> None:
     publisher.set_scene(other)
-    assert publisher.keyframe() == (0, other.poses)
+    assert publisher.read_keyframe() == (0, other.poses)
     publish(publisher, 1)
     assert len(sent.payloads[-1]) > 12 * N
-    assert publisher.keyframe()[0] == WINDOW + 6, "frames are numbered on"
+    assert publisher.read_keyframe()[0] == WINDOW + 6, "frames are numbered on"

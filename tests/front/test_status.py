@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from iris_session.front.status import ENOUGH, REUSE_NS
+from iris_session.front.status import MIN_DELAYS, REUSE_NS
 from iris_session.protocol.client_messages import Hello, Observation, Sample, Samples
 from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Join
@@ -109,7 +109,7 @@ def test_of_few_states_no_percentile_is_told(session: FrontSession) -> None:
     """A scene that stands still is sent four times a second: one that was late is not the usual way."""
     client = session.client()
     client.join()
-    for _ in range(ENOUGH // 2):
+    for _ in range(MIN_DELAYS // 2):
         session.send_state(STILL)
         session.once()
     assert ask(session, client).step_to_publish is None

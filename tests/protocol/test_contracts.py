@@ -13,7 +13,7 @@ from iris_session.protocol.client_messages import Bye, ClientMessage, Hello, Sam
 from iris_session.protocol.codec import decode_server, encode_server
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Applied, Denial, Pose, Target
 from iris_session.protocol.entries import Entry, decode_entries, decode_entry, encode_entries, encode_entry
-from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
+from iris_session.protocol.scene import RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import Event, Feedback, Notice, PresenceItem, Reply, ServerEnvelope
 from iris_session.protocol.specs import RobotSpec
 

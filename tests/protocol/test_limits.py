@@ -1,4 +1,4 @@
-"""Every message has limits; the token bucket lets through what it says."""
+"""Limits of every message, token buckets, drop counters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from iris_session.protocol import codec
 from iris_session.protocol.client_messages import EStop, Hello, Sample
 from iris_session.protocol.errors import RateError
-from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Limit, RateLimiter
+from iris_session.protocol.limits import LIMITS, SERVER_LIMITS, Drops, Limit, RateLimiter, TokenBucket
 from iris_session.protocol.server_messages import Snapshot
 
 SECOND = 1_000_000_000
@@ -70,3 +70,29 @@ def test_rate_error_says_what_is_allowed() -> None:
     error = RateError(codec.tag_of(Sample), limit.per_second, limit.burst)
     assert error.code == "rate"
     assert str(error) == "too many sample messages: at most 600 per second, 200 at once"
+
+
+def test_a_bucket_allows_its_burst_and_then_its_rate() -> None:
+    bucket = TokenBucket(rate=10.0, burst=3)
+    now = 5 * SECOND
+    assert [bucket.take(now) for _ in range(4)] == [True, True, True, False]
+    taken = sum(bucket.take(now + i * SECOND // 100) for i in range(1, 201))
+    assert taken == 20
+
+
+def test_a_bucket_holds_no_more_than_its_burst() -> None:
+    bucket = TokenBucket(rate=1000.0, burst=2)
+    assert [bucket.take(3600 * SECOND) for _ in range(3)] == [True, True, False]
+
+
+def test_drops_are_counted_by_reason_and_connection() -> None:
+    drops = Drops()
+    drops.count("rate", 3)
+    drops.count("rate", 3, n=2)
+    drops.count("unknown_key")
+    assert drops.by_reason == {"rate": 3, "unknown_key": 1}
+    assert drops.by_connection == {3: 3}
+    assert drops.version == 3
+    drops.remove(3)
+    assert drops.by_connection == {}
+    assert Drops().by_reason == {}

@@ -7,14 +7,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.scene import Body, Geometry, SceneError, SceneSpec, Visual, decode_scene, encode_scene
-from iris_session.protocol.scene_looks import Material
-from iris_session.protocol.scene_patch import (
+from iris_session.protocol.scene import (
     AddMaterial,
     AddVisual,
+    Body,
+    Geometry,
+    Material,
     PatchOp,
     RemoveVisual,
+    SceneError,
+    SceneSpec,
     SetVisual,
+    Visual,
+    decode_scene,
+    encode_scene,
     merged,
     patched,
 )

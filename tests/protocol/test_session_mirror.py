@@ -25,7 +25,7 @@ from iris_session.protocol.server_messages import (
     SceneChanged,
     Snapshot,
 )
-from iris_session.protocol.session_mirror import Missed
+from iris_session.protocol.session_mirror import MissedEvents
 
 BODIES = (BodyInfo(0, "world", False), BodyInfo(3, "hammer", True, True))
 
@@ -117,7 +117,7 @@ def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None
     for one in events[:3]:
         truth.apply_event(one)
     told = mirror.apply_snapshot(snapshot(truth))
-    assert told == [Missed(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
+    assert told == [MissedEvents(2, 2), events[2], events[3]], "event 3 was in the snapshot, and came"
     assert mirror.synced
     assert mirror.event_seq == 4
     assert mirror.discarded == 0
@@ -128,7 +128,7 @@ def test_gap_waits_for_a_snapshot_and_goes_on_with_what_came_meanwhile() -> None
 def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fates: list[str], before: int) -> None:
     """Exactly once, in order, whatever is lost or comes again, and whenever a snapshot comes."""
     mirror, truth = SessionMirror(), synced()
-    told: list[Event | Missed] = []
+    told: list[Event | MissedEvents] = []
 
     def come(one: Event) -> None:
         if mirror.apply_event(one):
@@ -142,11 +142,11 @@ def test_every_event_since_the_first_snapshot_is_handed_out_or_told_as_missed(fa
         truth.apply_event(one)
         for _ in range({"come": 1, "twice": 2, "lost": 0}[fate]):
             come(one)
-    seqs = [
-        seq for one in told for seq in (range(one.first, one.last + 1) if isinstance(one, Missed) else (one.event_seq,))
-    ]
+    seqs: list[int] = []
+    for one in told:
+        seqs += range(one.first, one.last + 1) if isinstance(one, MissedEvents) else (one.event_seq,)
     assert seqs == list(range(before + 1, truth.event_seq + 1))
-    lost = {seq for one in told if isinstance(one, Missed) for seq in range(one.first, one.last + 1)}
+    lost = {seq for one in told if isinstance(one, MissedEvents) for seq in range(one.first, one.last + 1)}
     numbers = [i for i, fate in enumerate([f for f in fates if f != "snapshot"], before + 1) if fate == "lost"]
     assert lost == set(numbers), "what came is handed out"
 
@@ -212,8 +212,8 @@ def test_lease_version_is_only_for_its_holders() -> None:
     mirror = synced()
     shared = Lease("left", "robot", "shared", "p1", 7, sub_holders=("p1", "p2"), weights=(0.5, 0.5))
     mirror.apply_event(event(1, LeaseChanged(shared, "acquired")))
-    assert [mirror.lease_version("left", p) for p in ("p1", "p2", "p3")] == [7, 7, None]
-    assert mirror.lease_version("right", "p1") is None
+    assert [mirror.find_lease_version("left", p) for p in ("p1", "p2", "p3")] == [7, 7, None]
+    assert mirror.find_lease_version("right", "p1") is None
 
 
 def test_held_events_are_bounded() -> None:

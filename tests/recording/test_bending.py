@@ -16,7 +16,7 @@ from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.bending import Bending
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import WAITING_VERTICES, RrdWriter
-from iris_session.scene import AssetError, AssetStore, decode_arrays
+from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_deformables import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
@@ -240,5 +240,5 @@ def test_an_asset_that_is_damaged_is_an_error_of_assets(world: World, name: str)
     (cloth, *_) = world.parsed.spec.deformables
     arrays = dict(decode_arrays(world.store.get(cloth.address), "deformable"))
     arrays[name] = arrays[name][:-1] if name == "position" else np.full_like(arrays[name], 200)
-    with pytest.raises(AssetError):
+    with pytest.raises(AssetDecodeError):
         Bending("e", cloth, arrays)

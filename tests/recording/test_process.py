@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import zmq
 
-from iris_session.protocol.scene_names import ArrayKind
+from iris_session.protocol.names import ArrayKind
 from iris_session.recording import RecorderError, RecorderProcess, Recording, RecordingLock, verify
 from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path

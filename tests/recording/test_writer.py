@@ -13,8 +13,17 @@ import pytest
 from anchors.pose import apply
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.protocol.common import Applied, Denial, Pose
-from iris_session.protocol.scene import Geometry, SceneSpec, Visual, encode_scene
-from iris_session.protocol.scene_patch import AddVisual, PatchOp, RemoveVisual, SetVisual, patched
+from iris_session.protocol.scene import (
+    AddVisual,
+    Geometry,
+    PatchOp,
+    RemoveVisual,
+    SceneSpec,
+    SetVisual,
+    Visual,
+    encode_scene,
+    patched,
+)
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
 from iris_session.recording import Recording, SessionHeader, pack_model, scene
 from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from iris_session.protocol.arrays import MAGIC, ArrayHeader, ArrayInfo
-from iris_session.scene import AssetError, decode_arrays, encode_arrays
+from iris_session.protocol.assets import ARRAYS_MAGIC, ArrayHeader, ArrayInfo
+from iris_session.scene import AssetDecodeError, decode_arrays, encode_arrays
 from iris_session.scene.arrays import Stored
 
 FILTERS = ("none", "shuffle", "delta", "up")
@@ -21,7 +21,7 @@ FILTERS = ("none", "shuffle", "delta", "up")
 
 def asset(*infos: ArrayInfo, body: bytes = b"", kind: str = "mesh") -> bytes:
     header = msgspec.msgpack.encode(ArrayHeader(kind, infos))
-    return MAGIC + len(header).to_bytes(4, "little") + header + body
+    return ARRAYS_MAGIC + len(header).to_bytes(4, "little") + header + body
 
 
 @given(
@@ -50,8 +50,8 @@ def test_smooth_content_shrinks_and_noise_costs_no_more_than_itself() -> None:
 
 @given(st.binary(max_size=200))
 def test_bytes_of_anybody(data: bytes) -> None:
-    for candidate in (data, MAGIC + data, MAGIC + len(data).to_bytes(4, "little") + data):
-        with pytest.raises(AssetError):
+    for candidate in (data, ARRAYS_MAGIC + data, ARRAYS_MAGIC + len(data).to_bytes(4, "little") + data):
+        with pytest.raises(AssetDecodeError):
             decode_arrays(candidate, "mesh")
 
 
@@ -63,7 +63,7 @@ def test_damaged_assets(at: int, byte: int, length: int) -> None:
     for damaged in (good, good[:length]):
         try:
             decode_arrays(damaged, "mesh")
-        except AssetError:
+        except AssetDecodeError:
             continue
 
 
@@ -87,22 +87,22 @@ HUGE = ArrayInfo("a", "f4", (2**40, 3), 4)
     ],
 )
 def test_what_is_wrong_is_said(data: bytes, text: str) -> None:
-    with pytest.raises(AssetError, match=text):
+    with pytest.raises(AssetDecodeError, match=text):
         decode_arrays(data, "mesh")
 
 
 def test_a_bomb_is_refused_before_it_unfolds() -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(50_000_000))
-    with pytest.raises(AssetError, match="another size"):
+    with pytest.raises(AssetDecodeError, match="another size"):
         decode_arrays(asset(ArrayInfo("a", "u1", (100,), len(bomb), codec="zstd"), body=bomb), "mesh")
     honest = asset(ArrayInfo("a", "u1", (50_000_000,), len(bomb), codec="zstd"), body=bomb)
-    with pytest.raises(AssetError, match="at most 1000 are read"):
+    with pytest.raises(AssetDecodeError, match="at most 1000 are read"):
         decode_arrays(honest, "mesh", max_bytes=1_000)
 
 
 def test_an_array_of_nothing_may_not_be_endless_along_an_axis() -> None:
     for shape in ((0, 2**62), (2**62, 0), (0, 2**31, 2**31, 2**31)):
-        with pytest.raises(AssetError, match="along an axis"):
+        with pytest.raises(AssetDecodeError, match="along an axis"):
             decode_arrays(asset(ArrayInfo("a", "f4", shape, 0)), "mesh")
     assert decode_arrays(asset(ArrayInfo("a", "f4", (0, 3), 0)), "mesh")["a"].shape == (0, 3)
 
@@ -110,7 +110,7 @@ def test_an_array_of_nothing_may_not_be_endless_along_an_axis() -> None:
 def test_what_is_quantised_counts_as_large_as_it_becomes() -> None:
     packed = zstandard.ZstdCompressor().compress(bytes(3_000))
     info = ArrayInfo("a", "u1", (1_000, 3), len(packed), codec="zstd", scale=(1.0,) * 3, offset=(0.0,) * 3)
-    with pytest.raises(AssetError, match="arrays of 12000 bytes, at most 11999"):
+    with pytest.raises(AssetDecodeError, match="arrays of 12000 bytes, at most 11999"):
         decode_arrays(asset(info, body=packed), "mesh", 11_999)
     assert decode_arrays(asset(info, body=packed), "mesh", 12_000)["a"].nbytes == 12_000
 
@@ -125,5 +125,5 @@ def test_rows_of_a_byte_cost_no_call_each(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_nothing_may_follow_a_frame() -> None:
     packed = zstandard.ZstdCompressor().compress(bytes(30)) + b"more"
-    with pytest.raises(AssetError, match="damaged"):
+    with pytest.raises(AssetDecodeError, match="damaged"):
         decode_arrays(asset(ArrayInfo("a", "u1", (30,), len(packed), codec="zstd"), body=packed), "mesh")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ def exported(spec: SceneSpec, store: AssetStore, tmp_path: Path) -> dict[str, An
     return document(tmp_path / "a.glb")
 
 
-@pytest.mark.parametrize("fault", ["write_bytes", "replace"])
+@pytest.mark.parametrize("fault", ["write", "replace"])
 def test_a_full_disk_leaves_what_was_there(
     tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
@@ -46,16 +47,18 @@ def test_a_full_disk_leaves_what_was_there(
     out.parent.mkdir()
     out.write_bytes(b"from before")
 
-    def full(path: Any, data: Any) -> None:
-        if fault == "write_bytes":
-            with Path(path).open("wb") as file:
-                file.write(data[:100])
+    class FullDisk(io.FileIO):
+        def write(self, data: Any) -> int:
+            super().write(bytes(data)[:100])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    if fault == "write_bytes":
-        monkeypatch.setattr(Path, "write_bytes", full)
+    if fault == "write":
+        monkeypatch.setattr(os, "fdopen", FullDisk)
     else:
-        monkeypatch.setattr("iris_session.scene.glb.os.replace", full)
+        monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="No space left"):
         write_glb(spec, store, out)
     assert [path.name for path in out.parent.iterdir()] == ["a.glb"]

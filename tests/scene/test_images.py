@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from iris_session.scene import AssetError, decode_image, encode_image
+from iris_session.scene import AssetDecodeError, decode_image, encode_image
 from iris_session.scene.images import halved
 
 ENCODINGS = ("arrays", "png", "jpeg")
@@ -35,7 +35,7 @@ def test_jpeg_states_its_error_and_is_small() -> None:
     error = np.abs(decode_image(image.data, "jpeg").astype(int) - pixels).max()
     assert 0 < error == image.max_error < 40
     assert len(image.data) < len(encode_image(pixels).data) / 3
-    with pytest.raises(AssetError, match="use PNG"):
+    with pytest.raises(AssetDecodeError, match="use PNG"):
         encode_image(picture(channels=4), "jpeg")
 
 
@@ -54,7 +54,7 @@ def test_half_the_size() -> None:
 def test_damaged_images(encoding: str) -> None:
     good = encode_image(picture(), encoding).data
     for length in (0, 3, 20, 40):
-        with pytest.raises(AssetError):
+        with pytest.raises(AssetDecodeError):
             decode_image(good[:length], encoding)
     rng = np.random.default_rng(1)
     for _ in range(100):
@@ -62,13 +62,13 @@ def test_damaged_images(encoding: str) -> None:
         bad[int(rng.integers(len(bad)))] = int(rng.integers(256))
         try:
             decode_image(bad, encoding)
-        except AssetError:
+        except AssetDecodeError:
             continue
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_too_large_is_refused_by_what_the_file_says(encoding: str) -> None:
-    with pytest.raises(AssetError, match="at most 1000"):
+    with pytest.raises(AssetDecodeError, match="at most 1000"):
         decode_image(encode_image(picture(), encoding).data, encoding, max_bytes=1_000)
 
 
@@ -76,7 +76,7 @@ def test_too_large_is_refused_by_what_the_file_says(encoding: str) -> None:
 def test_four_bytes_count_for_every_pixel(encoding: str) -> None:
     data = encode_image(picture(6, 8), encoding).data
     assert decode_image(data, encoding, 4 * 6 * 8).shape == (6, 8, 3)
-    with pytest.raises(AssetError, match="at most"):
+    with pytest.raises(AssetDecodeError, match="at most"):
         decode_image(data, encoding, 4 * 6 * 8 - 1)
 
 
@@ -90,15 +90,15 @@ def test_a_jpeg_cannot_hide_its_size_behind_fill_bytes() -> None:
     lie = b"\xff\xc0\x00\x11\x08\x00\x01\x00\x01" + bytes(10)
     bad = good[:frame] + b"\xff" + good[frame:]
     bad += bytes(max(0, frame + 2 + length - len(bad)))
-    with pytest.raises(AssetError, match="80 x 60 pixels, at most"):
+    with pytest.raises(AssetDecodeError, match="80 x 60 pixels, at most"):
         decode_image(bad[: frame + 2 + length] + lie, "jpeg", max_bytes=1_000)
     for marker in (b"\xff\xd8", b"\xff\x01", b"\xff\xda"):
-        with pytest.raises(AssetError, match="without a size"):
+        with pytest.raises(AssetDecodeError, match="without a size"):
             decode_image(good[:2] + marker + good[2:], "jpeg")
 
 
 def test_unknown_encodings() -> None:
-    with pytest.raises(AssetError, match="unknown encoding"):
+    with pytest.raises(AssetDecodeError, match="unknown encoding"):
         decode_image(b"", "webp")
-    with pytest.raises(AssetError, match="unknown encoding"):
+    with pytest.raises(AssetDecodeError, match="unknown encoding"):
         encode_image(picture(), "webp")

@@ -11,7 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from iris_session.scene import AssetError, MeshArrays, decode_mesh, encode_arrays, encode_mesh, encode_mesh_quantised
+from iris_session.scene import (
+    AssetDecodeError,
+    MeshArrays,
+    decode_mesh,
+    encode_arrays,
+    encode_mesh,
+    encode_mesh_quantised,
+)
 from iris_session.scene.arrays import Stored
 from iris_session.scene.meshes import index_corners
 from iris_session.scene.simplify import simplified, smooth_mesh, sorted_rows
@@ -148,7 +155,7 @@ def test_what_is_no_mesh_is_refused(arrays: list[Stored], text: str) -> None:
     }
     if len(whole["position"]) != 1:
         del whole["normal"]
-    with pytest.raises(AssetError, match=text):
+    with pytest.raises(AssetDecodeError, match=text):
         decode_mesh(encode_arrays("mesh", [Stored(name, values) for name, values in whole.items()]))
 
 

@@ -13,8 +13,7 @@ import pytest
 import trimesh
 
 from iris_session.cli.main import main
-from iris_session.protocol.scene import Geometry
-from iris_session.protocol.scene_looks import HeightField
+from iris_session.protocol.scene import Geometry, HeightField
 from iris_session.scene import AssetStore
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco

@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.link.sockets import ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE
-from iris_session.protocol.token_bucket import Drops
+from iris_session.protocol.limits import Drops
 from iris_session.security import fingerprint
 from iris_session.security.keyring import Keyring
 from iris_session.security.zap import Authenticator

@@ -21,7 +21,7 @@ from iris_session.protocol import entries as em
 from iris_session.protocol import names
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import HOST, Entry, EntryMessage, decode_entries, encode_entries
-from iris_session.protocol.scene_patch import SetVisual
+from iris_session.protocol.scene import SetVisual
 from iris_session.protocol.steps import Decision
 from iris_session.session.core import CoreConfig, SessionCore
 from tests.session.replay_stress import make_config

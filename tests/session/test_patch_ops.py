@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from iris_session.protocol.common import IDENTITY, Pose
-from iris_session.protocol.scene import Geometry, SceneError, Visual
-from iris_session.protocol.scene_patch import MAX_OPS, AddVisual, RemoveVisual, SetVisual
+from iris_session.protocol.scene import MAX_OPS, AddVisual, Geometry, RemoveVisual, SceneError, SetVisual, Visual
 from iris_session.session.patch_ops import checked_ops
 
 NAN = float("nan")

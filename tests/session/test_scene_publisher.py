@@ -24,8 +24,7 @@ from iris_session import (
     Session,
     SessionConfig,
 )
-from iris_session.protocol.scene import Environment
-from iris_session.protocol.scene_patch import RemoveVisual, SetVisual
+from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.scene import AssetStore

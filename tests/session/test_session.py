@@ -21,8 +21,7 @@ from iris_session.control import ControlConfig, ControlError
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import AmbiguousModelError, load_model
 from iris_session.protocol.client_messages import Control
-from iris_session.protocol.scene import encode_scene
-from iris_session.protocol.scene_patch import AddVisual, RemoveVisual, SetVisual
+from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.scene import AssetStore
 from iris_session.session import scene_change

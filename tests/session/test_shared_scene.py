@@ -10,9 +10,7 @@ import mujoco
 import pytest
 
 from iris_session.physics import World
-from iris_session.protocol.scene import SceneError
-from iris_session.protocol.scene_looks import Mesh, MeshLevel
-from iris_session.protocol.scene_patch import AddMesh, SetVisual
+from iris_session.protocol.scene import AddMesh, Mesh, MeshLevel, SceneError, SetVisual
 from iris_session.scene import AssetStore
 from iris_session.session import shared_scene
 from iris_session.session.config import SessionConfig
@@ -63,7 +61,7 @@ def test_the_scene_before_is_held_too_and_patches_on_one_visual_count_once(world
     scenes.take(scenes.make(world))
     looks = [scenes.take(scenes.patch([SetVisual(0, rgba=(i / 4, 0.0, 0.0, 1.0))])).scene_hash for i in range(3)]
     store = AssetStore(tmp_path)
-    removed = [store.discard(address, store.used_at(address)) for address in looks]
+    removed = [store.discard(address, store.last_used_ns(address)) for address in looks]
     assert removed == [True, False, False], "the front still serves the one before"
     assert scenes.newest is not None
     assert len(scenes.newest.patches) == 1

@@ -1,38 +1,94 @@
-"""Threads that give way: what they make, what they raise, and that nobody else has a lower priority for it."""
+"""Priority of threads: low-priority work stays in its thread, the tick priority is temporary and optional."""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 
 import pytest
 
-from iris_session.system.priority import NICER, made_below
+from iris_session.system.priority import LOW_PRIORITY_NICE, run_at_low_priority, tick_priority
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
 
 
-def test_what_is_made_is_handed_over_and_what_is_raised_too() -> None:
-    assert made_below(threading.get_ident) != threading.get_ident()
+def test_low_priority_call_returns_and_raises() -> None:
+    assert run_at_low_priority(threading.get_ident) != threading.get_ident()
     with pytest.raises(ZeroDivisionError):
-        made_below(lambda: 1 // 0)
-    assert made_below(lambda: None) is None
+        run_at_low_priority(lambda: 1 // 0)
+    assert run_at_low_priority(lambda: None) is None
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="threads have a priority on Linux only")
-def test_threads_that_are_started_there_inherit_its_priority_and_nobody_else_has_it() -> None:
+def test_threads_started_at_low_priority_inherit_it() -> None:
     ours = os.getpriority(os.PRIO_PROCESS, 0)
-    found: list[int] = []
+    seen: list[int] = []
 
-    def look() -> None:
-        found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    def record_nice() -> None:
+        seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
     def start() -> None:
-        look()
-        thread = threading.Thread(target=look)
+        record_nice()
+        thread = threading.Thread(target=record_nice)
         thread.start()
         thread.join()
 
-    made_below(start)
-    assert found == [min(19, ours + NICER)] * 2
-    look()
-    assert found[-1] == ours
+    run_at_low_priority(start)
+    assert seen == [min(19, ours + LOW_PRIORITY_NICE)] * 2
+    record_nice()
+    assert seen[-1] == ours
+
+
+def test_tick_priority_is_given_back() -> None:
+    before = os.sched_getscheduler(0)
+    with tick_priority() as reached:
+        inside = os.sched_getscheduler(0)
+    assert reached in ("realtime", "normal")
+    assert (inside & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR) == (reached == "realtime")
+    assert os.sched_getscheduler(0) == before
+
+
+#: Root has `CAP_SYS_NICE` until it changes its user; a user with an `rtprio` limit never had it.
+WITHOUT_CAPABILITY = """
+import os
+from iris_session.system.priority import tick_priority
+with tick_priority() as reached:
+    if os.getuid() == 0:
+        os.setuid(65534)
+    inside = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+print(reached, inside == os.SCHED_RR, os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER)
+"""
+
+
+def test_tick_priority_is_given_back_without_the_capability() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_CAPABILITY], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() in (["realtime", "True", "True"], ["normal", "False", "True"])
+
+
+def test_tick_priority_without_permission_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError("no")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with tick_priority() as reached:
+        assert reached == "normal"
+
+
+def test_disabled_tick_priority_makes_no_system_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(os, "sched_setscheduler", fail)
+    with tick_priority(False) as reached:
+        assert reached == "normal"
+
+
+def test_tick_priority_is_not_raised_on_a_single_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    before = os.sched_getscheduler(0)
+    with tick_priority() as reached:
+        assert reached == "normal"
+        assert os.sched_getscheduler(0) == before

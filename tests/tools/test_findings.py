@@ -157,8 +157,8 @@ def test_an_idle_state_socket_does_what_waits() -> None:
     state = context.socket(zmq.XPUB)
     publisher = StatePublisher(state, SceneInfo("hash"), lambda: 0)
     asked: list[int] = []
-    publisher.use_socket(None)
-    publisher.tend()
+    publisher.replace_socket(None)
+    publisher.poll()
 
     class Watched:
         def get(self, option: int) -> int:
@@ -166,6 +166,6 @@ def test_an_idle_state_socket_does_what_waits() -> None:
             return 0
 
     publisher._state = Watched()  # type: ignore[assignment]
-    publisher.tend()
+    publisher.poll()
     assert asked == [int(zmq.EVENTS)]
     context.destroy(linger=0)

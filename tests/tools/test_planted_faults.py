@@ -1,5 +1,5 @@
 """How `tools/planted_faults.py` judges: a doctor who does not name a fault fails. Planting them needs root and minutes:
-docs/doctor.md has what was seen."""
+docs/evidence/doctor.md has what was seen."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
-from planted import FAULTS, Fault
-from planted_faults import judge
+from planted_faults import FAULTS, Fault, judge
 
-from iris_session.doctor.examination import ORDER
 from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.doctor.runner import ORDER
 
 ROOT = Path(__file__).parents[2]
 REVOKED = next(one for one in FAULTS if one.name == "revoked")

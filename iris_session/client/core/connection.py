@@ -40,12 +40,12 @@ from iris_session.protocol.client_messages import (
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import DenialReason, FaultCode, RefusalCode
-from iris_session.protocol.security import Paired
 from iris_session.protocol.server_messages import (
     ClockPong,
     EStopChanged,
     Event,
     Feedback,
+    Paired,
     ParticipantLeft,
     ProtocolFault,
     Refused,
@@ -53,7 +53,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-from iris_session.protocol.session_mirror import Missed, SessionMirror
+from iris_session.protocol.session_mirror import MissedEvents, SessionMirror
 from iris_session.protocol.status import DeliveryBudget, GetStatus, StatusReport
 
 #: Time to wait for the reply to hello, at first and at most: a handshake takes five round trips, so over a slow link
@@ -78,7 +78,7 @@ UNREAD_MESSAGE_FAULTS: Final = frozenset({FaultCode.MALFORMED, FaultCode.TOO_LAR
 REPLACED: Final = "replaced"
 
 #: Messages to the application, in order. Replies: denials of messages that expect no reply.
-InboxMessage = Event | Missed | Feedback | ProtocolFault | Reply
+InboxMessage = Event | MissedEvents | Feedback | ProtocolFault | Reply
 
 
 class IdentityStore(Protocol):
@@ -291,7 +291,7 @@ class ClientConnection:
         if granted is not None and (known is None or granted.lease_version > known.lease_version):
             ours = granted.holder == self.participant_id or self.participant_id in granted.sub_holders
             return granted.lease_version if ours else None
-        return self.mirror.lease_version(target, self.participant_id)
+        return self.mirror.find_lease_version(target, self.participant_id)
 
     # --- receiving ----------------------------------------------------------------------------------------------------
 
@@ -426,14 +426,14 @@ class ClientConnection:
         self.inbox.append(message)
 
     def _make_inbox_room(self) -> None:
-        """Drop the oldest message of a full inbox; one `Missed` at its front counts the events among the dropped."""
-        missed: Missed | None = None
+        """Drop the oldest messages of a full inbox; one `MissedEvents` at its front names the events among them."""
+        missed: MissedEvents | None = None
         while len(self.inbox) >= MAX_INBOX - (missed is not None):
             dropped = self.inbox.popleft()
-            self.counters.inbox_dropped += not isinstance(dropped, Missed)
-            if isinstance(dropped, Event | Missed):
-                first, last = dropped if isinstance(dropped, Missed) else (dropped.event_seq, dropped.event_seq)
-                missed = Missed(first if missed is None else missed.first, last)
+            self.counters.inbox_dropped += not isinstance(dropped, MissedEvents)
+            if isinstance(dropped, Event | MissedEvents):
+                first, last = (dropped.event_seq,) * 2 if isinstance(dropped, Event) else dropped
+                missed = MissedEvents(first if missed is None else missed.first, last)
         if missed is not None:
             self.inbox.appendleft(missed)
 

@@ -67,5 +67,8 @@ class SceneFollower:
 
     def tip_pose(self, robot: str) -> PoseTuple | None:
         """Return `T_world_site` of a robot's end effector in the newest state, `None` when it is not known."""
-        poses, tip = self.poses, self._connection.mirror.tip(robot)
-        return None if poses is None or tip is None or tip[0] >= len(poses) else compose(pose_at(poses, tip[0]), tip[1])
+        poses, tip = self.poses, self._connection.mirror.find_tip(robot)
+        if poses is None or tip is None or tip[0] >= len(poses):
+            return None
+        index, T_body_site = tip
+        return compose(pose_at(poses, index), (T_body_site.p, T_body_site.q))

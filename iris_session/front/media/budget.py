@@ -55,25 +55,25 @@ RELEARN_NS: Final = 5 * SECOND
 Rates = Mapping[str, Sequence[float]]
 
 
-class Report(NamedTuple):
+class StateReport(NamedTuple):
     """What a client says of its state. `age_ms`: median, 0 when none came."""
 
     age_ms: float
     missed_share: float
 
 
-class Measure(NamedTuple):
+class LinkMeasure(NamedTuple):
     """One look at a client. `report`: its newest, `None` without a new one since the last look. `taken`, `due`: media
     frames that its connection took, of those that were due, since then. `limit`: bytes per second that it wants at
     most, 0 for no limit."""
 
-    report: Report | None
-    taken: int = 0
+    report: StateReport | None
+    delivered: int = 0
     due: int = 0
     limit: float = 0.0
 
 
-class Grant(NamedTuple):
+class BudgetGrant(NamedTuple):
     """`levels`: index into `CLASSES` by stream. `bytes_per_s`: bound of all together, 0 for none."""
 
     levels: dict[str, int]
@@ -81,38 +81,38 @@ class Grant(NamedTuple):
     reason: str = ""
 
 
-def cost(rates: Rates, levels: Mapping[str, int]) -> float:
+def compute_cost(rates: Rates, levels: Mapping[str, int]) -> float:
     """Bytes per second of all streams at these levels. A coarser class never counts more than a finer one."""
-    return sum(_rate(rates[stream], levels.get(stream, 0)) for stream in sorted(rates))
+    return sum(_level_rate(rates[stream], levels.get(stream, 0)) for stream in sorted(rates))
 
 
-def ladder(rates: Rates) -> list[dict[str, int]]:
+def build_ladder(rates: Rates) -> list[dict[str, int]]:
     """From everything to nothing: each step lowers the stream that costs the most."""
     levels = dict.fromkeys(sorted(rates), 0)
     steps = [dict(levels)]
     while any(level < NOTHING for level in levels.values()):
         lowest = max(
             (stream for stream in levels if levels[stream] < NOTHING),
-            key=lambda stream: (_rate(rates[stream], levels[stream]), -levels[stream], stream),
+            key=lambda stream: (_level_rate(rates[stream], levels[stream]), -levels[stream], stream),
         )
         levels[lowest] += 1
         steps.append(dict(levels))
     return steps
 
 
-def fit(rates: Rates, bytes_per_s: float) -> dict[str, int]:
+def select_levels(rates: Rates, bytes_per_s: float) -> dict[str, int]:
     """The first rung of the ladder that costs no more than that; nothing at all for no budget."""
-    steps = ladder(rates)
+    steps = build_ladder(rates)
     if bytes_per_s <= 0.0:
         return steps[-1]
-    return next(levels for levels in steps if cost(rates, levels) <= bytes_per_s)
+    return next(levels for levels in steps if compute_cost(rates, levels) <= bytes_per_s)
 
 
-def _rate(rates: Sequence[float], level: int) -> float:
+def _level_rate(rates: Sequence[float], level: int) -> float:
     return 0.0 if level >= NOTHING else min(rates[: level + 1])
 
 
-class _Line:
+class _ClientBudget:
     """What is remembered of one client."""
 
     def __init__(self) -> None:
@@ -135,46 +135,46 @@ class BudgetController:
     """All clients of a session. `update` is called a few times a second for each."""
 
     def __init__(self) -> None:
-        self._lines: dict[int, _Line] = {}
+        self._clients: dict[int, _ClientBudget] = {}
 
-    def forget(self, client: int) -> None:
+    def remove(self, client: int) -> None:
         """A client is gone."""
-        self._lines.pop(client, None)
+        self._clients.pop(client, None)
 
-    def update(self, client: int, measure: Measure, rates: Rates, now_ns: int) -> Grant:
+    def update(self, client: int, measure: LinkMeasure, rates: Rates, now_ns: int) -> BudgetGrant:
         """What a client gets of the streams in `rates`, those that it wants. `now_ns` must not go back."""
-        line = self._lines.get(client)
+        line = self._clients.get(client)
         if line is None:
-            line = self._lines[client] = _Line()
+            line = self._clients[client] = _ClientBudget()
         limit = measure.limit or math.inf
-        self._take_streams(line, rates)
-        trouble = self._trouble(line, measure, now_ns)
-        present = cost(rates, line.levels)
+        self._sync_streams(line, rates)
+        trouble = self._find_trouble(line, measure, now_ns)
+        present = compute_cost(rates, line.levels)
         if trouble:
             line.troubled_ns = now_ns
         if trouble and present > 0.0:
             line.innocent_ns = -1
-            self._lower(line, rates, LESS * present * line.sent, trouble, now_ns)
+            self._lower_levels(line, rates, LESS * present * line.sent, trouble, now_ns)
         elif trouble:
-            self._not_to_blame(line, now_ns)
+            self._relearn_best(line, now_ns)
         else:
             line.innocent_ns = -1
-            self._climb(line, rates, limit, now_ns)
+            self._raise_levels(line, rates, limit, now_ns)
         allowed = min(line.budget, limit)
-        if cost(rates, line.levels) > min(SLACK * line.budget, LIMIT_SLACK * limit):
-            line.levels = fit(rates, allowed)
+        if compute_cost(rates, line.levels) > min(SLACK * line.budget, LIMIT_SLACK * limit):
+            line.levels = select_levels(rates, allowed)
             line.reason = line.reason if line.budget <= limit else "the client asked for no more"
         bound = 0.0 if math.isinf(allowed) else allowed
-        return Grant(dict(line.levels), bound, line.reason if bound or any(line.levels.values()) else "")
+        return BudgetGrant(dict(line.levels), bound, line.reason if bound or any(line.levels.values()) else "")
 
     # --- what is wrong -----------------------------------------------------------------------------------------------
 
-    def _trouble(self, line: _Line, measure: Measure, now_ns: int) -> str:
+    def _find_trouble(self, line: _ClientBudget, measure: LinkMeasure, now_ns: int) -> str:
         """Why this client should get less, empty when all is well."""
         if measure.report is not None:
-            self._judge(line, measure.report, now_ns)
+            self._judge_report(line, measure.report, now_ns)
         if measure.due:
-            share = measure.taken / measure.due
+            share = measure.delivered / measure.due
             line.sent = (line.sent + share) / 2  # buffers take some before the link is known
             line.blocked = line.blocked + 1 if 1.0 - share > BLOCKED else 0
         if line.reported_ns >= 0 and now_ns - line.reported_ns > SILENT_NS:
@@ -186,7 +186,7 @@ class BudgetController:
             return "the link does not take all media"
         return line.late
 
-    def _judge(self, line: _Line, report: Report, now_ns: int) -> None:
+    def _judge_report(self, line: _ClientBudget, report: StateReport, now_ns: int) -> None:
         line.reported_ns = now_ns
         line.late = ""
         if now_ns - line.lowered_ns >= DRAIN_NS:
@@ -199,7 +199,7 @@ class BudgetController:
             line.ages.append(report.age_ms)
             line.missed.append(report.missed_share)
 
-    def _not_to_blame(self, line: _Line, now_ns: int) -> None:
+    def _relearn_best(self, line: _ClientBudget, now_ns: int) -> None:
         if line.innocent_ns < 0:
             line.innocent_ns = now_ns
         elif now_ns - line.innocent_ns > RELEARN_NS and line.ages:
@@ -211,30 +211,30 @@ class BudgetController:
 
     # --- what is done ------------------------------------------------------------------------------------------------
 
-    def _take_streams(self, line: _Line, rates: Rates) -> None:
+    def _sync_streams(self, line: _ClientBudget, rates: Rates) -> None:
         """A stream that is new to this client begins with everything, or with nothing while there is too much."""
         first = 0 if math.isinf(line.budget) else NOTHING
         line.levels = {stream: line.levels.get(stream, first) for stream in sorted(rates)}
 
-    def _lower(self, line: _Line, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
+    def _lower_levels(self, line: _ClientBudget, rates: Rates, bytes_per_s: float, reason: str, now_ns: int) -> None:
         if now_ns - line.climbed_ns <= PROBE_NS:
-            line.failed = min(line.failed, cost(rates, line.levels))
+            line.failed = min(line.failed, compute_cost(rates, line.levels))
             line.climb_ns = min(2 * line.climb_ns, CLIMB_MAX_NS)
-        levels = fit(rates, bytes_per_s)
+        levels = select_levels(rates, bytes_per_s)
         line.levels = {stream: max(level, line.levels[stream]) for stream, level in levels.items()}
         line.budget, line.reason = bytes_per_s, reason
         line.changed_ns = line.lowered_ns = now_ns
         line.blocked, line.late = 0, ""
 
-    def _climb(self, line: _Line, rates: Rates, limit: float, now_ns: int) -> None:
+    def _raise_levels(self, line: _ClientBudget, rates: Rates, limit: float, now_ns: int) -> None:
         calm_ns = now_ns - max(line.changed_ns, line.troubled_ns)
-        present = cost(rates, line.levels)
+        present = compute_cost(rates, line.levels)
         if present >= SAME * line.failed and calm_ns > PROBE_NS:
             line.failed, line.climb_ns = math.inf, CLIMB_NS  # it works now
         if math.isinf(line.budget) and not any(line.levels.values()):
             return
-        better = [levels for levels in reversed(ladder(rates)) if cost(rates, levels) > present]
-        wanted = cost(rates, better[0]) if better else present
+        better = [levels for levels in reversed(build_ladder(rates)) if compute_cost(rates, levels) > present]
+        wanted = compute_cost(rates, better[0]) if better else present
         if wanted > limit or calm_ns < (line.climb_ns if wanted >= SAME * line.failed else CLIMB_NS):
             return
         # Where nothing costs more, what is left to give is given.

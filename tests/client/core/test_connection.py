@@ -51,7 +51,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-from iris_session.protocol.session_mirror import Missed
+from iris_session.protocol.session_mirror import MissedEvents
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -350,8 +350,12 @@ def test_gap_in_events_asks_for_a_snapshot_again_until_it_comes(wire: Wire) -> N
     assert 4 <= asked <= 7
     wire.snapshot(now, event_seq=2)
     assert wire.connection.mirror.event_seq == 3
-    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
-    assert told == [1, Missed(2, 2), 3]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 2), 3]
 
 
 def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> None:
@@ -359,12 +363,16 @@ def test_a_snapshot_that_runs_ahead_says_which_events_are_missed(wire: Wire) -> 
     wire.join()
     wire.get(Event(1, 0, 0, Notice("info", "x")), MS)
     wire.snapshot(2 * MS, event_seq=1)
-    assert not [m for m in wire.connection.inbox if isinstance(m, Missed)], "none is missed"
+    assert not [m for m in wire.connection.inbox if isinstance(m, MissedEvents)], "none is missed"
     wire.snapshot(3 * MS, event_seq=7)
     wire.get(Event(8, 0, 0, Notice("info", "y")), 4 * MS)
     assert wire.connection.mirror.gaps == 0
-    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
-    assert told == [1, Missed(2, 7), 8]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 7), 8]
 
 
 def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
@@ -374,7 +382,7 @@ def test_inbox_is_bounded_and_says_what_it_dropped(wire: Wire) -> None:
     assert len(wire.connection.inbox) == MAX_INBOX
     assert wire.connection.counters.inbox_dropped == 11
     first, second = wire.connection.inbox[0], wire.connection.inbox[1]
-    assert first == Missed(1, 11), "and the application is told"
+    assert first == MissedEvents(1, 11), "and the application is told"
     assert isinstance(second, Event)
     assert second.event_seq == 12
 
@@ -384,8 +392,12 @@ def test_events_held_while_a_snapshot_came_are_handed_out_and_not_told_as_missed
     for seq in (1, 3, 5, 6):
         wire.get(Event(seq, 0, 0, Notice("info", "x")), MS)
     wire.snapshot(2 * MS, event_seq=5)
-    told = [e if isinstance(e, Missed) else e.event_seq for e in wire.connection.inbox if isinstance(e, Event | Missed)]
-    assert told == [1, Missed(2, 2), 3, Missed(4, 4), 5, 6]
+    told = [
+        e if isinstance(e, MissedEvents) else e.event_seq
+        for e in wire.connection.inbox
+        if isinstance(e, Event | MissedEvents)
+    ]
+    assert told == [1, MissedEvents(2, 2), 3, MissedEvents(4, 4), 5, 6]
 
 
 @pytest.mark.parametrize("data", [b"", b"12345678", b"\0" * (3 * 56)])

@@ -1,0 +1,351 @@
+"""What the benchmarks of a session share: a session in this process, clients in others, one measured window.
+
+Clients join directly, or over a bad link: then the proxy of `emulator.impairment` runs too, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import msgspec
+import mujoco
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from iris_session.bench.clients import ClientJob, Job
+from iris_session.bench.report import BenchError
+from iris_session.netsim.process import ImpairmentProcess
+from iris_session.netsim.session_link import link_address, links_before
+from iris_session.physics import PacerStats
+from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.server_messages import StateHeader
+from iris_session.session.config import SessionConfig
+from iris_session.session.session import Session
+from iris_session.system.process import PIPE, ChildProcess
+
+#: The bars are stated for at most four clients in one process.
+CLIENTS_PER_PROCESS: Final = 4
+WARM_UP_S: Final = 3.0
+CLIENTS: Final = "iris_session.bench.clients"
+Log = dict[str, NDArray[Any]]
+
+
+Group = tuple[ClientJob, ...]  # the clients of one process
+
+
+def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
+    """`specs` in processes of at most `CLIENTS_PER_PROCESS`."""
+    return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
+
+
+def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
+    """Each of `specs` on a link of its own, and the profile by link; as they are when `profile` is empty."""
+    if not profile:
+        return list(specs), {}
+    placed = [msgspec.structs.replace(spec, link=link_address(i)) for i, spec in enumerate(specs)]
+    return placed, dict.fromkeys((spec.link for spec in placed), profile)
+
+
+@dataclass
+class Measurement:
+    """One window, from session time `begin_ns` on.
+
+    `truth`: poses by tick as the authority had them. `received`: (connection, device, seq) ->
+    session time of receipt. `logs`: by client name. `late_causes`: late ticks of its last ten seconds."""
+
+    seconds: float
+    stats: PacerStats
+    cpu_share: float
+    logs: dict[str, Log]
+    scheduling: str
+    truth: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    received: dict[tuple[int, str], list[tuple[int, int]]] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    connections: dict[str, int] = field(default_factory=dict)
+    drops: dict[str, int] = field(default_factory=dict)
+    late_causes: dict[str, int] = field(default_factory=dict)
+    begin_ns: int = 0
+
+
+class ClientProcess:
+    """The clients of one group. `module`: what they run."""
+
+    def __init__(self, job: Job, module: str = CLIENTS) -> None:
+        self.job = job
+        self._process = ChildProcess(module, stdout=PIPE)
+        self._process.write(msgspec.json.encode(job) + b"\n")
+
+    def is_ready(self) -> bool:
+        """True once its clients have joined. Raises when it died."""
+        if not self._process.is_running:
+            raise BenchError(f"a client process ended with status {self._process.exit_status} before it was ready")
+        return b"ready" in self._process.read_available_lines()
+
+    def set_window(self, begin_ns: int, end_ns: int) -> None:
+        self._process.write(f"{begin_ns} {end_ns}\n".encode())
+
+    def read_result(self) -> dict[str, Log]:
+        """The logs by client name, once the process has ended."""
+        if self._process.wait(60.0) != 0:
+            raise BenchError(f"a client process failed with status {self._process.exit_status}")
+        with np.load(self.job.log) as columns:
+            logs: dict[str, Log] = {}
+            for key in columns.files:
+                name, column = key.rsplit(".", 1)
+                logs.setdefault(name, {})[column] = columns[key]
+        return logs
+
+    @property
+    def running(self) -> bool:
+        return self._process.is_running
+
+    def send_signal(self, number: int) -> None:
+        """Stops or continues the process, for example."""
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        self._process.close()
+
+
+@dataclass
+class BenchRun:
+    """What an action of `measure` acts on. `processes`: by the name of each of their clients."""
+
+    session: Session
+    processes: list[ClientProcess]
+    by_client: dict[str, ClientProcess]
+    proxy: ImpairmentProcess | None
+
+
+#: Seconds after the beginning of the window, and what happens then; it must be quick.
+Action = tuple[float, Callable[[BenchRun], None]]
+
+
+def measure(
+    model: mujoco.MjModel,
+    groups: Sequence[Group],
+    seconds: float,
+    *,
+    links: Mapping[str, str] = MappingProxyType({}),
+    seed: int = 0,
+    actions: Sequence[Action] = (),
+    keep_poses: bool = False,
+    curve: bool = False,
+    assets: bool | Path = False,
+    module: str = CLIENTS,
+    make_job: Callable[..., Job] = Job,
+    on_tick: Callable[[Session], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Measurement:
+    """Runs a session over `model` with the clients of `groups` and measures `seconds` of it, warm-up excluded.
+
+    `links`: profile by address, `seed` is of their weather. `actions`: in the order of their times. `assets`: the store
+    of those of the scene; False: clients get poses only. `module` and `make_job`: what other clients run, and their
+    jobs. `beside`: what the loop does after every tick, warm-up included.
+    """
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
+        keys = _create_keys(folder) if curve else None
+        config = SessionConfig(
+            name="bench",
+            control_port=0,
+            state_port=0,
+            record=False,
+            assets=assets,
+            curve_key="" if keys is None else keys["server_file"],
+            curve_clients="" if keys is None else str(folder / "clients"),
+        )
+        session = stack.enter_context(Session(model, config=config))
+        proxy = stack.enter_context(links_before(session, links, seed)) if links else None
+        arena = BenchRun(session, [], {}, proxy)
+        for i, group in enumerate(groups):
+            job = make_job(
+                session.address,
+                session.origin_ns,
+                str(folder / f"log{i}.npz"),
+                group,
+                keep_poses,
+                **({} if keys is None else {k: keys[k] for k in ("server_public", "public", "secret")}),
+            )
+            process = ClientProcess(job, module)
+            stack.callback(process.kill)
+            arena.processes.append(process)
+            arena.by_client.update((spec.name, process) for spec in group)
+        return _run_session(arena, seconds, actions, on_tick, keep_poses, progress)
+
+
+def _run_session(
+    arena: BenchRun,
+    seconds: float,
+    actions: Sequence[Action],
+    on_tick: Callable[[Session], None],
+    keep_poses: bool,
+    progress: Callable[[str], None],
+) -> Measurement:
+    session, processes = arena.session, arena.processes
+    waiting = list(processes)
+    progress(f"waiting for {len(processes)} client processes")
+    session.run(seconds=60.0, until=_limit_rate(0.05, session.clock, lambda: _are_all_ready(waiting)))
+    _raise_if_stopped(session)
+    if waiting:
+        raise BenchError("the clients did not join within 60 s")
+    progress(f"warm-up, then measuring {seconds:g} s")
+    truth: dict[int, NDArray[np.float64]] = {}
+    received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    if keep_poses:
+        session.stepper.on_state = lambda header, poses: _store_poses(truth, header, poses)
+    session.stepper.on_entries = lambda entries: _store_receipts(received, entries)
+    connections, names = dict(session.stepper.ledger.connections), session.stepper.ledger.names()
+    begin = session.clock() + round(WARM_UP_S * 1e9)
+    end = begin + round(seconds * 1e9)
+    for process in processes:
+        process.set_window(begin, end)
+    restart = [] if arena.proxy is None else [(0.0, _start_profiles)]
+    meter = _Meter(session, begin, end)
+    script = _Schedule(arena, begin, [*restart, *actions])
+
+    def until() -> bool:
+        on_tick(session)
+        return script.run_due() or meter.is_window_over()
+
+    session.run(until=until)
+    _raise_if_stopped(session)
+    stats, cpu_share = meter.result()
+    session.run(seconds=30.0, until=_limit_rate(0.05, session.clock, lambda: not any(p.running for p in processes)))
+    _raise_if_stopped(session)
+    received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
+    logs = {name: log for process in processes for name, log in process.read_result().items()}
+    status = session.status()
+    ledger = session.stepper.ledger
+    return Measurement(
+        seconds,
+        stats,
+        cpu_share,
+        logs,
+        status.scheduling,
+        truth,
+        received,
+        {"/".join(key): count for key, count in ledger.rejected.items()},
+        {names[p]: c for c, p in connections.items()},
+        status.drops,
+        meter.late_causes,
+        begin,
+    )
+
+
+def _raise_if_stopped(session: Session) -> None:
+    """Ctrl-C ends a session in order; a benchmark then has no result."""
+    if session.stopping:
+        raise KeyboardInterrupt
+
+
+def _start_profiles(arena: BenchRun) -> None:
+    """The moments of a profile count from the beginning of the window."""
+    assert arena.proxy is not None
+    arena.proxy.post("start")
+
+
+class _Schedule:
+    """Does what is to happen during the window, each thing once."""
+
+    def __init__(self, arena: BenchRun, begin_ns: int, actions: Sequence[Action]) -> None:
+        self._arena = arena
+        self._actions = [(begin_ns + round(at_s * 1e9), action) for at_s, action in actions]
+
+    def run_due(self) -> bool:
+        """Does what is due; never true."""
+        while self._actions and self._arena.session.clock() >= self._actions[0][0]:
+            self._actions.pop(0)[1](self._arena)
+        return False
+
+
+class _Meter:
+    """Reads lateness and processor time at both ends of the window, inside the one run that holds it."""
+
+    def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
+        self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
+        self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
+        self._readings: list[tuple[PacerStats, float]] = []
+        self.late_causes: dict[str, int] = {}
+
+    def is_window_over(self) -> bool:
+        """Whether the window is over; for `Session.run(until=...)`."""
+        now = self._session.clock()
+        if now >= (self._end_ns if self._readings else self._begin_ns):
+            times = self._session.processes.reporter.times
+            self.late_causes = {} if times is None else times.late_causes()
+            stats = self._session.lateness(anew=not self._readings)
+            assert stats is not None
+            self._readings.append((stats, sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)))
+        return len(self._readings) == 2
+
+    def result(self) -> tuple[PacerStats, float]:
+        """Ticks of the window, and CPU of authority and front as a share of one core."""
+        if len(self._readings) < 2:
+            raise BenchError("the session ended before the window was over")
+        (before, cpu0), (after, cpu1) = self._readings
+        ticks, late = after.ticks - before.ticks, after.late - before.late
+        stats = after._replace(
+            ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
+        )
+        return stats, (cpu1 - cpu0) / ((self._end_ns - self._begin_ns) * 1e-9)
+
+
+def _are_all_ready(waiting: list[ClientProcess]) -> bool:
+    waiting[:] = [process for process in waiting if not process.is_ready()]
+    return not waiting
+
+
+def _limit_rate(period_s: float, clock: Callable[[], int], check: Callable[[], bool]) -> Callable[[], bool]:
+    """`check` at most every `period_s`: it must not disturb the ticks that are measured."""
+    due = 0
+
+    def until() -> bool:
+        nonlocal due
+        now = clock()
+        if now < due:
+            return False
+        due = now + round(period_s * 1e9)
+        return check()
+
+    return until
+
+
+def _store_poses(truth: dict[int, NDArray[np.float64]], header: StateHeader, poses: NDArray[np.float64]) -> None:
+    truth[header.tick] = poses.copy()
+
+
+def _store_receipts(received: dict[tuple[int, str], list[tuple[int, int]]], entries: Sequence[Entry]) -> None:
+    for entry in entries:
+        if isinstance(entry.message, Sample):
+            key = (entry.connection, entry.message.device)
+            received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
+
+
+def _create_keys(folder: Path) -> dict[str, str]:
+    """A server and a client certificate in `folder`, as an installation would have them."""
+    import zmq.auth
+
+    (folder / "clients").mkdir()
+    _, server_secret = zmq.auth.create_certificates(folder, "server")
+    client_public, client_secret = zmq.auth.create_certificates(folder, "client")
+    Path(client_public).rename(folder / "clients" / "client.key")
+    os.chmod(server_secret, 0o600)
+    server_public, _ = zmq.auth.load_certificate(server_secret)
+    public, secret = zmq.auth.load_certificate(client_secret)
+    assert secret is not None
+    return {
+        "server_file": server_secret,
+        "server_public": server_public.decode(),
+        "public": public.decode(),
+        "secret": secret.decode(),
+    }

@@ -1,0 +1,110 @@
+"""The one form in which every benchmark reports: parameters, results, bars, the machine."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+from importlib.metadata import version
+from typing import Any, Final
+
+import msgspec
+
+VERSION: Final = 1
+#: Parameter `bars` of a benchmark over an impaired link.
+NO_BARS: Final = "none: the figures include the link"
+_OPERATORS: Final = {
+    "<=": lambda value, bound: value <= bound,
+    ">=": lambda value, bound: value >= bound,
+    "<": lambda value, bound: value < bound,
+}
+
+
+class BenchError(Exception):
+    """A benchmark that gives no figures: one line for the person who started it."""
+
+
+class Bar(msgspec.Struct, frozen=True):
+    """A bound that a result must keep. `ok` is false for a value that is not a number."""
+
+    key: str
+    op: str
+    bound: float
+    value: float
+    ok: bool
+
+
+def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
+    """The bar `results[key] op bound`; a dotted key is that of an object within the results."""
+    value = float(flatten(results)[key] if "." in key else results[key])
+    return Bar(key, op, bound, value, bool(_OPERATORS[op](value, bound)))
+
+
+class BenchReport(msgspec.Struct, frozen=True):
+    """What `iris-session bench NAME --json` prints."""
+
+    name: str
+    params: dict[str, Any]
+    results: dict[str, Any]
+    bars: tuple[Bar, ...]
+    reference: dict[str, float] | None = None
+    version: int = VERSION
+
+    @property
+    def ok(self) -> bool:
+        return all(b.ok for b in self.bars)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON object of the contract. What never came (an infinite age) is null: JSON has no infinity."""
+        return {
+            "name": self.name,
+            "version": self.version,
+            "machine": describe_machine(),
+            "params": self.params,
+            "results": _replace_infinite(self.results),
+            "reference": self.reference,
+            "bars": [{**msgspec.to_builtins(b), "value": _replace_infinite(b.value)} for b in self.bars],
+        }
+
+    def format(self) -> str:
+        """The same for people."""
+        nested = any("." in b.key for b in self.bars)
+        results = flatten(self.results) if nested else self.results
+        width = max(map(len, results))
+        rows = [f"{self.name}: {' '.join(f'{k}={v}' for k, v in self.params.items())}"]
+        for key, value in results.items():
+            held = [f"   bar {b.op} {b.bound:g}  {'ok' if b.ok else 'MISSED'}" for b in self.bars if b.key == key]
+            note = "".join(held)
+            rows.append(f"  {key:<{width}}  {value}{note}")
+        if self.reference:
+            rows.append("reference, in the same run:")
+            rows += [f"  {key:<{width}}  {value}" for key, value in self.reference.items()]
+        return "\n".join(rows)
+
+
+def flatten(results: dict[str, Any]) -> dict[str, Any]:
+    """Objects within the results as dotted keys."""
+    out: dict[str, Any] = {}
+    for key, value in results.items():
+        if isinstance(value, dict):
+            out |= {f"{key}.{inner}": one for inner, one in value.items()}
+        else:
+            out[key] = value
+    return out
+
+
+def _replace_infinite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _replace_infinite(one) for key, one in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def describe_machine() -> dict[str, Any]:
+    """The machine as the contract names it."""
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "cpus": os.cpu_count(),
+        "memory_gb": round(pages / 2**30, 1),
+        "python": platform.python_version(),
+        "mujoco": version("mujoco"),
+    }

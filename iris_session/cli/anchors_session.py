@@ -1,0 +1,689 @@
+"""`iris-session anchors status`, `align`, `place`, `move` and `solve`: alignment in running and recorded sessions."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from iris_session.cli.common import (
+    CommandError,
+    add_address_options,
+    add_json_option,
+    add_pose_option,
+    check_session_reachable,
+    pose_to_dict,
+    print_json,
+    to_printable,
+)
+from iris_session.cli.status import add_watch_options, open_status, watch_status
+from iris_session.doctor.headset_checks import is_consistent
+from iris_session.protocol.names import AlignAction, AlignmentKind
+
+if TYPE_CHECKING:
+    from anchors.constellation import Constellation
+    from anchors.pose import PoseTuple
+    from iris_session.alignment.resolve import Compared, Relative, Result
+    from iris_session.client import Client
+    from iris_session.protocol.server_messages import ParticipantInfo
+    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
+    from iris_session.recording import Looks, Person, Recording
+
+
+ALL_PARTICIPANTS: Final = "all"
+#: Sheets that are told of per headset, those seen last first.
+MAX_LISTED_SHEETS: Final = 8
+
+
+def register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "status",
+        help="how well the headsets of a running session are aligned",
+        description="Joins as an observer, asks, and prints for every headset what its alignment rests on, then the "
+        "anchors, and how far apart pairs of headsets put the same thing.",
+        epilog="examples:\n"
+        "  iris-session anchors status\n"
+        "  iris-session anchors status 192.168.1.20 --watch\n"
+        "  iris-session anchors status --json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_address_options(one)
+    add_watch_options(one, one)
+    add_json_option(one)
+    one.set_defaults(run=run_status)
+
+
+def register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "align",
+        help="start or stop measuring the alignment of headsets",
+        description="`start` measures anew, from nothing; `stop` keeps what is in force, whatever is seen from then "
+        "on. Until there is a better one the present alignment stays. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors align start                   everybody with a headset\n"
+        "  iris-session anchors align start ann\n"
+        "  iris-session anchors align stop p3 --address 192.168.1.20",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("what", choices=sorted(AlignAction.ALL))
+    one.add_argument(
+        "participant",
+        nargs="?",
+        default=ALL_PARTICIPANTS,
+        metavar="PARTICIPANT",
+        help="name or id, or `all` (%(default)s)",
+    )
+    add_address_options(one, option=True)
+    add_json_option(one)
+    one.set_defaults(run=run_align)
+
+
+def register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "place",
+        help="align a headset by hand",
+        description="Says where the tracking frame of a headset is, T_world_tracking, or with --offset by how much the "
+        "measured one is to be moved, which voids its stated error. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors place ann --pose 0.4,0,0,1,0,0,0\n"
+        "  iris-session anchors place ann --offset --pose -0.01,0,0,1,0,0,0",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("participant", metavar="PARTICIPANT", help="name or id")
+    add_pose_option(one, "T_world_tracking, or the offset in the world")
+    one.add_argument("--offset", action="store_true", help="on top of the measured alignment")
+    add_address_options(one, option=True)
+    add_json_option(one)
+    one.set_defaults(run=run_place)
+
+
+def register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "move",
+        help="say where an anchor of the session is",
+        description="Changes T_world_anchor: the shared scene moves for everybody who is aligned to that anchor by "
+        "what is measured. Further than 5 m only with --force. Joins as a director.",
+        epilog="examples:\n"
+        "  iris-session anchors move table --pose 0,-0.45,0,1,0,0,0\n"
+        "  iris-session anchors move table --pose -0.2,0.1,0,0.7071068,0,0,0.7071068",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument("anchor", metavar="ANCHOR", help="id of the anchor, see `anchors status`")
+    add_pose_option(one, "T_world_anchor")
+    one.add_argument("--force", action="store_true", help="also further than 5 m from where it is")
+    add_address_options(one, option=True)
+    add_json_option(one)
+    one.set_defaults(run=run_move)
+
+
+# --- what a director says ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def join_as_director(arguments: argparse.Namespace) -> Iterator[Client]:
+    """A director in the session that is meant."""
+    from iris_session.client import Client
+
+    check_session_reachable(arguments)
+    with Client(
+        arguments.address,
+        session=arguments.session,
+        join_code=arguments.code,
+        role="director",
+        name="anchors",
+        alignment=AlignmentKind.NOT_NEEDED,
+    ) as client:
+        yield client
+
+
+def run_align(arguments: argparse.Namespace) -> int:
+    """Exit status 1 when it was denied for one of several."""
+    from iris_session.client import DeniedError
+
+    done: list[dict[str, Any]] = []
+    with join_as_director(arguments) as client:
+        people = select_participants(client, arguments.participant)
+        for person in people:
+            denied = ""
+            try:
+                client.align(arguments.what, person.id)
+            except DeniedError as error:
+                if len(people) == 1:
+                    raise
+                denied = str(error)
+            done.append({"id": person.id, "name": person.name, "denied": denied})
+    ok = not any(one["denied"] for one in done)
+    if arguments.json:
+        print_json({"ok": ok, "action": arguments.what, "participants": done})
+        return 0 if ok else 1
+    word = "started: look at the sheets" if arguments.what == AlignAction.START else "stopped: the alignment stays"
+    for one in done:
+        print(to_printable(f"{one['name']} ({one['id']}): {one['denied'] or word}"))
+    return 0 if ok else 1
+
+
+def run_place(arguments: argparse.Namespace) -> int:
+    with join_as_director(arguments) as client:
+        (one,) = select_participants(client, arguments.participant, allow_all=False)
+        client.place_alignment(one.id, arguments.pose, offset=arguments.offset)
+    if arguments.json:
+        print_json({"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset})
+    else:
+        print(to_printable(f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"))
+    return 0
+
+
+def run_move(arguments: argparse.Namespace) -> int:
+    """Whoever is not measured, or no more, is told of: their alignments stay."""
+    from anchors.pose import distance
+
+    with join_as_director(arguments) as client:
+        report = client.status()
+        was = next((one.T_world_anchor.p for one in report.anchors if one.anchor_id == arguments.anchor), None)
+        away_m = 0.0 if was is None else distance(was, arguments.pose[0])  # one that is not known is denied
+        client.move_anchor(arguments.anchor, arguments.pose, force=arguments.force)
+    aligned = [p for p in list_headsets(report) if p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)]
+    stay = {
+        p.id: f"{p.name} ({p.id}): {why}" for p in aligned if (why := explain_unaffected_alignment(p, arguments.anchor))
+    }
+    follow = [p for p in aligned if p.id not in stay]
+    if arguments.json:
+        ids = {"follow": [p.id for p in follow], "stay": list(stay)}
+        print_json({"ok": True, "anchor": arguments.anchor, "moved_m": away_m, **ids})
+        return 0
+    by = "turned" if away_m == 0.0 else f"moved by {away_m * 1e3:.0f} mm"
+    print(to_printable(f"anchor '{arguments.anchor}' {by}: alignments that are measured to it follow ({len(follow)})"))
+    for line in stay.values():
+        print(to_printable(f"    not that of {line}"))
+    return 0
+
+
+def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
+    """Why an alignment does not follow an anchor that is moved; empty: it does."""
+    r = p.alignment_report
+    if r is not None and not r.running:
+        return f"its run is stopped; `iris-session anchors align start {p.id}`"
+    if p.alignment == AlignmentKind.PLACED:
+        return f"a director placed it; `iris-session anchors align start {p.id}` measures it"
+    if r is None or not p.connected or anchor not in {one.anchor_id for one in r.seen}:
+        return f"it has not looked at '{anchor}' since it came; it follows when it does"
+    return ""
+
+
+def select_participants(client: Client, name: str, *, allow_all: bool = True) -> list[ParticipantInfo]:
+    """Who is meant by an id, a name, or `all`. Raises `CommandError` that lists who could be."""
+    people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
+    headsets = [one for one in people if one.alignment is None or one.alignment.kind != AlignmentKind.NOT_NEEDED]
+    there = ", ".join(f"{one.name} ({one.id})" for one in headsets) or "nobody"
+    found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
+    if not found and name == ALL_PARTICIPANTS and allow_all:
+        found = [one for one in headsets if one.connected]
+        if not found:
+            raise CommandError("nobody in this session has a headset that is aligned", status=1)
+        return found
+    if not found:
+        raise CommandError(to_printable(f"no participant is called '{name}'; with a headset: {there}"))
+    if len(found) > 1:
+        ids = ", ".join(f"{one.id} ({one.role}{'' if one.connected else ', lost'})" for one in found)
+        raise CommandError(to_printable(f"{len(found)} participants are called '{name}', give an id: {ids}"))
+    return found
+
+
+# --- how it stands ----------------------------------------------------------------------------------------------------
+
+
+def run_status(arguments: argparse.Namespace) -> int:
+    """Prints the alignment of everybody; with --watch until Ctrl-C."""
+    with open_status(arguments) as (client, report):
+        if arguments.watch:
+            return watch_status(client, arguments.period, print_alignment_status, as_json=arguments.json)
+        print_alignment_status(report, as_json=arguments.json)
+    return 0
+
+
+def print_alignment_status(report: StatusReport, *, as_json: bool) -> None:
+    if as_json:
+        print_json(to_dict(report))
+    else:
+        print("\n".join(format_alignment_status(report)), flush=True)
+
+
+def list_headsets(report: StatusReport) -> list[ParticipantReport]:
+    """Those who are, or are to be, aligned."""
+    return [p for p in report.participants if p.alignment != AlignmentKind.NOT_NEEDED]
+
+
+def to_dict(report: StatusReport) -> dict[str, Any]:
+    """For `--json`: fields as in `StatusReport`."""
+    import msgspec
+
+    kept = ("id", "name", "role", "connected", "tracking_epoch", "alignment", "alignment_age_ns", "alignment_void_ns")
+    people = [
+        {**{name: getattr(p, name) for name in kept}, "alignment_report": msgspec.to_builtins(p.alignment_report)}
+        for p in list_headsets(report)
+    ]
+    checks = [{**msgspec.to_builtins(one), "as_expected": is_consistent(one)} for one in report.cross_checks]
+    return {
+        "session": report.session_name,
+        "session_time": report.session_time,
+        "participants": people,
+        "anchors": msgspec.to_builtins(report.anchors),
+        "cross_checks": checks,
+    }
+
+
+def format_alignment_status(report: StatusReport) -> list[str]:
+    """One screen of printable lines."""
+    return [to_printable(line) for line in _format_lines(report)]
+
+
+def _format_lines(report: StatusReport) -> Iterator[str]:
+    people = list_headsets(report)
+    still = f"  STANDS STILL since {report.authority_silent_ns * 1e-9:.1f} s" if report.stalled else ""
+    yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
+    yield ""
+    yield (
+        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
+        f"{'looks':>6s} {'places':>6s} {'tilt':>8s}  correction"
+    )
+    for p in people:
+        yield from _format_headset(p)
+    yield ""
+    for anchor in report.anchors:
+        x, y, z = anchor.T_world_anchor.p
+        q = ",".join(f"{c:.5g}" for c in anchor.T_world_anchor.q)
+        size = f", {anchor.size_m * 1e3:.0f} mm" if anchor.size_m > 0.0 else ""
+        yield f"anchor '{anchor.anchor_id}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {q}{size}"
+    if not report.anchors:
+        yield "this session has no anchors"
+    names = {p.id: p.name for p in report.participants}
+    for check in report.cross_checks:
+        yield _format_cross_check(check, names)
+
+
+def _format_headset(p: ParticipantReport) -> Iterator[str]:
+    r = p.alignment_report
+    name = f"{p.name} ({p.id})" if p.connected else f"{p.name} LOST {p.lost}"
+    if r is None:
+        yield f"{name:20.20s} {p.alignment:16.16s}"
+        return
+    kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
+    aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED)
+    stated = aligned and p.alignment == AlignmentKind.MEASURED and not r.offset
+    at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
+    yield (
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
+        f"{format_pending_correction(r)}"
+    )
+    if not aligned and p.alignment_void_ns >= 0:
+        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
+    seen = sorted(r.seen, key=lambda one: one.age_ns)
+    if seen:
+        told = [
+            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
+            for one in seen[:MAX_LISTED_SHEETS]
+        ]
+        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
+        unusable = f"; {r.unusable} of no use" if r.unusable else ""
+        yield f"    saw {'; '.join(told)}{more}{unusable}"
+    elif r.unusable:
+        yield f"    saw nothing of use, {r.unusable} times"
+    if r.alarm:
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
+    if r.advice:
+        yield f"    advice: {r.advice}"
+
+
+def format_pending_correction(r: AlignmentReport) -> str:
+    """A correction that waits or slides in."""
+    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
+        return "-"
+    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
+
+
+def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
+    a, b = (f"{names[one]} ({one})" if one in names else one for one in (check.a, check.b))
+    verdict = "" if is_consistent(check) else "  TOO FAR APART"
+    return (
+        f"{a} - {b}: {check.error_m * 1e3:.1f} mm, {degrees(check.error_rad):.2f} deg apart at '{check.anchor_id}', "
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {check.n} looks, "
+        f"{format_duration(check.age_ns)} ago{verdict}"
+    )
+
+
+def format_duration(duration_ns: int) -> str:
+    """How long ago, as people say it."""
+    seconds = duration_ns * 1e-9
+    if seconds < 0.0:
+        return "never"
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
+
+
+# --- solve ------------------------------------------------------------------------------------------------------------
+
+
+#: Lines about alignments and outliers per tracking frame; `--json` has all.
+MAX_LISTED: Final = 12
+
+
+def register_solve(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    one = actions.add_parser(
+        "solve",
+        help="solve the alignments of a recording again, and where its sheets lie",
+        description="Reads every observation of a recording and solves alignments again, with what was seen before and "
+        "after each moment: how far off was each alignment that was in force, which looks contradict it, which sheets "
+        "were moved. With two or more sheets also where they lie to each other, as a file for `serve --anchors`.",
+        epilog="examples:\n"
+        "  iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd\n"
+        "  iris-session anchors solve session.rrd --anchors anchors.toml --json\n"
+        "  iris-session anchors solve session.rrd --out anchors.toml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    one.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="a .rrd file; later parts are found by their names"
+    )
+    one.add_argument(
+        "--anchors", type=Path, metavar="TOML", help="where the anchors really were (default: as the session had them)"
+    )
+    one.add_argument("--out", type=Path, metavar="FILE", help="write where the sheets lie, for `serve --anchors`")
+    add_json_option(one)
+    one.set_defaults(run=run_solve)
+
+
+def run_solve(arguments: argparse.Namespace) -> int:
+    """Exit status 1 when `--out` was asked for and nothing can be written."""
+    from iris_session.alignment.resolve import constellation
+    from iris_session.alignment.smoother import Anchors
+    from iris_session.recording import Recording, read_looks
+    from iris_session.session.anchors_file import load_anchors
+
+    given = None if arguments.anchors is None else load_anchors(arguments.anchors)
+    with Recording.open(arguments.recording, warn=False) as recording:
+        looks = read_looks(recording, make_progress_printer("reading"))
+        saved = _load_reference_anchors(recording, given)
+        anchors = Anchors(looks, dict(saved.anchors), given)
+        results = _resolve_frames(looks, anchors, saved.sizes)
+        relative = constellation(looks, _replace_anchors(saved, anchors.last))
+        damage = recording.damage + recording.missing
+    wanted = arguments.out is not None
+    written = _write_constellation(arguments.out, relative) if wanted and relative.solved is not None else ""
+    if arguments.json:
+        print_json(solution_to_dict(str(arguments.recording), looks, results, relative, damage, written))
+    else:
+        for line in format_solution(looks, results, relative, damage):
+            print(to_printable(line))
+        if written:
+            print(f"written: {written}    use it: iris-session serve SCENE --anchors {written}")
+    if wanted and not written:  # after what was found out all the same
+        raise CommandError(f"{arguments.out} is not written: {relative.advice}", status=1)
+    return 0
+
+
+def make_progress_printer(what: str) -> Callable[[int, int], None] | None:
+    """Shows how far it is, on a terminal."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(done: int, total: int) -> None:
+        end = "" if done < total else "\n"
+        print(f"\r{what}: {done} of {total}", end=end, file=sys.stderr, flush=True)
+
+    return show
+
+
+def _load_reference_anchors(recording: Recording, given: Constellation | None) -> Constellation:
+    """Where the anchors ought to be: the file, else as the session had them when it began."""
+    from anchors.constellation import Constellation
+
+    if given is not None:
+        return given
+    header = recording.header
+    places: dict[str, PoseTuple] = {name: (pose.p, pose.q) for name, pose in header.anchors.items()}
+    sizes = {} if header.settings is None else dict(header.settings.anchor_sizes)
+    return Constellation(next(iter(places), ""), places, {}, sizes)
+
+
+def _replace_anchors(saved: Constellation, anchors: dict[str, PoseTuple]) -> Constellation:
+    from anchors.constellation import Constellation
+
+    return Constellation(saved.reference, anchors, saved.error_m, saved.sizes)
+
+
+def _resolve_frames(looks: Looks, anchors: Any, sizes: dict[str, float]) -> list[Result]:
+    from iris_session.alignment.resolve import resolve
+
+    by_frame = {frame: [one for one in looks.in_force if one.frame == frame] for frame in looks.looks}
+    total = sum(map(len, by_frame.values()))
+    show, done = make_progress_printer("solving"), 0
+    results = []
+
+    def told() -> None:
+        nonlocal done
+        done += 1
+        if show is not None:
+            show(done, total)
+
+    for frame, every in looks.looks.items():
+        results.append(resolve(frame, every, by_frame[frame], anchors, sizes, told))
+    return results
+
+
+def _write_constellation(path: Path, relative: Relative) -> str:
+    """The constellation as a file for `serve --anchors`."""
+    assert relative.solved is not None
+    try:
+        path.write_text(relative.solved.constellation.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
+    return str(path)
+
+
+# --- as text ----------------------------------------------------------------------------------------------------------
+
+
+def format_solution(looks: Looks, results: list[Result], relative: Relative, damage: list[str]) -> Iterator[str]:
+    """Everybody who was to be aligned, then the sheets, then what could not be read."""
+    wearers = [one for one in looks.people.values() if one.aligned]
+    if not wearers:
+        yield "nobody in this recording had a headset to be aligned"
+    for person in wearers:
+        own = [one for one in results if one.frame.participant == person.id]
+        if not own:
+            yield f"{person.name} ({person.id}): no observations"
+        for result in own:
+            yield from _format_frame(person, result)
+    yield from _format_sheets(relative)
+    if looks.unowned:
+        yield f"{looks.unowned} observations over connections whose join is not in this recording"
+    if looks.unreadable:
+        yield f"{looks.unreadable} recorded messages do not decode"
+    yield from (f"damaged: {line}" for line in damage)
+
+
+def _format_frame(person: Person, r: Result) -> Iterator[str]:
+    run = f", run {r.frame.run}" if len(person.runs) > 1 else ""
+    run += f", after jump {r.frame.jumps}" if r.frame.jumps else ""
+    sheets = ", ".join(f"{name} {n}" for name, n in sorted(r.sheets.items()))
+    unused = "".join(f"; {n} {why}" for why, n in r.unused.items())
+    yield (
+        f"{person.name} ({person.id}), tracking epoch {r.frame.tracking_epoch}{run}: {r.looks} looks from "
+        f"{r.viewpoints} places, {r.first_ns * 1e-9:.1f} to {r.last_ns * 1e-9:.1f} s ({sheets}){unused}"
+    )
+    if r.last.refused:
+        yield f"    solved again: refused, {r.last.advice}"
+    else:
+        tilt = math.degrees(r.last.residual_tilt_rad)
+        advice = f"; {r.last.advice}" if r.last.advice else ""
+        yield (
+            f"    solved again: {_format_mm(r.last.error_at_anchor_m)} at the sheet (95 %), tilt {tilt:.1f} deg{advice}"
+        )
+    if 2 * r.unused.get("against gravity", 0) > r.looks:
+        yield "    most looks contradict the vertical: the sheet does not lie as configured (on the table, on a wall?)"
+    yield from _limit_lines(
+        [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
+    )
+    told = [
+        f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} looks: "
+        f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
+        f"95 % expected below {_format_mm(o.expected_p95_m)}"
+        for o in r.outliers
+    ]
+    yield from _limit_lines(told[:MAX_LISTED], len(told), "outliers")
+
+
+def _select_worst(compared: list[Compared]) -> list[Compared]:
+    """The worst of them, in order of time."""
+    kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
+    return sorted(kept, key=lambda one: one.live.since_ns)
+
+
+def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
+    yield from shown
+    if of > len(shown):
+        yield f"    ... {of - len(shown)} more {what}, which --json lists"
+
+
+def _format_comparison(one: Compared) -> str:
+    a, until = one.live.alignment, one.live.until_ns
+    end = "the end" if until < 0 else f"{until * 1e-9:.1f} s"
+    kind = a.kind + (" with offset" if a.offset else "")
+    head = f"    version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
+    if one.off_m is None or one.off_rad is None:
+        return f"{head}: nothing to compare with"
+    stated = "nothing stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"
+    at_end = "" if one.off_end_m is None else f", {_format_mm(one.off_end_m)} at its end"
+    solved = "" if one.solved_m is None else f", solved again {_format_mm(one.solved_m)}"
+    beyond = "  BEYOND WHAT WAS STATED" if one.beyond else ""
+    return f"{head}: {_format_mm(one.off_m)}, {math.degrees(one.off_rad):.2f} deg off{at_end}; {stated}{solved}{beyond}"
+
+
+def _format_sheets(relative: Relative) -> Iterator[str]:
+    if relative.solved is None:
+        yield f"sheets to each other: {relative.advice}"
+        return
+    c = relative.solved.constellation
+    for name in sorted(c.anchors):
+        (x, y, z), q = c.anchors[name]
+        what = "reference" if name == c.reference else f"known to {_format_mm(c.error_m[name])} (95 %)"
+        residual = relative.solved.residuals_m.get(name, 0.0)
+        turned = ",".join(f"{v:.5g}" for v in q)
+        yield (
+            f"sheet '{name}': at {x:.4f}, {y:.4f}, {z:.4f} m, turned {turned}; {what}, "
+            f"looks scatter {_format_mm(residual)}"
+        )
+    for headset, epoch, viewpoint, name in relative.solved.rejected:
+        participant = headset.split(" ")[0]
+        yield f"left out: '{name}' as {participant} saw it from place {viewpoint} in epoch {epoch}, it fits nowhere"
+    for moved in relative.moved:
+        yield (
+            f"MOVED: sheet '{moved.anchor_id}' lies {_format_mm(moved.distance_m)}, "
+            f"{math.degrees(moved.angle_rad):.1f} deg "
+            "from where it ought to, as seen from the others"
+        )
+    if relative.unsaid:
+        yield f"moved sheets: {relative.unsaid}"
+
+
+def _format_mm(metres: float) -> str:
+    return f"{metres * 1e3:.1f} mm"
+
+
+# --- as JSON ----------------------------------------------------------------------------------------------------------
+
+
+def solution_to_dict(
+    path: str, looks: Looks, results: list[Result], relative: Relative, damage: list[str], written: str
+) -> dict[str, Any]:
+    """For `--json`."""
+    people = [
+        {
+            "id": one.id,
+            "name": one.name,
+            "role": one.role,
+            "frames": [_frame_to_dict(r) for r in results if r.frame.participant == one.id],
+        }
+        for one in looks.people.values()
+        if one.aligned
+    ]
+    return {
+        "recording": path,
+        "participants": people,
+        "constellation": _constellation_to_dict(relative),
+        "unowned": looks.unowned,
+        "unreadable": looks.unreadable,
+        "damage": damage,
+        "out": written,
+    }
+
+
+def _frame_to_dict(r: Result) -> dict[str, Any]:
+    return {
+        "run": r.frame.run,
+        "tracking_epoch": r.frame.tracking_epoch,
+        "jumps": r.frame.jumps,
+        "looks": r.looks,
+        "viewpoints": r.viewpoints,
+        "sheets": r.sheets,
+        "first_s": r.first_ns * 1e-9,
+        "last_s": r.last_ns * 1e-9,
+        "unused": r.unused,
+        "refused": r.last.refused,
+        "advice": r.last.advice,
+        "T_world_tracking": None if r.last.refused else pose_to_dict(r.last.T_world_tracking),
+        "error_at_anchor_m": None if r.last.refused else r.last.error_at_anchor_m,
+        "residual_tilt_rad": r.last.residual_tilt_rad,
+        "alignments": [_alignment_to_dict(one) for one in r.compared],
+        "outliers": [
+            {
+                "anchor_id": o.anchor_id,
+                "viewpoint_id": o.viewpoint_id,
+                "looks": o.looks,
+                "off_m": o.off_m,
+                "off_rad": o.off_rad,
+                "expected_p95_m": o.expected_p95_m,
+                "at_s": o.at_ns * 1e-9,
+            }
+            for o in r.outliers
+        ],
+    }
+
+
+def _alignment_to_dict(one: Compared) -> dict[str, Any]:
+    a, until = one.live.alignment, one.live.until_ns
+    return {
+        "version": a.version,
+        "kind": a.kind,
+        "offset": a.offset,
+        "since_s": one.live.since_ns * 1e-9,
+        "until_s": None if until < 0 else until * 1e-9,
+        "off_m": one.off_m,
+        "off_rad": one.off_rad,
+        "off_end_m": one.off_end_m,
+        "stated_m": one.stated_m,
+        "solved_m": one.solved_m,
+        "beyond": one.beyond,
+    }
+
+
+def _constellation_to_dict(relative: Relative) -> dict[str, Any]:
+    if relative.solved is None:
+        return {"advice": relative.advice}
+    c = relative.solved.constellation
+    sheets = {
+        name: {**pose_to_dict(pose), "error_m": c.error_m[name], "residual_m": relative.solved.residuals_m.get(name)}
+        for name, pose in c.anchors.items()
+    }
+    moved = [{"anchor_id": m.anchor_id, "distance_m": m.distance_m, "angle_rad": m.angle_rad} for m in relative.moved]
+    return {
+        "reference": c.reference,
+        "anchors": sheets,
+        "rejected": [list(one) for one in relative.solved.rejected],
+        "moved": moved,
+        "advice": relative.unsaid,
+    }

@@ -1,0 +1,193 @@
+"""All checks in their order: the way, the door, then what the session says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import psutil
+
+from iris_session.client.address import Address
+from iris_session.client.discovery import FoundSession
+from iris_session.client.endpoint_resolver import is_loopback
+from iris_session.client.errors import ClientError
+from iris_session.doctor import join_checks, network_checks, session_checks
+from iris_session.doctor.findings import OK, Findings, failed, ok
+from iris_session.doctor.host_checks import check_host
+from iris_session.protocol.names import Role
+from iris_session.protocol.status import StatusReport
+from iris_session.security import KeyHome, KeysError
+
+LOCAL: Final = "127.0.0.1:7721"
+JOIN_CHECKS: Final = ("server_key", "key", "role", "join")
+STREAM_CHECKS: Final = ("clock", "state")
+SESSION_CHECKS: Final = (
+    "session", "alignment", "alarm", "stale", "align_run", "correction", "agreement", "leases", "robots", "clients",
+    "age", "ticks", "media", "recorder", "disk", "drops",
+)  # fmt: skip
+
+#: As a person asks: is there a way, am I let in, does anything come, how is the session?
+ORDER: Final = (
+    "beacon",
+    "address",
+    "subnet",
+    "tcp",
+    "introduction",
+    "version",
+    "server_key",
+    "key",
+    "code",
+    "role",
+    "join",
+    *STREAM_CHECKS,
+    *SESSION_CHECKS,
+)
+
+
+@dataclass
+class DoctorReport:
+    """`address`: what was looked at, as far as it is known. `report`: what the session said, if it did."""
+
+    address: str = ""
+    findings: Findings = field(default_factory=Findings)
+    report: StatusReport | None = None
+
+    @property
+    def ok(self) -> bool:
+        return self.findings.ok
+
+    def as_dict(self) -> dict[str, object]:
+        """For `--json`."""
+        return {
+            "ok": self.ok,
+            "address": self.address,
+            "checks": self.findings.as_list(),
+            "report": None if self.report is None else msgspec.to_builtins(self.report),
+        }
+
+
+def run_checks(
+    address: str = "",
+    *,
+    session: str = "",
+    code: str = "",
+    role: str = Role.OBSERVER,
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> DoctorReport:
+    """Looks at the session at `address` (or called `session`; neither: that of this user, see `here`). Takes seconds.
+
+    `told` hears what is done next. Nothing is changed there: it joins as `doctor`, and leaves. A `code` is used up.
+    """
+    result = DoctorReport()
+    findings = result.findings
+    try:
+        target = None if session else Address.parse(address or find_default_address())
+    except ClientError as error:
+        findings.add(failed("address", str(error)))
+        findings.skip("tcp", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+        return result
+    on_progress("listening for sessions")
+    heard, found = network_checks.check_beacon(session, target)
+    findings.add(heard)
+    if target is None and not heard.failed:
+        target = Address.parse(next(one.address for one in found if one.name == session))
+    if target is None:
+        findings.skip(
+            "address", "subnet", "tcp", "introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS
+        )
+        return result
+    result.address = str(target)
+    on_progress(f"looking for {target}")
+    if not _check_network(target, findings, found):
+        findings.skip("introduction", "version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+        return result
+    _check_join(result, target, address or str(target), code or target.join_code, role, on_progress)
+    return result
+
+
+def find_default_address() -> str:
+    """Address of the encrypted session that this user serves on this machine, if it is the only one; else that of a
+    session on loopback at the usual port."""
+    try:
+        notes = KeyHome().sessions.read()
+    except KeysError:  # the check `key_home` tells
+        notes = []
+    return str(Address(notes[0].hosts[0], notes[0].control)) if len(notes) == 1 and notes[0].hosts else LOCAL
+
+
+def _check_network(target: Address, findings: Findings, heard: list[FoundSession]) -> bool:
+    named, ip = network_checks.check_address(target)
+    findings.add(named)
+    if not ip:
+        return False
+    findings.add(
+        network_checks.check_subnet(ip),
+        network_checks.mention_heard_sessions(network_checks.check_tcp(target, ip), target, heard),
+    )
+    return not findings["tcp"].failed
+
+
+def _check_join(
+    result: DoctorReport, target: Address, typed: str, code: str, role: str, on_progress: Callable[[str], None]
+) -> None:
+    findings = result.findings
+    introduced, version, said = network_checks.check_introduction(target)
+    base = network_checks.check_port_base(target) if introduced.state != OK else None
+    if base is not None:
+        findings.add(base)
+        findings.skip("version", *JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+        return
+    findings.add(introduced, version)
+    if version.failed:
+        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+        return
+    findings.add(join_checks.check_server_key(target, said))
+    if findings["server_key"].failed:
+        findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+        return
+    on_progress(f"joining {target} as {role}")
+    visit = join_checks.attempt_join(target, typed, code, role, said)
+    findings.add(*visit.findings)
+    if any(one.check == "join" and not one.failed for one in visit.findings):
+        plain = is_loopback(target.host) and not (said is not None and said.server_key)
+        text = "none is needed on the session's own machine" if plain else "this machine's key is on the session's list"
+        findings.add(ok("key", text))
+    result.report = visit.report
+    if visit.report is not None:
+        findings.add(*session_checks.check_session_report(visit.report, visit.own_id))
+    findings.skip(*JOIN_CHECKS, *STREAM_CHECKS, *SESSION_CHECKS)
+    findings.sort(ORDER)
+
+
+def run_host_checks(
+    address: str, recordings: Path, *, on_progress: Callable[[str], None] = lambda _: None
+) -> DoctorReport:
+    """Looks at this machine, and at the session that runs on it, if one does. `recordings`: the folder for them.
+
+    `address`: of that session; empty: that of this user, see `here`, else the first that tells of itself from here.
+    """
+    on_progress("looking at this machine")
+    target = Address.parse(address or find_default_address())
+    result = DoctorReport(str(target))
+    result.findings.add(*check_host(recordings, target.port))
+    named, ip = network_checks.check_address(target)
+    if not ip:
+        result.findings.add(named)
+        return result
+    if network_checks.check_tcp(target, ip).failed and not address:
+        own = {one.address for addresses in psutil.net_if_addrs().values() for one in addresses}
+        local = [found for found in map(_to_address, network_checks.check_beacon("", None)[1]) if found.host in own]
+        target = local[0] if local else target
+        ip = network_checks.check_address(target)[1]
+    if not network_checks.check_tcp(target, ip).failed:
+        inside = run_checks(str(target), on_progress=on_progress)
+        result.address, result.report = inside.address, inside.report
+        result.findings.add(*(one for one in inside.findings if one.check not in ("beacon", "address", "subnet")))
+    return result
+
+
+def _to_address(found: FoundSession) -> Address:
+    return Address.parse(found.address)

@@ -1,0 +1,39 @@
+"""Logging of our own commands and child processes. A program that embeds a session configures `logging` itself."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Final
+
+ROOTS: Final = ("iris_session", "anchors")
+LEVEL_VARIABLE: Final = "IRIS_LOG"
+_FORMAT: Final = "%(levelname)s %(name)s: %(message)s"
+
+
+class _StandardErrorHandler(logging.Handler):
+    """Writes to what `sys.stderr` is at the moment, so that redirecting it later has its effect."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            print(self.format(record), file=sys.stderr, flush=True)
+        except Exception:
+            self.handleError(record)
+
+
+def configure_logging() -> None:
+    """Write the log of this package to standard error, one line `LEVEL name: text` a record.
+
+    For our own processes and commands, never on import. The level comes from the environment variable `IRIS_LOG`
+    (`DEBUG`, `INFO`, `WARNING`, `ERROR`), default `WARNING`; child processes inherit it. May be called twice.
+    """
+    name = os.environ.get(LEVEL_VARIABLE, "").strip().upper()
+    level = logging.getLevelNamesMapping().get(name, logging.WARNING)
+    for root in ROOTS:
+        logger = logging.getLogger(root)
+        logger.setLevel(level)
+        if not any(isinstance(handler, _StandardErrorHandler) for handler in logger.handlers):
+            handler = _StandardErrorHandler()
+            handler.setFormatter(logging.Formatter(_FORMAT))
+            logger.addHandler(handler)

@@ -1,0 +1,616 @@
+"""`iris-session anchors status`, `align`, `place`, `move` on paper: screens, who is meant, what is sent."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from anchors.alignment import AlignmentEstimate
+from anchors.constellation import Constellation
+from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
+from iris_session.alignment.smoother import Anchors, Resolver, fused
+from iris_session.authority import AuthorityConfig
+from iris_session.cli import anchors_session
+from iris_session.cli.anchors_session import format_alignment_status, select_participants, to_dict
+from iris_session.cli.common import CommandError
+from iris_session.cli.main import main
+from iris_session.client import Client, DeniedError
+from iris_session.protocol.common import IDENTITY, Alignment, Denial, Pose
+from iris_session.protocol.server_messages import AlignmentAlarmed, AlignmentRun, AnchorMoved, Event, ParticipantInfo
+from iris_session.protocol.status import (
+    AlignmentReport,
+    AnchorReport,
+    AnchorSeen,
+    CrossCheckReport,
+    ParticipantReport,
+    StatusReport,
+)
+from iris_session.recording import Frame, Recording, read_looks
+from iris_session.session.anchors_file import load_anchors
+from tests.anchors.worlds import headset, shifted
+from tests.client.harness import LiveSession
+from tests.recording.headsets import Played
+
+S = 1_000_000_000
+ANN = ParticipantReport(
+    "p1",
+    "ann \x1b[2J",
+    "operator",
+    True,
+    alignment="measured",
+    alignment_age_ns=61 * S,
+    alignment_report=AlignmentReport(
+        7,
+        error_at_anchor_m=0.0021,
+        error_at_robot_m=0.0044,
+        residual_tilt_rad=0.0035,
+        observations=210,
+        viewpoints=3,
+        unusable=2,
+        seen=(AnchorSeen("table", 120, 300 * S), AnchorSeen("door", 90, 4 * S)),
+    ),
+)
+BOB = ParticipantReport(
+    "p2",
+    "bob",
+    "operator",
+    True,
+    alignment="none",
+    alignment_void_ns=4 * S,
+    alignment_report=AlignmentReport(
+        0, False, advice="step closer", alarm="jump", alarm_size_m=0.12, alarm_ns=5 * S, pending_m=0.012
+    ),
+)
+DESK = ParticipantReport("p3", "desk", "agent", True, alignment="not_needed")
+REPORT = StatusReport(
+    1,
+    "s1",
+    "lab",
+    60 * S,
+    participants=(ANN, BOB, DESK),
+    anchors=(AnchorReport("table", Pose((0.0, -0.45, 0.0), IDENTITY.q), 0.16), AnchorReport("door", IDENTITY)),
+    cross_checks=(
+        CrossCheckReport("p1", "p2", "table", 0.031, 0.01, 0.0082, 4 * S, 40),
+        CrossCheckReport("p1", "gone", "door", 0.003, 0.0, 0.0082, 4 * S, 40),
+    ),
+)
+
+
+def test_the_screen_says_what_every_alignment_rests_on() -> None:
+    text = "\n".join(format_alignment_status(REPORT))
+    ann = next(line for line in format_alignment_status(REPORT) if "ann" in line)
+    assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
+    assert "saw door 90 times, 4 s ago; table 120 times, 5 min ago; 2 of no use" in text
+    assert "none STOPPED" in text
+    assert "12.0 mm, 0.00 deg to go" in text
+    assert "void for 4 s" in text
+    assert "ALARM jump: off by 120 mm, 5 s ago" in text
+    assert "advice: step closer" in text
+    assert "anchor 'table': at 0.0000, -0.4500, 0.0000 m, turned 1,0,0,0, 160 mm" in text
+    assert "anchor 'door': at 0.0000, 0.0000, 0.0000 m, turned 1,0,0,0" in text
+    pair, other = (line for line in format_alignment_status(REPORT) if " apart at " in line)
+    assert "bob (p2): 31.0 mm, 0.57 deg apart at 'table', 95 % expected below 8.2 mm; 40 looks, 4 s ago" in pair
+    assert pair.endswith("TOO FAR APART")
+    assert " - gone: 3.0 mm" in other
+    assert not other.endswith("TOO FAR APART")
+    assert "desk" not in text
+
+
+def test_names_of_strangers_move_no_cursor() -> None:
+    assert all(line.isprintable() for line in format_alignment_status(REPORT))
+
+
+def test_offsets_and_placed_alignments_state_no_error() -> None:
+    for fields in (
+        {"alignment": "placed"},
+        {"alignment_report": msgspec.structs.replace(ANN.alignment_report, offset=True)},
+    ):
+        report = msgspec.structs.replace(REPORT, participants=(msgspec.structs.replace(ANN, **fields),))
+        assert "2.1 mm" not in "\n".join(format_alignment_status(report))
+
+
+def test_what_an_old_session_does_not_say_is_left_out() -> None:
+    old = StatusReport(1, "s1", "lab", 0, participants=(msgspec.structs.replace(ANN, alignment_report=None),))
+    assert any("ann" in line for line in format_alignment_status(old))
+    assert "this session has no anchors" in format_alignment_status(old)
+    assert to_dict(old)["participants"][0]["alignment_report"] is None
+
+
+def test_json_has_everything() -> None:
+    told = json.loads(json.dumps(to_dict(REPORT)))
+    assert [one["id"] for one in told["participants"]] == ["p1", "p2"]
+    assert told["participants"][0]["alignment_report"]["seen"][0]["anchor_id"] == "table"
+    assert [one["as_expected"] for one in told["cross_checks"]] == [False, True]
+    assert told["anchors"][0]["T_world_anchor"] == [[0.0, -0.45, 0.0], [1.0, 0.0, 0.0, 0.0]]
+
+
+# --- who is meant, and what a director sends --------------------------------------------------------------------------
+
+MEASURED = Alignment(1, "measured", IDENTITY)
+
+
+class Session:
+    """Stands for a client in a session: who is there, and what was asked of it."""
+
+    def __init__(self, *people: ParticipantInfo) -> None:
+        self.participants = {one.id: one for one in people}
+        self.mirror = self
+        self.asked: list[tuple[Any, ...]] = []
+        self.denies: set[str] = set()
+        self.report = REPORT
+
+    def align(self, action: str, participant: str) -> None:
+        if participant in self.denies:
+            raise DeniedError(Denial("role", "not yours"))
+        self.asked.append((action, participant))
+
+    def place_alignment(self, participant: str, pose: Any, *, offset: bool) -> None:
+        self.asked.append((participant, pose, offset))
+
+    def move_anchor(self, anchor_id: str, pose: Any, *, force: bool) -> None:
+        if anchor_id in self.denies and not force:
+            raise DeniedError(Denial("too_far", f"anchor {anchor_id} would be moved by 450.0 m: --force"))
+        self.asked.append((anchor_id, pose))
+
+    def status(self) -> StatusReport:
+        return self.report
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch) -> Session:
+    here = Session(
+        ParticipantInfo("p1", "ann", "operator", True),
+        ParticipantInfo("p2", "bob", "operator", True, alignment=MEASURED),
+        ParticipantInfo("p10", "bob", "observer", False, alignment=MEASURED),
+        ParticipantInfo("p3", "desk", "agent", True, alignment=Alignment(0, "not_needed", IDENTITY)),
+    )
+
+    @contextmanager
+    def join_as_director(arguments: argparse.Namespace) -> Iterator[Session]:
+        yield here
+
+    monkeypatch.setattr(anchors_session, "join_as_director", join_as_director)
+    return here
+
+
+def test_participants_are_meant_by_id_or_name(session: Any) -> None:
+    assert [one.id for one in select_participants(session, "ann")] == ["p1"]
+    assert [one.id for one in select_participants(session, "p10")] == ["p10"]
+    assert [one.id for one in select_participants(session, "all")] == ["p1", "p2"], "who is here and has a headset"
+    with pytest.raises(
+        CommandError, match=r"2 participants are called 'bob', give an id: p2 \(operator\), p10 \(observ"
+    ):
+        select_participants(session, "bob")
+    with pytest.raises(CommandError, match=r"called 'carl'; with a headset: ann \(p1\), bob \(p2\), bob \(p10\)$"):
+        select_participants(session, "carl")
+    with pytest.raises(CommandError, match="no participant is called 'all'"):
+        select_participants(session, "all", allow_all=False)
+
+
+def test_nobody_to_align(monkeypatch: pytest.MonkeyPatch) -> None:
+    empty: Any = Session()
+    with pytest.raises(CommandError, match="nobody in this session has a headset") as caught:
+        select_participants(empty, "all")
+    assert caught.value.status == 1
+
+
+def test_runs_are_started_and_stopped(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["anchors", "align", "start"]) == 0
+    assert main(["anchors", "align", "stop", "ann", "--json"]) == 0
+    assert session.asked == [("start", "p1"), ("start", "p2"), ("stop", "p1")]
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == "ann (p1): started: look at the sheets"
+    assert json.loads(out[2]) == {
+        "ok": True,
+        "action": "stop",
+        "participants": [{"id": "p1", "name": "ann", "denied": ""}],
+    }
+
+
+def test_one_denial_of_several_is_told_and_the_others_go_on(
+    session: Session, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session.denies = {"p1"}
+    assert main(["anchors", "align", "start"]) == 1
+    assert session.asked == [("start", "p2")]
+    assert "ann (p1): denied (role): not yours" in capsys.readouterr().out
+    assert main(["anchors", "align", "start", "ann"]) == 2
+    assert capsys.readouterr().err == "iris-session: denied (role): not yours\n"
+
+
+def test_headsets_are_placed_and_anchors_moved(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["anchors", "place", "ann", "--pose", "0.4,0,0,1,0,0,0"]) == 0
+    assert main(["anchors", "place", "p2", "--offset", "--pose", "-0.01,0,0,1,0,0,0"]) == 0, "a minus is no option"
+    assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,0,0,0,1", "--json"]) == 0
+    assert session.asked == [
+        ("p1", ((0.4, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), False),
+        ("p2", ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), True),
+        ("table", ((-0.2, 0.1, 0.0), (0.0, 0.0, 0.0, 1.0))),
+    ]
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told.pop("moved_m") == pytest.approx(0.585, abs=1e-3)
+    assert told == {"ok": True, "anchor": "table", "follow": ["p1"], "stay": []}, "bob is not aligned at all"
+
+
+def test_a_moved_anchor_tells_whose_alignments_follow(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    stopped = msgspec.structs.replace(ANN.alignment_report, running=False)
+    others = [
+        msgspec.structs.replace(ANN, id="p4", name="cay", alignment_report=stopped),
+        msgspec.structs.replace(ANN, id="p5", name="dan", alignment="placed"),
+        msgspec.structs.replace(ANN, id="p6", name="eve", connected=False),
+        msgspec.structs.replace(ANN, id="p7", name="fay", alignment_report=AlignmentReport(3)),
+    ]
+    session.report = msgspec.structs.replace(REPORT, participants=(ANN, BOB, DESK, *others))
+    assert main(["anchors", "move", "table", "--pose", "0,-0.4,0,1,0,0,0"]) == 0
+    first, *stay = capsys.readouterr().out.splitlines()
+    assert first == "anchor 'table' moved by 50 mm: alignments that are measured to it follow (1)"
+    assert [line.strip() for line in stay] == [
+        "not that of cay (p4): its run is stopped; `iris-session anchors align start p4`",
+        "not that of dan (p5): a director placed it; `iris-session anchors align start p5` measures it",
+        "not that of eve (p6): it has not looked at 'table' since it came; it follows when it does",
+        "not that of fay (p7): it has not looked at 'table' since it came; it follows when it does",
+    ]
+
+
+def test_an_anchor_is_moved_far_only_by_force(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+    far = ["anchors", "move", "table", "--pose", "450,-0.45,0,1,0,0,0"]
+    session.denies = {"table"}
+    assert main(far) == 2
+    assert session.asked == []
+    assert "denied (too_far): anchor table would be moved by 450.0 m: --force" in capsys.readouterr().err
+    assert main([*far, "--force"]) == 0
+    assert [asked[0] for asked in session.asked] == ["table"]
+
+
+@pytest.mark.parametrize("command", [["status"], ["align", "start"], ["move", "table", "--pose", "0,0,0,1,0,0,0"]])
+def test_that_nobody_is_there_is_found_out_without_waiting(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing listens at the port: no client is made, which would wait for a session to begin."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # nobody else gets it, and it takes no connections
+        monkeypatch.setattr(Client, "open", lambda self: pytest.fail("waits"))
+        where = f"127.0.0.1:{taken.getsockname()[1]}"
+        there = [where] if command == ["status"] else ["--address", where]
+        assert main(["anchors", *command, *there]) == 2
+    err = capsys.readouterr().err
+    assert f"no session answers at {where}: is `iris-session serve` running there? (TCP port" in err
+    assert "refused" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["place", "ann"], "--pose"),
+        (["place", "ann", "--pose", "1,2,3"], "is not a pose: x,y,z in metres"),
+        (["move", "table", "--pose", "0,0,0,1,1,0,0"], "a unit quaternion"),
+        (["align", "begin"], "choose from"),
+        (["move", "--pose", "0,0,0,1,0,0,0"], "ANCHOR"),
+    ],
+)
+def test_commands_that_cannot_be_meant(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["anchors", *words])
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("action", ["status", "align", "place", "move", "solve", "example"])
+def test_help_has_examples(action: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["anchors", action, "--help"])
+    assert caught.value.code == 0
+    assert re.search(rf"examples:\n  iris-session anchors {action}", capsys.readouterr().out)
+
+
+def test_address_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["anchors", "status", "nowhere:port"]) == 2
+    assert main(["anchors", "move", "table", "--pose", "0,0,0,1,0,0,0", "--address", "nowhere:port"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all("is not HOST:PORT" in line for line in lines)
+
+
+def test_a_running_session_takes_what_a_director_says(capsys: pytest.CaptureFixture[str]) -> None:
+    """The same commands with a real front and authority."""
+    config = AuthorityConfig(anchors={"table": IDENTITY})
+    live = LiveSession(config)
+    events: list[Event] = []
+    try:
+        with Client(live.address, name="ann", alignment="measured", on_event=events.append) as ann:
+            there = ["--address", live.address]
+            assert main(["anchors", "place", "ann", "--pose", "0.4,0,0,1,0,0,0", *there]) == 0
+            assert main(["anchors", "align", "stop", ann.participant_id, *there]) == 0
+            assert main(["anchors", "align", "start", *there]) == 0
+            assert main(["anchors", "move", "table", "--pose=-0.2,0.1,0,1,0,0,0", *there]) == 0
+            assert ann.wait_for(lambda _: any(isinstance(e.body, AnchorMoved) for e in events))
+            assert ann.alignment is not None
+            assert ann.alignment.kind == "placed"
+            runs = [(e.body.participant, e.body.running) for e in events if isinstance(e.body, AlignmentRun)]
+            assert runs == [(ann.participant_id, False), (ann.participant_id, True)]
+            assert [e.body.T_world_anchor.p for e in events if isinstance(e.body, AnchorMoved)] == [(-0.2, 0.1, 0.0)]
+            capsys.readouterr()
+            assert main(["anchors", "move", "shelf", "--pose", "0,0,0,1,0,0,0", *there]) == 2
+            assert "denied" in capsys.readouterr().err
+    finally:
+        live.close()
+
+
+Capture = pytest.CaptureFixture[str]
+TRUE: dict[str, PoseTuple] = {
+    "table": ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0)),
+    "door": ((1.2, 0.1, 0.3), (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)),
+    "shelf": ((-0.4, 0.9, 0.5), (1.0, 0.0, 0.0, 0.0)),
+}
+#: The session believes that the shelf's sheet still is where it was.
+BELIEVED = {**TRUE, "shelf": shifted(TRUE["shelf"], (0.03, 0.0, 0.0))}
+
+
+def frames() -> tuple[PoseTuple, PoseTuple]:
+    rng = np.random.default_rng(7)
+    return headset(rng), headset(rng)
+
+
+def play() -> Played:
+    """Ann and bob look at three sheets; ann's second alignment is 25 mm off, stated as 3 mm. Carl sees nothing."""
+    played = Played(BELIEVED, {"table": 0.16})
+    ann, bob = frames()
+    played.join(1, "p1", "ann \x1b[2J")
+    played.join(2, "p2", "bob")
+    played.join(3, "p3", "carl", role="observer")
+    played.join(4, "p4", "desk", role="agent", alignment=Alignment(0, "not_needed", IDENTITY))
+    for viewpoint in (1, 2, 3):
+        played.look(1, "table", TRUE["table"], ann, viewpoint)
+    played.aligned("p1", 1, ann, 0.003)
+    for viewpoint in (4, 5):
+        played.look(1, "door", TRUE["door"], ann, viewpoint)
+    played.aligned("p1", 2, shifted(ann, (0.0, 0.025, 0.0)), 0.003)
+    played.look(1, "shelf", TRUE["shelf"], ann, 6)
+    for viewpoint, name in enumerate(("table", "door", "shelf", "table", "door"), 1):
+        played.look(2, name, TRUE[name], bob, viewpoint)
+    played.aligned("p2", 1, bob, 0.003)
+    return played
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return play().write(tmp_path_factory.mktemp("solve") / "session.rrd")
+
+
+def solved(capsys: Capture, *words: str) -> dict[str, Any]:
+    assert main(["anchors", "solve", *words, "--json"]) == 0
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return told
+
+
+def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Capture) -> None:
+    told = solved(capsys, str(recording))
+    ann, bob, carl = told["participants"]
+    assert (ann["id"], bob["name"], carl["frames"]) == ("p1", "bob", [])
+    (frame,) = ann["frames"]
+    assert (frame["looks"], frame["sheets"]) == (120, {"table": 60, "door": 40, "shelf": 20})
+    T = frame["T_world_tracking"]
+    assert distance(tuple(T["position_m"]), frames()[0][0]) < 0.01
+    first, second = frame["alignments"]
+    assert first["off_m"] < 0.005
+    assert not first["beyond"]
+    assert second["off_m"] == pytest.approx(0.025, abs=0.005)
+    assert second["beyond"]
+    assert (second["stated_m"], second["until_s"]) == (0.003, None)
+    assert 0.0005 < second["solved_m"] < 0.006
+    assert not bob["frames"][0]["alignments"][0]["beyond"]
+
+
+def test_looks_at_a_moved_sheet_are_outliers(recording: Path, capsys: Capture) -> None:
+    told = solved(capsys, str(recording))
+    for person in told["participants"][:2]:
+        (outlier,) = person["frames"][0]["outliers"]
+        assert outlier["anchor_id"] == "shelf"
+        assert outlier["off_m"] == pytest.approx(0.03, abs=0.01)
+
+
+def test_where_the_anchors_really_were_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+    path = tmp_path / "true.toml"
+    path.write_text(Constellation("table", TRUE, {}, {"table": 0.16}).to_toml())
+    told = solved(capsys, str(recording), "--anchors", str(path))
+    assert [one["frames"][0]["outliers"] for one in told["participants"][:2]] == [[], []]
+    assert told["constellation"]["moved"] == []
+
+
+def test_sheets_to_each_other_and_which_one_was_moved(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "anchors.toml"
+    told = solved(capsys, str(recording), "--out", str(out))
+    (moved,) = told["constellation"]["moved"]
+    assert moved["anchor_id"] == "shelf"
+    assert moved["distance_m"] == pytest.approx(0.03, abs=0.008)
+    found = load_anchors(out)
+    assert found.anchors["table"] == TRUE["table"], "the reference stays where it is"
+    for name in TRUE:
+        seen, true = (compose(inverse(c["table"]), c[name]) for c in (found.anchors, TRUE))
+        assert distance(seen[0], true[0]) <= 2.0 * found.error_m[name] < 0.04, name
+    assert found.sizes == dict.fromkeys(TRUE, 0.16)
+
+
+def test_the_text_says_it_too(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "anchors.toml"
+    assert main(["anchors", "solve", str(recording), "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    lines = shown.splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert any("120 looks from 6 places" in line and "table 60" in line for line in lines)
+    (beyond,) = [line for line in lines if "BEYOND WHAT WAS STATED" in line]
+    assert beyond.lstrip().startswith("version 2 (measured), 10.0 s to the end: 2")
+    assert "stated 3.0 mm" in beyond
+    assert "carl (p3): no observations" in lines
+    assert sum("outlier: 'shelf'" in line for line in lines) == 2
+    assert any(line.startswith("MOVED: sheet 'shelf' lies ") for line in lines)
+    assert "desk" not in shown
+    assert lines[-1].endswith(f"iris-session serve SCENE --anchors {out}")
+
+
+def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: Path) -> None:
+    """The same looks before and after: the alignment follows the anchor."""
+    played, T = Played({"table": TRUE["table"]}), frames()[0]
+    played.join(1, "p1", "ann")
+    for viewpoint in (1, 2):
+        played.look(1, "table", TRUE["table"], T, viewpoint)
+    played.wait(20.0)
+    played.event(AnchorMoved("table", Pose(*shifted(TRUE["table"], (0.5, 0.0, 0.0)))))
+    moved_ns = played.now_ns
+    played.wait(20.0)
+    with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
+        looks = read_looks(recording)
+    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {})
+    before, after = resolver.at(moved_ns - 1), resolver.at(moved_ns)
+    x, y, z = before.T_world_tracking[0]
+    assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
+
+
+def test_what_came_later_counts_too(tmp_path: Path) -> None:
+    """Live, there were two looks, which is too few; a minute later there were more."""
+    played, T = Played({"table": TRUE["table"]}), frames()[0]
+    played.join(1, "p1", "ann")
+    played.look(1, "table", TRUE["table"], T, 1, n=2)
+    early_ns = played.now_ns
+    played.wait(60.0)
+    played.look(1, "table", TRUE["table"], T, 2)
+    with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
+        looks = read_looks(recording)
+    solution = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, {"table": TRUE["table"]}, None), {}).at(early_ns)
+    assert (solution.refused, solution.n_observations) == (False, 20)
+
+
+def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> None:
+    played, T = Played({"table": TRUE["table"]}, {"table": 0.12}), frames()[0]
+    played.join(1, "p1", "ann")
+    played.look(1, "table", TRUE["table"], T, 1, n=6)
+    played.look(1, "door", TRUE["door"], T, 2, n=5)
+    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    (frame,) = told["participants"][0]["frames"]
+    assert frame["refused"]
+    assert "measures 160 mm, not 120 mm" in frame["advice"]
+    assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
+
+
+def test_a_sheet_on_the_wall_is_told_to_be_none_that_lies(tmp_path: Path, capsys: Capture) -> None:
+    played, T = Played({"table": TRUE["table"]}), frames()[0]
+    upright: PoseTuple = (TRUE["table"][0], quat_from_rotvec((math.pi / 2.0, 0.0, 0.0)))
+    played.join(1, "p1", "ann")
+    played.look(1, "table", upright, T, 1, n=8)
+    assert main(["anchors", "solve", str(played.write(tmp_path / "session.rrd"))]) == 0
+    shown = capsys.readouterr().out
+    assert "8 against gravity" in shown
+    assert "most looks contradict the vertical: the sheet does not lie as configured" in shown
+    assert "1 sheet was seen" in shown
+
+
+def test_numbers_of_strangers_end_nothing(tmp_path: Path, capsys: Capture) -> None:
+    played, T = Played({"table": TRUE["table"]}), frames()[0]
+    played.join(1, "p1", "ann")
+    played.look(1, "table", ((1e300, -1e300, 1e200), TRUE["table"][1]), T, 1, n=6, noise=0.0)
+    played.look(1, "table", TRUE["table"], T, 2, n=6)
+    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    assert told["participants"][0]["frames"][0]["unused"] == {"not a pose": 6}
+
+
+def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: Capture) -> None:
+    played = Played({"table": TRUE["table"]})
+    empty = str(played.write(tmp_path / "empty.rrd"))
+    assert main(["anchors", "solve", empty]) == 0
+    assert "nobody in this recording had a headset" in capsys.readouterr().out
+    assert main(["anchors", "solve", empty, "--out", str(tmp_path / "x.toml")]) == 1
+    assert capsys.readouterr().err.endswith(
+        "is not written: 0 sheets were seen: 2 are needed to say where they lie to each other\n"
+    )
+    assert not (tmp_path / "x.toml").exists()
+
+
+def test_sheets_that_nothing_ties_together_are_named(tmp_path: Path, capsys: Capture) -> None:
+    played, (ann, bob) = Played({"table": TRUE["table"]}), frames()
+    played.join(1, "p1", "ann")
+    played.join(2, "p2", "bob")
+    played.look(1, "table", TRUE["table"], ann, 1)
+    played.look(2, "door", TRUE["door"], bob, 1)
+    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    assert told["constellation"]["advice"].startswith("sheets not tied to 'table': door")
+
+
+def test_files_that_are_none(tmp_path: Path, recording: Path, capsys: Capture) -> None:
+    assert main(["anchors", "solve", str(tmp_path / "none.rrd")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")]) == 2
+    assert "`iris-session anchors example`" in capsys.readouterr().err
+    assert main(["anchors", "solve", str(recording), "--out", str(tmp_path / "no" / "folder.toml")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_both_sides_of_a_moment_are_weighted_by_what_they_know() -> None:
+    """Two solutions of one frame, one known ten times better; and two that differ by more than they state."""
+    T = frames()[0]
+    sheet = TRUE["table"][0]
+
+    def known(off_m: float, sigma_m: float) -> AlignmentEstimate:
+        C = np.diag([sigma_m**2] * 3 + [1e-6] * 3)
+        here = shifted(T, (off_m, 0.0, 0.0))
+        return AlignmentEstimate(
+            here, 0, tuple(C.ravel()), shifted((sheet, T[1]), (off_m, 0, 0))[0], 0.0, 0.0, 9, 2, False, ""
+        )
+
+    both = fused(known(0.0, 0.001), known(0.01, 0.01))
+    assert distance(both.T_world_tracking[0], T[0]) < 0.0005
+    assert both.error_at(both.pivot_world) < 0.0028, "no worse than the better one"
+    assert both.n_observations == 18
+    half = fused(known(0.0, 0.002), known(0.004, 0.002))
+    assert distance(half.T_world_tracking[0], T[0]) == pytest.approx(0.002, abs=1e-4)
+    apart = fused(known(0.0, 0.002), known(0.05, 0.002))
+    assert apart.error_at_anchor_m > 3.0 * half.error_at_anchor_m
+
+
+def test_sheets_seen_before_and_after_a_jump_are_not_pooled(tmp_path: Path, capsys: Capture) -> None:
+    """A headset that does not notice its jump tells no new epoch: each side of it is a tracking frame of its own."""
+    played, (ann, _) = Played(TRUE, {"table": 0.16}), frames()
+    jumped = shifted(ann, (0.2, 0.0, 0.0))
+    played.join(1, "p1", "ann")
+    for viewpoint, name in enumerate(("table", "door", "shelf"), 1):
+        played.look(1, name, TRUE[name], ann, viewpoint)
+    played.wait(0.5)
+    played.event(AlignmentAlarmed("p1", "jump", "", 0.2))
+    for viewpoint, name in enumerate(("table", "door"), 4):
+        played.look(1, name, TRUE[name], jumped, viewpoint)
+    played.aligned("p1", 1, jumped, 0.003)
+    told = solved(capsys, str(played.write(tmp_path / "session.rrd")))
+    before, after = told["participants"][0]["frames"]
+    assert [(one["jumps"], one["looks"]) for one in (before, after)] == [(0, 60), (1, 40)]
+    assert (before["outliers"], after["outliers"], told["constellation"]["moved"]) == ([], [], [])
+    (alignment,) = after["alignments"]
+    assert alignment["off_m"] < 0.01
+
+
+def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the live estimator sees no majority."""
+    solve = Resolver._solve
+
+    def blind(self: Resolver, moment: int, places: dict[str, PoseTuple]) -> AlignmentEstimate:
+        return replace(solve(self, moment, places), refused="shelf" in places)
+
+    monkeypatch.setattr(Resolver, "_solve", blind)
+    with Recording.open(recording) as opened:
+        looks = read_looks(opened)
+    resolver = Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, BELIEVED, None), {})
+    solved = resolver.at(10_000_000_000)
+    assert (solved.refused, solved.moved) == (False, ("shelf",))
+    assert "sheet 'shelf'; it is not used" in solved.advice
+    two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
+    assert Resolver(looks.looks[Frame("p1", 1, 0)], Anchors(looks, two, None), {}).at(10_000_000_000).refused

@@ -1,0 +1,127 @@
+"""What the doctor makes of alignments that are in force, and of media: one fault at a time, in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from iris_session.doctor.findings import Finding
+from iris_session.doctor.headset_checks import ALARMS, MEDIA_DROPS, STALE_NS, is_consistent
+from iris_session.doctor.runner import SESSION_CHECKS
+from iris_session.doctor.session_checks import check_session_report
+from iris_session.protocol.media import StreamBudget
+from iris_session.protocol.names import AlarmKind
+from iris_session.protocol.status import AlignmentReport, AnchorSeen, CrossCheckReport, StatusReport
+from tests.doctor.test_session_checks import ANN, DOCTOR, LEFT, WELL, S, change
+
+ALIGNED = AlignmentReport(3, observations=200, viewpoints=3, seen=(AnchorSeen("table", 120, 4 * S),))
+BOB = change(ANN, id="p2", name="bob", role="observer", holds=())
+AGREES = CrossCheckReport("p1", "p2", "table", 0.003, 0.001, 0.008, 4 * S, 40)
+
+
+def with_ann(**fields: object) -> StatusReport:
+    """Of a session with ann, whose alignment is told of, and bob."""
+    ann = change(ANN, alignment_report=change(ALIGNED, **fields))
+    report: StatusReport = change(WELL, participants=(ann, BOB, DOCTOR), robots=(LEFT,))
+    return report
+
+
+def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
+    """That exactly this check is not well, in one line."""
+    found: list[Finding] = [one for one in check_session_report(report, "p9") if one.state != "ok"]
+    assert [(one.check, one.state) for one in found] == [(check, state)]
+    said = f"{found[0].text} {found[0].why} {found[0].advice}"
+    assert "\n" not in said
+    assert all(text in said for text in texts), said
+
+
+def test_headsets_that_are_well() -> None:
+    assert [one for one in check_session_report(with_ann(), "p9") if one.state != "ok"] == []
+    told = {one.check for one in check_session_report(with_ann(), "p9")}
+    assert told == set(SESSION_CHECKS), "every check is told of, and its place in the order is known"
+
+
+@pytest.mark.parametrize(("kind", "state"), [("jump", "failed"), ("differs", "warning"), ("changed", "warning")])
+def test_alarms(kind: str, state: str) -> None:
+    report = with_ann(alarm=kind, alarm_size_m=0.12, alarm_ns=4 * S)
+    only(report, "alarm", state, f"ann: {ALARMS[kind]}, by 120 mm, 4.0 s ago", "look at a sheet")
+
+
+def test_every_alarm_is_explained() -> None:
+    assert set(ALARMS) == AlarmKind.ALL
+    only(with_ann(alarm="of_tomorrow", alarm_ns=S), "alarm", "warning", "ann: of_tomorrow")
+
+
+def test_an_alignment_that_nothing_confirms() -> None:
+    long_ago = (AnchorSeen("table", 9, STALE_NS + 60 * S), AnchorSeen("door", 9, STALE_NS + 120 * S))
+    only(with_ann(seen=long_ago), "stale", "warning", "ann has seen no sheet for 11 min", "glance")
+    recent = (*long_ago, AnchorSeen("shelf", 9, S))
+    assert all(one.state == "ok" for one in check_session_report(with_ann(seen=recent), "p9"))
+
+
+def test_without_any_sheet_its_own_age_counts() -> None:
+    old = change(ANN, alignment_age_ns=STALE_NS + 1, alignment_report=change(ALIGNED, seen=()))
+    only(change(WELL, participants=(old, DOCTOR)), "stale", "warning", "ann")
+    assert all(one.state == "ok" for one in check_session_report(with_ann(seen=()), "p9"))
+
+
+def test_a_run_that_was_stopped() -> None:
+    only(with_ann(running=False), "align_run", "warning", "stopped for ann", "anchors align start")
+
+
+@pytest.mark.parametrize("fields", [{"pending_m": 0.025}, {"pending_rad": 0.02}])
+def test_corrections_that_wait(fields: dict[str, float]) -> None:
+    mm, deg = fields.get("pending_m", 0.0) * 1e3, fields.get("pending_rad", 0.0) * 57.3
+    only(with_ann(**fields), "correction", "warning", f"ann: {mm:.0f} mm, {deg:.1f} deg to go", "open the clutch")
+
+
+def test_headsets_that_disagree() -> None:
+    apart = change(AGREES, error_m=0.03)
+    only(
+        change(with_ann(), cross_checks=(AGREES, apart)),
+        "agreement",
+        "warning",
+        "ann and bob put 'table' 30 mm apart, below 8 mm was stated",
+    )
+
+
+def test_what_chance_explains_and_what_was_long_ago_is_no_fault() -> None:
+    assert is_consistent(change(AGREES, error_m=0.016))
+    assert not is_consistent(change(AGREES, error_m=0.0161))
+    old = change(AGREES, error_m=0.5, age_ns=601 * S)
+    found = {one.check: one for one in check_session_report(change(with_ann(), cross_checks=(old, AGREES)), "p9")}
+    assert found["agreement"].state == "ok"
+    assert "1 pairs compared, at most 3 mm apart" in found["agreement"].text
+
+
+def test_who_is_gone_or_needs_no_alignment_is_no_patient() -> None:
+    bad: Any = change(ALIGNED, alarm="jump", running=False, pending_m=1.0)
+    desk = change(ANN, alignment="not_needed", alignment_report=bad)
+    assert all(one.state == "ok" for one in check_session_report(change(WELL, participants=(desk, DOCTOR)), "p9"))
+
+
+def test_media_that_are_cut_down_or_dropped() -> None:
+    full, quarter = StreamBudget("cloud", "full", 20.0), StreamBudget("cloth", "quarter", 0.5)
+    cut = change(ANN, media=(full, quarter))
+    only(change(WELL, participants=(cut, DOCTOR)), "media", "warning", "ann: cloth in class quarter", "links.md")
+    lossy = change(ANN, media=(full,), media_drops=MEDIA_DROPS)
+    only(change(WELL, participants=(lossy, DOCTOR)), "media", "warning", f"ann: {MEDIA_DROPS} frames dropped")
+
+
+def test_media_that_are_well() -> None:
+    for fields in ({"media": (StreamBudget("cloud"),), "media_drops": MEDIA_DROPS - 1}, {"media": ()}):
+        report = change(WELL, participants=(change(ANN, **fields), DOCTOR))
+        assert all(one.state == "ok" for one in check_session_report(report, "p9"))
+
+
+def test_reports_without_the_new_fields_are_read() -> None:
+    old = msgspec.convert({"request_id": 1, "session_id": "s", "session_name": "n", "session_time": 0}, StatusReport)
+    assert {one.check for one in check_session_report(old)} >= {
+        "alarm",
+        "stale",
+        "align_run",
+        "correction",
+        "agreement",
+    }

@@ -1,0 +1,116 @@
+"""The server's machine: what is looked at, on this one."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from iris_session.doctor import host_checks
+from iris_session.doctor.findings import Findings, failed, ok, warning
+from iris_session.security import KeyHome
+from iris_session.session.processes import INGEST_OFFSET, MEDIA_OFFSET
+
+
+def test_every_check_says_something(tmp_path: Path) -> None:
+    found = host_checks.check_host(tmp_path / "sessions")
+    names = [one.check for one in found]
+    assert names == [
+        "scheduling",
+        "processors",
+        "memory",
+        "disk",
+        "key_home",
+        "ports",
+        "interfaces",
+        "clock_source",
+    ]
+    assert all(one.text and one.state in ("ok", "warning", "failed") for one in found)
+
+
+def test_ports_name_who_has_them() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(1)
+        port = listener.getsockname()[1]
+        found = host_checks.check_ports(port)
+    assert found.state == "warning"
+    assert f"{port} (control)" in found.text
+    assert "python" in found.text or "pytest" in found.text
+
+
+def test_ports_of_a_session_are_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each program is told once, with all its ports."""
+    monkeypatch.setattr(host_checks, "_is_port_in_use", lambda port: port != 7725)
+    monkeypatch.setattr(host_checks, "_list_connections", list)
+    assert host_checks.check_ports(7721).state == "warning"
+    listening = [
+        SimpleNamespace(status="LISTEN", laddr=SimpleNamespace(port=port), pid=1) for port in range(7720, 7727)
+    ]
+    monkeypatch.setattr(host_checks, "_list_connections", lambda: listening)
+    monkeypatch.setattr(host_checks, "_describe_process", lambda pid: "python -m iris_session.front.main (process 1)")
+    found = host_checks.check_ports(7721)
+    assert found.state == "ok"
+    assert found.text.count("process 1") == 1
+    assert "7720 (introduction), 7721 (control), " in found.text
+
+
+def test_every_port_of_a_session_is_looked_at() -> None:
+    """As the session lays them out: introduction below control, media ingest above the web."""
+    assert {host_checks.CONTROL_PORT + offset: name for offset, name in host_checks.PORT_OFFSETS.items()} == {
+        7720: "introduction",
+        7721: "control",
+        7722: "state",
+        7723: "media",
+        7724: "assets",
+        7725: "web",
+        7726: "media ingest",
+    }
+    assert host_checks.PORT_OFFSETS[1 + MEDIA_OFFSET] == "media"
+    assert host_checks.PORT_OFFSETS[1 + INGEST_OFFSET] == "media ingest"
+
+
+def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    assert host_checks.check_key_home().state == "ok"  # not there yet
+    KeyHome().server_key()
+    assert host_checks.check_key_home().state == "ok"
+    (tmp_path / "home" / "server.key_secret").chmod(0o644)
+    found = host_checks.check_key_home()
+    assert found.failed
+    assert "server.key_secret" in found.text
+    assert "chmod" in found.advice
+
+
+def test_key_home_that_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    KeyHome().server_key()
+    path = tmp_path / "home" / "clients.json"
+    path.write_text("[{}]")
+    path.chmod(0o600)
+    assert host_checks.check_key_home().failed
+
+
+def test_folder_for_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert str(tmp_path) in host_checks.check_disk_space(tmp_path / "deep" / "below").text
+    monkeypatch.setattr(host_checks, "FULL_DISK", 1 << 60)
+    assert host_checks.check_disk_space(tmp_path).failed
+
+
+def test_findings_keep_their_order_and_one_per_check() -> None:
+    findings = Findings()
+    findings.add(ok("b", "fine"), warning("a", "hm"), failed("c", "no"))
+    findings.add(ok("c", "fine after all"))
+    findings.skip("c", "d")
+    findings.sort(("a", "b", "c"))
+    assert [(one.check, one.state) for one in findings] == [
+        ("a", "warning"),
+        ("b", "ok"),
+        ("c", "ok"),
+        ("d", "skipped"),
+    ]
+    assert findings.ok
+    findings.add(failed("d", "no"))
+    assert not findings.ok

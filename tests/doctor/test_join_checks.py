@@ -1,0 +1,130 @@
+"""Why joining failed: each refusal under the check that it belongs to; and keys that are or are not the known ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iris_session.client.address import Address
+from iris_session.client.core.state_stream import SceneState
+from iris_session.client.errors import NotConnectedError, RefusedError, SessionNameError, TrustError, VersionError
+from iris_session.doctor.join_checks import (
+    attempt_join,
+    check_server_key,
+    check_state_age,
+    explain_refusal,
+    explain_unpaired_key,
+)
+from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import RefusalCode
+from iris_session.protocol.server_messages import Refused, StateHeader
+from iris_session.security import KeyHome, KeyPair, SessionNote
+
+ADDRESS = Address("192.0.2.7", 7721)
+
+
+def said(key: str) -> Introduction:
+    return Introduction(Beacon(1, "s1", "lab", "live", "192.0.2.7", 7721, 7722, 0, 0, 0), key)
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
+    monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
+    return KeyHome()
+
+
+@pytest.mark.parametrize(
+    ("error", "check"),
+    [
+        (VersionError(Refused("version", "no", supported_versions=(2,))), "version"),
+        (RefusedError(Refused(RefusalCode.UNPAIRED, "who are you", "pair")), "key"),
+        (RefusedError(Refused(RefusalCode.CODE, "used")), "code"),
+        (RefusedError(Refused("role", "not as director")), "role"),
+        (RefusedError(Refused(RefusalCode.FULL, "all in use")), "join"),
+        (TrustError("another key"), "server_key"),
+        (SessionNameError("two of them"), "beacon"),
+        (NotConnectedError("nobody"), "join"),
+    ],
+)
+def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
+    found = explain_refusal(error)  # type: ignore[arg-type]
+    assert (found.check, found.state) == (check, "failed")
+    assert found.text
+
+
+def test_key_that_is_the_known_one(home: KeyHome) -> None:
+    key = KeyPair.new().public
+    assert check_server_key(ADDRESS, said(key)).state == "warning"  # not known yet
+    home.servers.pin(str(ADDRESS), "lab", key)
+    assert check_server_key(ADDRESS, said(key)).state == "ok"
+
+
+def test_key_that_is_another_one(home: KeyHome) -> None:
+    home.servers.pin(str(ADDRESS), "lab", KeyPair.new().public)
+    found = check_server_key(ADDRESS, said(KeyPair.new().public))
+    assert found.failed
+    assert "iris-session keys forget 192.0.2.7:7721" in found.advice
+
+
+def test_key_of_a_scanned_code_counts(home: KeyHome) -> None:
+    scanned = Address("192.0.2.7", 7721, server_key=KeyPair.new().public)
+    assert check_server_key(scanned, said(KeyPair.new().public)).failed
+    assert check_server_key(scanned, said(scanned.server_key)).state == "ok"
+
+
+def test_damaged_list_of_servers(home: KeyHome) -> None:
+    home.folder.make()
+    path = home.path / "known_servers.json"
+    path.write_text("{")
+    path.chmod(0o600)
+    assert check_server_key(ADDRESS, said(KeyPair.new().public)).failed
+
+
+def test_nothing_to_compare() -> None:
+    assert check_server_key(ADDRESS, None).state == "skipped"
+    assert check_server_key(ADDRESS, said("")).state == "ok"
+
+
+def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
+    new = explain_unpaired_key(ADDRESS, said(KeyPair.new().public))
+    assert (new.check, new.state, new.why) == ("key", "failed", "")
+    assert "iris-session pair" in new.advice
+    assert f"iris-session doctor {ADDRESS} --code" in new.advice
+    key = KeyPair.new().public
+    home.servers.pin(str(ADDRESS), "lab", key)
+    assert "let in before" in explain_unpaired_key(ADDRESS, said(key)).why
+
+
+def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
+    key = KeyPair.new()
+    home.sessions.add(SessionNote("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
+    assert check_server_key(ADDRESS, said(key.public)).state == "ok"
+    assert explain_unpaired_key(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
+    assert "pair" in explain_unpaired_key(ADDRESS, said(KeyPair.new().public)).advice
+
+
+def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:
+    [found] = attempt_join(ADDRESS, str(ADDRESS), "abc", "observer", None).findings
+    assert (found.check, found.state) == ("code", "failed")
+    assert "like 7KQ2-M4XD-9PTR" in found.text
+    assert "iris-session pair" in found.advice
+
+
+def state(session_time: int, age_ms: int) -> SceneState:
+    return SceneState(StateHeader(1, 0, 0, 0.0, session_time, 0, 0, 0), np.zeros((0, 7)), 0, age_ms * 1_000_000)
+
+
+def test_old_state_is_blamed_on_the_link_only_when_something_new_comes() -> None:
+    moving = [state(n, 3) for n in range(90)]
+    assert check_state_age(moving, 0).state == "ok"
+    slow = check_state_age([state(n, 300) for n in range(90)], 7)
+    assert (slow.state, slow.why) == ("warning", "7 frames waited too long in a queue")
+    silent = check_state_age([state(5, 9000 + 250 * n) for n in range(6)], 0)
+    assert silent.state == "warning"
+    assert silent.text == "state comes at 4 Hz, all as it was 10.2 s ago"
+    assert silent.why == "nothing new is published"
+    assert check_state_age([state(5, 9000), *(state(6 + n, 3) for n in range(80))], 0).state == "ok", "it goes on"
+    assert check_state_age([state(5, 3)], 0).state == "ok", "of one alone nobody can say"

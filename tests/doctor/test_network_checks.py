@@ -1,0 +1,250 @@
+"""The way to a session, on this machine: names, networks, closed ports, what introduces itself."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from typing import ClassVar
+
+import pytest
+
+from iris_session.client.address import Address
+from iris_session.client.discovery import FoundSession
+from iris_session.doctor import network_checks
+from iris_session.doctor.findings import failed, ok
+from iris_session.doctor.runner import run_checks
+from iris_session.protocol.codec import encode_introduction
+from iris_session.protocol.discovery import Beacon, Introduction
+from iris_session.protocol.names import PROTOCOL_VERSION
+
+
+@contextlib.contextmanager
+def says(data: bytes) -> Iterator[Address]:
+    """Something that says `data` to whoever connects to the port below the address."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(4)
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                visitor, _ = listener.accept()
+                with visitor:
+                    visitor.sendall(data)
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield Address("127.0.0.1", listener.getsockname()[1] + 1)
+        thread.join(5.0)
+
+
+@contextlib.contextmanager
+def says_of_itself(times: int = 1) -> Iterator[Address]:
+    """A session that introduces itself below its control port, whose address this is."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(4)
+        port = listener.getsockname()[1] + 1
+        beacon = Beacon(PROTOCOL_VERSION, "s1", "lab", "live", "127.0.0.1", port, 7722, 0, 0, 0)
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                for _ in range(times):
+                    visitor, _ = listener.accept()
+                    with visitor:
+                        visitor.sendall(encode_introduction(Introduction(beacon)))
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield Address("127.0.0.1", port)
+        thread.join(5.0)
+
+
+def introduction(protocol: int = PROTOCOL_VERSION) -> bytes:
+    beacon = Beacon(protocol, "s1", "lab", "live", "127.0.0.1", 7721, 7722, 0, 0, 0)
+    return encode_introduction(Introduction(beacon, pairing=True, participants=3))
+
+
+def test_a_session_introduces_itself() -> None:
+    with says(introduction()) as address:
+        introduced, version, said = network_checks.check_introduction(address)
+    assert (introduced.state, version.state) == ("ok", "ok")
+    assert "'lab' (live), 3 participants, a join code is open" in introduced.text
+    assert said is not None
+
+
+@pytest.mark.parametrize(("theirs", "older"), [(PROTOCOL_VERSION + 1, "this machine"), (0, "the session")])
+def test_another_version(theirs: int, older: str) -> None:
+    with says(introduction(theirs)) as address:
+        _, version, said = network_checks.check_introduction(address)
+    assert version.failed
+    assert f"version {theirs}" in version.text
+    assert version.advice.startswith(f"update {older}")
+    assert said is None
+
+
+def test_the_base_of_a_block_of_ports_is_told_from_its_control_port() -> None:
+    """`serve --port-base N` is joined at N + 1; at N it introduces itself."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nothing = Address("127.0.0.1", free.getsockname()[1])
+    assert network_checks.check_port_base(nothing) is None
+    with says(b"SSH-2.0-OpenSSH_9.2\r\n" + bytes(64)) as above:
+        assert network_checks.check_port_base(Address("127.0.0.1", above.port - 1)) is None
+    with says_of_itself() as above:
+        base = Address("127.0.0.1", above.port - 1)
+        found = network_checks.check_port_base(base)
+    assert found is not None
+    assert found.failed
+    assert f"port {base.port} is the base of the ports of session 'lab', which is joined at {above}" in found.text
+    assert found.advice == f"use {above}"
+
+
+def test_the_examination_ends_at_the_base_of_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
+    with says_of_itself(times=2) as above:
+        result = run_checks(f"127.0.0.1:{above.port - 1}")
+    found = {one.check: one for one in result.findings}
+    assert found["introduction"].advice == f"use {above}"
+    assert found["join"].state == "skipped"
+    assert not result.ok
+
+
+def test_something_else_introduces_itself() -> None:
+    with says(b"SSH-2.0-OpenSSH_9.2p1 Debian\r\n") as address:
+        introduced, version, _ = network_checks.check_introduction(address)
+    assert introduced.state in ("failed", "warning")
+    assert version.state == "skipped"
+
+
+def test_closed_port() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    found = network_checks.check_tcp(Address("127.0.0.1", port), "127.0.0.1")
+    assert found.failed
+    assert "nothing listens" in found.text
+    introduced, _, _ = network_checks.check_introduction(Address("127.0.0.1", port + 1))
+    assert introduced.state == "warning"
+
+
+def test_open_port() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(1)
+        assert network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1").state == "ok"
+
+
+def test_a_firewall_is_told_from_a_closed_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_checks, "CONNECT_S", 0.2)
+    with socket.socket() as listener, contextlib.ExitStack() as stack:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)  # full after one: the system throws the rest away
+        for _ in range(3):
+            filling = stack.enter_context(socket.socket())
+            filling.setblocking(False)
+            filling.connect_ex(listener.getsockname())
+        found = network_checks.check_tcp(Address("127.0.0.1", listener.getsockname()[1]), "127.0.0.1")
+    assert found.failed
+    assert "firewall" in found.why
+
+
+def test_own_machine_and_own_networks() -> None:
+    assert network_checks.check_subnet("127.0.0.1").state == "ok"
+    assert network_checks.check_subnet("::1").state == "ok"
+    for name, network in network_checks.list_own_networks():
+        inside = str(next(network.hosts()))
+        found = network_checks.check_subnet(inside)
+        assert found.state == "ok"
+        assert name in found.text or str(network) in found.text or "in the network of" in found.text
+
+
+def test_foreign_network() -> None:
+    """Addresses of TEST-NET-3 are in nobody's network."""
+    found = network_checks.check_subnet("203.0.113.77")
+    assert found.state in ("warning", "failed")
+    assert "none of this machine's networks" in found.text
+    assert found.advice
+
+
+def test_names() -> None:
+    found, ip = network_checks.check_address(Address("localhost", 7721))
+    assert found.state == "ok"
+    assert ip in ("127.0.0.1", "::1")
+    for nobody in ("a..b", "x" * 300, ""):
+        found, ip = network_checks.check_address(Address(nobody, 7721))
+        assert (found.state, ip) == ("failed", "")
+        assert network_checks.check_tcp(
+            Address(nobody, 7721), ip
+        ).failed  # not this machine, which an empty address means
+        assert network_checks.check_tcp(Address(nobody, 7721), nobody).failed
+    found, ip = network_checks.check_address(Address("no-such-machine.invalid", 7721))
+    assert found.failed
+    assert ip == ""
+
+
+class Listener:
+    """Hears what it is given."""
+
+    sessions_heard: tuple[FoundSession, ...] = ()
+    ignored: ClassVar[dict[str, int]] = {}
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def wait(self, timeout_s: float) -> None: ...
+
+    def sessions(self) -> list[FoundSession]:
+        return list(self.sessions_heard)
+
+
+def heard(name: str, address: str) -> FoundSession:
+    return FoundSession(name, address, f"id-{address}", "live", "", (address,))
+
+
+@pytest.mark.parametrize(
+    ("sessions", "ignored", "name", "state", "text"),
+    [
+        ((heard("lab", "10.0.0.1:7721"),), {}, "lab", "ok", "10.0.0.1:7721"),
+        ((heard("lab", "10.0.0.1:7721"), heard("lab", "10.0.0.2:7721")), {}, "lab", "failed", "2 sessions"),
+        ((heard("other", "10.0.0.1:7721"),), {}, "lab", "failed", "other (10.0.0.1:7721)"),
+        ((), {}, "", "warning", "no session is heard"),
+        ((), {"other_version": 3}, "", "warning", "another protocol version"),
+        ((heard("lab", "10.0.0.1:7721"),), {}, "", "ok", "lab"),
+    ],
+)
+def test_beacon(
+    monkeypatch: pytest.MonkeyPatch,
+    sessions: tuple[FoundSession, ...],
+    ignored: dict[str, int],
+    name: str,
+    state: str,
+    text: str,
+) -> None:
+    monkeypatch.setattr(network_checks, "LISTEN_S", 0.01)
+    monkeypatch.setattr(network_checks, "BeaconListener", Listener)
+    monkeypatch.setattr(Listener, "sessions_heard", sessions)
+    monkeypatch.setattr(Listener, "ignored", ignored)
+    found, _ = network_checks.check_beacon(name, None)
+    assert found.state == state
+    assert text in found.text
+
+
+def test_sessions_that_are_heard_elsewhere_may_be_meant() -> None:
+    typed = Address("10.0.0.9", 7721)
+    there = [heard("lab", "10.0.0.1:7721"), heard("itself", str(typed))]
+    dead = failed("tcp", "nothing listens", "why", "look")
+    told = network_checks.mention_heard_sessions(dead, typed, there)
+    assert "lab (10.0.0.1:7721)" in told.advice
+    assert "itself" not in told.advice
+    assert (told.text, told.why) == (dead.text, dead.why)
+    assert network_checks.mention_heard_sessions(dead, typed, there[1:]) is dead
+    well = ok("tcp", "takes connections")
+    assert network_checks.mention_heard_sessions(well, typed, there) is well
+
+
+def test_networks_that_cannot_be_used_are_not_told() -> None:
+    assert not any(network.version == 6 and network.is_link_local for _, network in network_checks.list_own_networks())

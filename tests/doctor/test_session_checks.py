@@ -1,0 +1,318 @@
+"""What the doctor makes of a report: one fault at a time, each named by its check, with what to do."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from iris_session.doctor import session_checks
+from iris_session.doctor.drop_explanations import EXPLANATIONS, explain_drops
+from iris_session.doctor.findings import Finding
+from iris_session.doctor.session_checks import (
+    DRIVERS,
+    FULL_DISK,
+    HOLD_ADVICE,
+    LATE_CAUSES,
+    STAGES,
+    check_session_report,
+    measure_stages,
+)
+from iris_session.protocol.common import Pose
+from iris_session.protocol.names import HoldReason, LateCause
+from iris_session.protocol.status import (
+    AlignmentReport,
+    AnchorReport,
+    AnchorSeen,
+    ParticipantReport,
+    Quantiles,
+    RecorderReport,
+    RobotReport,
+    StatusReport,
+)
+
+S = 1_000_000_000
+ORIGIN = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+DOCTOR = ParticipantReport("p9", "doctor", "observer", True, alignment="not_needed")
+ANN = ParticipantReport(
+    "p1",
+    "ann",
+    "operator",
+    True,
+    heard_ns=50_000_000,
+    alignment="measured",
+    alignment_age_ns=60 * S,
+    alignment_error_m=0.004,
+    holds=("left",),
+    samples_per_s=72.0,
+    capture_to_receive=Quantiles(8.0, 20.0),
+    state_age=Quantiles(3.0, 9.0),
+    reported=True,
+)
+LEFT = RobotReport("left", "exclusive", "p1", "ann", "pose", "", Quantiles(1.0, 3.0))
+RIGHT = RobotReport("right", "exclusive", state="hold", hold_reason="no_lease")
+WELL = StatusReport(
+    1,
+    "s1",
+    "lab",
+    600 * S,
+    tick=300_000,
+    tick_period_ns=2_000_000,
+    scheduling="realtime",
+    lateness=Quantiles(0.3, 0.6),
+    step_to_publish=Quantiles(0.4, 1.0),
+    load=0.5,
+    cpus=8,
+    participants=(ANN, DOCTOR),
+    robots=(LEFT, RIGHT),
+    recorder=RecorderReport("running", "/data/session.rrd", 50_000_000, 400_000_000_000),
+    authority_silent_ns=2_000_000,
+)
+
+
+def change(value: Any, **fields: object) -> Any:
+    return msgspec.structs.replace(value, **fields)
+
+
+def with_ann(**fields: object) -> StatusReport:
+    report: StatusReport = change(WELL, participants=(change(ANN, **fields), DOCTOR))
+    return report
+
+
+def troubles(report: StatusReport) -> dict[str, Finding]:
+    return {one.check: one for one in check_session_report(report, "p9") if one.state != "ok"}
+
+
+def only(report: StatusReport, check: str, state: str, *texts: str) -> None:
+    """That exactly this check is not well."""
+    found = troubles(report)
+    assert list(found) == [check]
+    one = found[check]
+    assert one.state == state
+    assert all(text in f"{one.text} {one.why} {one.advice}" for text in texts), one
+
+
+def test_a_session_that_is_well() -> None:
+    assert troubles(WELL) == {}
+
+
+def test_the_doctor_is_not_a_patient() -> None:
+    unwell = change(DOCTOR, role="operator", alignment="none", heard_ns=5 * S)
+    assert troubles(change(WELL, participants=(ANN, unwell))) == {}
+
+
+@pytest.mark.parametrize(
+    ("fields", "state", "text"),
+    [
+        ({"stalled": True, "authority_silent_ns": 3 * S}, "failed", "stands still, for 3.0 s"),
+        ({"authority_silent_ns": 2 * S}, "failed", "stands still, for 2.0 s"),
+        ({"authority_silent_ns": -1}, "failed", "has not taken a step yet"),
+        ({"estop": True}, "failed", "e-stop"),
+        ({"paused": True}, "warning", "paused"),
+    ],
+)
+def test_session(fields: dict[str, object], state: str, text: str) -> None:
+    only(change(WELL, **fields), "session", state, text)
+
+
+def test_nobody_keeps_up_with_a_session_that_stands_still() -> None:
+    """What its people and ticks did before says nothing about now."""
+    blind = with_ann(state_age=None, missed_share=1.0, capture_to_receive=Quantiles(900.0, 900.0))
+    only(change(blind, stalled=True, authority_silent_ns=3 * S), "session", "failed")
+
+
+def test_a_step_that_comes_late_is_no_standstill() -> None:
+    assert troubles(change(WELL, stalled=True, authority_silent_ns=S // 5)) == {}
+
+
+def test_who_drives_needs_an_alignment() -> None:
+    only(with_ann(alignment="none"), "alignment", "failed", "ann has no alignment", "look at the sheet")
+
+
+def test_who_looks_at_another_sheet_is_told_which_there_are() -> None:
+    elsewhere = with_ann(alignment="none", alignment_report=AlignmentReport(unusable=12))
+    report = change(elsewhere, anchors=(AnchorReport("table", ORIGIN), AnchorReport("shelf", ORIGIN)))
+    only(report, "alignment", "failed", "12 observations, none of a sheet of this session", "session: table, shelf")
+    seen = AlignmentReport(unusable=12, seen=(AnchorSeen("table", 3, S),))
+    assert "none of" not in troubles(with_ann(alignment="none", alignment_report=seen))["alignment"].text
+
+
+def test_an_alignment_that_was_lost_is_told_apart() -> None:
+    only(with_ann(alignment="none", alignment_void_ns=4 * S), "alignment", "failed", "lost 4.0 s ago", "jumped")
+
+
+def test_who_only_looks_should_have_one() -> None:
+    looking = change(ANN, alignment="none", role="observer", holds=())
+    report = change(WELL, participants=(looking,), robots=(RIGHT,))
+    only(report, "alignment", "warning", "ann has no alignment")
+
+
+def test_where_nobody_drives_a_screen_needs_none() -> None:
+    screen = change(ANN, alignment="none", role="observer", holds=(), alignment_report=AlignmentReport())
+    shown = change(WELL, participants=(screen,), robots=())
+    assert "alignment" not in troubles(shown)
+    assert "alignment" not in troubles(change(shown, participants=(change(screen, role="operator"),)))
+    headset = change(screen, role="operator", alignment_report=AlignmentReport(unusable=3))
+    only(change(shown, participants=(headset,)), "alignment", "warning", "ann has no alignment (3 observations")
+
+
+def test_no_lease_and_who_has_it() -> None:
+    bob = change(ANN, id="p2", name="bob", holds=(), waits_for=("left",))
+    taken = change(RIGHT, holder="p3", holder_name="carl")
+    carl = change(ANN, id="p3", name="carl", holds=("right",))
+    report = change(WELL, participants=(ANN, bob, carl), robots=(LEFT, taken))
+    only(report, "leases", "warning", "bob has no robot, waits for left", "left: ann", "right: carl", "ask the holder")
+
+
+def test_a_free_robot_is_offered() -> None:
+    bob = change(ANN, id="p2", name="bob", holds=())
+    only(change(WELL, participants=(ANN, bob)), "leases", "warning", "bob has no robot", "right is free")
+
+
+def test_a_robot_kept_for_somebody_who_is_gone() -> None:
+    gone = change(ANN, connected=False, lost="silent")
+    bob = change(ANN, id="p2", name="bob", holds=())
+    found = troubles(change(WELL, participants=(gone, bob), robots=(LEFT,)))
+    assert "ann is gone, left is kept for them" in found["leases"].why
+
+
+def test_directors_need_no_robot() -> None:
+    director = change(ANN, id="p2", name="dora", role="director", holds=())
+    assert troubles(change(WELL, participants=(ANN, director))) == {}
+
+
+@pytest.mark.parametrize("reason", sorted(HOLD_ADVICE))
+def test_robots_that_hold_against_the_will(reason: str) -> None:
+    held = change(LEFT, state="hold", hold_reason=reason)
+    report = change(WELL, robots=(held, RIGHT), participants=(change(ANN, rejected={"stale": 7}),))
+    only(report, "robots", "warning", f"left (ann) holds: {reason}, rejected: stale 7", HOLD_ADVICE[reason])
+
+
+def test_an_open_clutch_is_no_fault() -> None:
+    held = change(LEFT, state="hold", hold_reason=HoldReason.CLUTCH_OPEN)
+    assert troubles(change(WELL, robots=(held, RIGHT))) == {}
+
+
+@pytest.mark.parametrize(
+    ("fields", "state", "text"),
+    [
+        ({"connected": False, "lost": "silent"}, "failed", "connection lost (silent)"),
+        ({"heard_ns": 3 * S // 2}, "failed", "silent for 1.5 s"),
+        ({"missed_share": 0.5}, "warning", "misses 50% of the frames"),
+        ({"state_age": None}, "warning", "gets no state"),
+    ],
+)
+def test_slow_clients(fields: dict[str, object], state: str, text: str) -> None:
+    only(with_ann(**fields), "clients", state, "ann: ", text)
+
+
+def test_data_age_names_the_guilty_stage() -> None:
+    only(
+        with_ann(capture_to_receive=Quantiles(50.0, 90.0)), "age", "warning", "device -> front is slow", "90.0 ms (ann)"
+    )
+    slow = change(WELL, robots=(change(LEFT, receive_to_step=Quantiles(10.0, 60.0)), RIGHT))
+    only(slow, "age", "warning", "front -> authority is slow", "60.0 ms (left)")
+    only(change(WELL, step_to_publish=Quantiles(9.0, 40.0)), "age", "warning", "authority -> state is slow")
+    only(with_ann(state_age=Quantiles(90.0, 400.0)), "age", "warning", "state -> client is slow")
+
+
+def test_the_worst_stage_is_blamed_not_the_longest() -> None:
+    report = change(with_ann(state_age=Quantiles(90.0, 160.0)), step_to_publish=Quantiles(1.0, 90.0))
+    assert "authority -> state is slow" in troubles(report)["age"].text
+
+
+def test_ages_of_every_stage() -> None:
+    assert set(measure_stages(WELL.participants, WELL)) == set(STAGES)
+    assert measure_stages((), change(WELL, robots=(), step_to_publish=None)) == {}
+
+
+@pytest.mark.parametrize("cause", sorted(LATE_CAUSES))
+def test_late_ticks_name_their_cause(cause: str) -> None:
+    report = change(WELL, late_share=0.01, late_causes={LateCause.SCHEDULER: 1, cause: 40})
+    only(report, "ticks", "warning", f"{cause}: {LATE_CAUSES[cause][0]}", LATE_CAUSES[cause][1])
+
+
+def test_very_late_ticks_are_a_failure() -> None:
+    only(change(WELL, late_share=0.2, late_causes={"physics": 900}), "ticks", "failed", "20.00% late")
+
+
+def test_every_cause_is_explained() -> None:
+    names = {value for name, value in vars(LateCause).items() if name.isupper()}
+    assert names | {"skipped"} == set(LATE_CAUSES)
+
+
+@pytest.mark.parametrize(
+    ("state", "text"), [("hangs", "does not answer"), ("failed", "no space left"), ("dead", "no space left")]
+)
+def test_recorder(state: str, text: str) -> None:
+    report = change(WELL, recorder=change(WELL.recorder, state=state, text="no space left"))
+    only(report, "recorder", "failed", text)
+
+
+def test_lost_rows_are_told() -> None:
+    only(change(WELL, recorder=change(WELL.recorder, lost_rows=12)), "recorder", "warning", "12 rows lost")
+
+
+def test_disk() -> None:
+    full = change(WELL.recorder, disk_free_bytes=FULL_DISK - 1)
+    only(change(WELL, recorder=full), "disk", "failed", "full")
+    # 50 MB in ten minutes: 83 kB/s. 10 GB last for more than a day, at 100 times the rate for 20 minutes.
+    assert troubles(change(WELL, recorder=change(WELL.recorder, disk_free_bytes=10_000_000_000))) == {}
+    soon = change(WELL.recorder, bytes_written=5_000_000_000, disk_free_bytes=10_000_000_000)
+    only(change(WELL, recorder=soon), "disk", "warning", "about 20 minutes")
+
+
+def test_without_recording() -> None:
+    assert troubles(change(WELL, recorder=RecorderReport())) == {}
+    assert troubles(change(WELL, recorder=None)) == {}
+
+
+def test_restarts_and_warnings() -> None:
+    only(change(WELL, restarts={"front": 2, "recorder": 0}), "drops", "warning", "front 2 times")
+    only(change(WELL, warnings=("physics stands still until a reset",)), "warnings", "warning", "physics stands still")
+
+
+def test_what_drops_mean_is_told() -> None:
+    (found,) = (
+        one
+        for one in check_session_report(change(WELL, drops={"send_queue_full": 2, "odd": 1}), "p9")
+        if one.check == "drops"
+    )
+    assert found.text == "dropped so far: send_queue_full 2 (answers and events to who did not read in time), odd 1"
+    meaning = "requests for pieces of the scene that were refused"
+    assert explain_drops({"assets_unknown_asset": 3}) == f"assets_unknown_asset 3 ({meaning})"
+
+
+def test_every_reason_that_the_front_counts_is_explained() -> None:
+    rooms = Path(session_checks.__file__).parents[1]
+    counted: set[str] = set()
+    for path in (
+        *(rooms / "front").rglob("*.py"),
+        *(rooms / "alignment").glob("*.py"),
+        *(rooms / "link").glob("*.py"),
+        *(rooms / "security").glob("*.py"),
+        rooms / "session" / "processes.py",
+    ):
+        counted |= set(re.findall(r"""drops(?:\.count\(|\[)\s*"([a-z_]+)\"""", path.read_text()))
+    assert {"send_queue_full", "journal_rows", "unknown_key"} <= counted
+    assert not counted - set(EXPLANATIONS)
+
+
+@pytest.mark.parametrize(
+    ("tick", "text"),
+    [
+        (0, "steps, and nothing has moved so far: no tick was taken, no pose published"),
+        (7, "steps: tick 7, at the pace of the program that owns it"),
+    ],
+)
+def test_a_pace_that_is_not_ours_is_not_told(tick: int, text: str) -> None:
+    """The carrier of a scene without physics has a tick of a millisecond: nobody steps at 1000 Hz."""
+    report = change(WELL, lateness=None, tick=tick, tick_period_ns=1_000_000)
+    assert check_session_report(report, "p9")[0] == Finding("session", "ok", text)
+
+
+def test_drivers_are_who_may_hold_robots_but_directors() -> None:
+    assert {"operator", "agent", "leader"} == DRIVERS

@@ -1,0 +1,140 @@
+"""Child processes: start, read, stop; no file of the working folder is imported, and a checkout finds itself."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from iris_session.recording import Recording
+from iris_session.system import process
+from iris_session.system.process import DEVNULL, PIPE, ChildProcess
+
+ROOT = Path(__file__).parents[2]
+#: Names of users' own scripts that child processes of a session import as modules.
+TRAPS = ("queue", "zmq", "json", "random", "select", "selectors", "anchors", "msgspec", "numpy", "rerun", "rich")
+TRAP = "raise SystemExit('a file of the working folder was taken for a module')"
+SERVE = ("serve", "handover", "--no-beacon", "--control-port", "0", "--state-port", "0", "--seconds", "0.5")
+#: What the installed command does. An empty part of PYTHONPATH means the working folder, too.
+INSTALLED = """
+import os
+from iris_session.cli.main import main
+os.environ["PYTHONPATH"] = os.pathsep
+raise SystemExit(main())
+"""
+#: Starts a child from a package that only this process can import, as in a checkout that is not installed.
+FROM_CHECKOUT = """
+import subprocess, sys
+sys.path.insert(0, sys.argv[1])
+from iris_session.system.process import child_environment, module_command
+subprocess.run(module_command("iris_session.where", "a", "b"), env=child_environment(), check=True)
+"""
+
+
+@pytest.fixture
+def trapped(tmp_path: Path) -> Path:
+    """A working folder with files named as modules are."""
+    for name in TRAPS:
+        (tmp_path / f"{name}.py").write_text(TRAP)
+    return tmp_path
+
+
+def test_session_imports_nothing_from_the_working_folder(trapped: Path) -> None:
+    """With its front, its recorder and its display: started as the installed command is, without that folder."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", INSTALLED, *SERVE, "--record", "session.rrd"],
+        cwd=trapped, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "taken for a module" not in done.stdout + done.stderr
+    with Recording.open(trapped / "session.rrd") as recording:
+        assert recording.finished
+
+
+def test_probe_imports_nothing_from_the_working_folder(trapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(trapped)
+    done = subprocess.run(
+        process.module_command("iris_session.recording.probe"),
+        env=process.child_environment(), input='["readable", "/none"]\n', capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "taken for a module" not in done.stderr
+    assert (done.returncode, done.stdout) == (0, "0\n")
+
+
+def test_a_checkout_that_is_not_installed_starts_its_own_modules(tmp_path: Path) -> None:
+    checkout, elsewhere = tmp_path / "checkout", tmp_path / "elsewhere"
+    package = checkout / "iris_session"
+    (package / "system").mkdir(parents=True)
+    elsewhere.mkdir()
+    (package / "__init__.py").touch()
+    (package / "system" / "__init__.py").touch()
+    shutil.copy(process.__file__, package / "system" / "process.py")
+    (package / "where.py").write_text("import sys; print(__file__, *sys.argv[1:])")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", FROM_CHECKOUT, str(checkout)],
+        cwd=elsewhere, env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == [str(package / "where.py"), "a", "b"]
+
+
+def test_the_environment_keeps_folders_that_the_user_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(["", "/opt/mine", "", "/opt/yours"]))
+    made = process.child_environment(RERUN="on")
+    assert made["PYTHONPATH"].split(os.pathsep)[-2:] == ["/opt/mine", "/opt/yours"]
+    assert "" not in made["PYTHONPATH"].split(os.pathsep)
+    assert made["RERUN"] == "on"
+    assert made["PATH"] == os.environ["PATH"]
+
+
+def test_only_this_module_runs_the_interpreter() -> None:
+    calling = [path for path in (ROOT / "iris_session").rglob("*.py") if "sys.executable" in path.read_text()]
+    assert calling == [Path(process.__file__)]
+
+
+@pytest.fixture
+def module_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder where children find modules."""
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    return tmp_path
+
+
+@pytest.mark.parametrize("size", [0, 1000, 1_000_000])
+def test_child_reads_configuration_and_answers_in_lines(module_folder: Path, size: int) -> None:
+    (module_folder / "echo_length.py").write_text(
+        "import sys; print(len(sys.stdin.buffer.read())); print('cut', end='')"
+    )
+    with ChildProcess("echo_length", config=bytes(1_000_000), stdout=PIPE) as child:
+        assert child.read_line(30.0) == b"1000000"
+        with pytest.raises(EOFError):
+            child.read_line(30.0)
+        assert child.wait(30.0) == 0
+        assert child.exit_status == 0
+        assert not child.is_running
+
+
+def test_child_that_writes_nothing_times_out_and_is_killed(module_folder: Path) -> None:
+    (module_folder / "deaf.py").write_text(
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
+    )
+    with ChildProcess("deaf", stdout=PIPE, stderr=DEVNULL) as child:
+        assert child.read_line(30.0) == b"up"
+        with pytest.raises(TimeoutError):
+            child.read_line(0.01)
+        assert child.read_available_lines() == []
+        assert child.close(terminate_s=0.05) == -signal.SIGKILL
+        assert child.close() == -signal.SIGKILL
+
+
+def test_child_exits_at_the_end_of_its_input(module_folder: Path) -> None:
+    (module_folder / "echo.py").write_text("import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)")
+    child = ChildProcess("echo", stdout=PIPE)
+    child.write(b"a\nb\n")
+    assert [child.read_line(30.0), child.read_line(30.0)] == [b"A", b"B"]
+    assert child.stop(exit_s=30.0) == 0
+    child.close()
