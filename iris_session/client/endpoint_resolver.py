@@ -39,7 +39,7 @@ from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused, Welcome
-from iris_session.security import KeyHome, KeyPair, KeysError, KnownServer, fingerprint, raw_key
+from iris_session.security import KeyHome, KeyPair, KeysError, KnownServer, compute_fingerprint, decode_key
 
 LOCAL_ADDRESS: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
 INTRODUCTION_S: Final = 2.5
@@ -202,7 +202,7 @@ class EndpointResolver:
             )
         if not key:
             return None if key is None else Endpoint(address, None, session_id, name)
-        own = home.identity()
+        own = home.load_identity()
         if code and (self._repair or not trust.is_known(key)):
             self.note = f"pairing with the session at {address}"
             yield from pair_key(address, key, own, code, default_key_name())
@@ -370,7 +370,7 @@ class ServerTrust:
         self._home = home
         self._address = address
         self._session = session
-        self._known = home.servers.read()
+        self._known = home.known_servers.read()
 
     @property
     def stored(self) -> str:
@@ -421,7 +421,7 @@ class ServerTrust:
     def store(self, session: str, key: str) -> None:
         """Store `key` for the address. Raises `TrustError` when another one is there."""
         try:
-            self._home.servers.pin(str(self._address), session, key)
+            self._home.known_servers.pin(str(self._address), session, key)
         except KeysError as error:
             raise TrustError(str(error)) from error
 
@@ -434,13 +434,13 @@ class ServerTrust:
 
 
 def _fingerprint_or_none(key: str) -> str:
-    return fingerprint(raw_key(key)) if key else "none"
+    return compute_fingerprint(decode_key(key)) if key else "none"
 
 
 def known_fingerprints() -> frozenset[str]:
     """Return the fingerprint of every stored key. Raises `TrustError` when the file cannot be read."""
     try:
-        return frozenset(one.fingerprint for one in KeyHome().servers.read())
+        return frozenset(one.fingerprint for one in KeyHome().known_servers.read())
     except KeysError as error:
         raise TrustError(str(error)) from error
 
@@ -476,7 +476,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
         TrustError: The session could not prove that it knows the code, so it is not the one that gave it out.
         NotConnectedError: No answer.
     """
-    server_public = raw_key(server_key)
+    server_public = decode_key(server_key)
     try:
         secret = pairing.stretch(code, server_public)
     except ValueError as error:

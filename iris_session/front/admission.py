@@ -15,8 +15,8 @@ from iris_session.protocol.limits import Drops, RateLimiter
 from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.security import fingerprint
-from iris_session.security.keyring import Keyring, roles_behind
+from iris_session.security import compute_fingerprint
+from iris_session.security.keyring import Keyring, select_gateway_roles
 from iris_session.security.resume_tokens import ResumeTokens
 
 SECRET_BYTES = 16  # 128 bits, made by the client
@@ -90,7 +90,7 @@ class Admission:
         share = max_connections_per_key(limit)
         if not resume_of and self._count_connections(gateway.key_id if gateway else key_id) >= share:
             raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
-        number = self._tokens.new_connection()
+        number = self._tokens.allocate_connection()
         connection = FrontConnection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
         join = Join(
             key_id,
@@ -165,22 +165,22 @@ class Admission:
                 f"hello has a secret of {len(hello.secret)} bytes, at least {SECRET_BYTES} are needed",
                 "make 16 random bytes once, keep them, and send them in every hello",
             )
-        return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
+        return compute_fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
     def _find_roles(self, key_id: str, gateway: FrontConnection | None) -> tuple[str, ...]:
         """What the key may join as, empty for any role."""
-        entry = self._keyring.find(gateway.key_id if gateway else key_id)
-        if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
+        entry = self._keyring.find_key(gateway.key_id if gateway else key_id)
+        if self._tokens.is_revoked(key_id) or (entry is None and self._keyring.key is not None):
             raise _RefusedError(
                 RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
             )
         roles = () if entry is None else entry.roles
-        return roles if gateway is None else roles_behind(roles)
+        return roles if gateway is None else select_gateway_roles(roles)
 
     def _find_resumed(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
         if not hello.resume_token:
             return ""
-        participant_id = self._tokens.find(hello.resume_token, key_id)
+        participant_id = self._tokens.find_participant(hello.resume_token, key_id)
         if participant_id is None:
             self._audit.record(
                 AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
@@ -201,7 +201,7 @@ class Admission:
         behind = gateway.key_id if gateway is not None else ""
         token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
         connection.admitted = True
-        self._keyring.welcomed(connection.key_id)
+        self._keyring.record_join(connection.key_id)
         connection.participant_id = admitted.participant_id
         for let_in in self.lets_in:
             let_in()
@@ -233,9 +233,9 @@ class Admission:
 
     def expire_tokens(self, participant_id: str) -> None:
         """A participant is gone for good: its tokens open nothing any more."""
-        self._tokens.left(participant_id)
+        self._tokens.remove_participant(participant_id)
 
     def confirm(self, connection: FrontConnection) -> None:
         """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
         if connection.hello.resume_token:
-            self._tokens.retire(connection.hello.resume_token)
+            self._tokens.use_up(connection.hello.resume_token)

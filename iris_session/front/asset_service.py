@@ -118,7 +118,9 @@ class AssetService:
 
     def _publish_access(self, listeners: dict[int, str]) -> None:
         keyring = self._keyring
-        marks = frozenset() if keyring.key is None else frozenset(m for m in keyring.marks if not self._revoked(m))
+        marks = (
+            frozenset() if keyring.key is None else frozenset(m for m in keyring.fingerprints if not self._revoked(m))
+        )
         table = AssetAccess(listeners, marks, self._folders)
         if table != self._published:
             self._published = table

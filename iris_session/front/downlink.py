@@ -24,7 +24,7 @@ from iris_session.protocol.server_messages import (
     ServerMessage,
     Snapshot,
 )
-from iris_session.protocol.steps import Outgoing
+from iris_session.protocol.steps import OutgoingMessage
 
 _MAX_MESSAGES = 64  # messages taken at once
 #: Why a director ends a participation: nobody joins again by itself after that.
@@ -143,7 +143,7 @@ class Downlink:
             if dropped.key_id:
                 self._revocation.revoke(dropped.key_id, self.heard_ns)
 
-    def _send_outgoing(self, outgoing: Outgoing) -> None:
+    def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
         connection = self._clients.by_number.get(outgoing.connection)
         if connection is None:

@@ -24,7 +24,8 @@ from iris_session.link.sockets import (
     watch_tcp,
 )
 from iris_session.protocol.limits import Drops
-from iris_session.security.keyring import open_keyring
+from iris_session.security import KeysError
+from iris_session.security.keyring import Keyring, open_keyring
 from iris_session.security.zap import Authenticator
 
 
@@ -62,7 +63,7 @@ class FrontSockets:
 
     def _open(self, refused: Callable[[str, str], None]) -> None:
         config = self._config
-        self.keyring = open_keyring(config, self._drops)
+        self.keyring = self._open_keyring()
         key = self.keyring.key
         self.authenticator = Authenticator(self.context, self.keyring, self._drops, refused) if key else None
         self.listeners: Listeners
@@ -93,6 +94,16 @@ class FrontSockets:
             bound_port(ingest),
             bound_port(self.assets.socket),
         )
+
+    def _open_keyring(self) -> Keyring:
+        """Return the session's keyring, an empty one on plain loopback. Raises `FrontError`."""
+        config = self._config
+        if config.loopback and not (config.curve or config.curve_secret_file):
+            return Keyring(drops=self._drops)
+        try:
+            return open_keyring(config.key_home, config.curve_secret_file, config.curve_clients_dir, self._drops)
+        except KeysError as error:
+            raise FrontError(str(error)) from error
 
     def open_state(self, port: int) -> Watched:
         """A state socket; the one before must be closed. Raises `FrontError` while its port is not free yet."""

@@ -38,8 +38,8 @@ from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
-from iris_session.security import fingerprint, raw_key
-from iris_session.security.keyring import stranger_key
+from iris_session.security import compute_fingerprint, decode_key
+from iris_session.security.keyring import parse_pairing_key
 
 #: Faults to strangers, per second: they have no connection to count on.
 _UNKNOWN_PEER_FAULTS: Final = 20
@@ -133,7 +133,7 @@ class Intake:
             self._count_rejection(peer, None, now_ns)
             self._pairing.handle_pair(route, peer, message, now_ns)
             return
-        if stranger_key(peer.user_id):
+        if parse_pairing_key(peer.user_id):
             self._reject_unpaired(route, peer, message, now_ns)
             return
         connection = self._clients.by_route.get(route)
@@ -171,7 +171,7 @@ class Intake:
         """A key that is not on the list said something else than `Pair`."""
         self._drops.count("unpaired")
         self._count_rejection(peer, None, now_ns)
-        mark, name = fingerprint(raw_key(stranger_key(peer.user_id))), getattr(message, "name", "")
+        mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
         self._audit.record(
             AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=tag_of(type(message))

@@ -170,7 +170,7 @@ class Front:
         self.cut_off = False
         self._authenticator = sockets.authenticator
         if self._authenticator is not None:
-            self._authenticator.banned = self._tokens.revoked
+            self._authenticator.is_revoked = self._tokens.is_revoked
         self._uplink = Uplink(
             self._link,
             config.limits.unacknowledged,
@@ -213,7 +213,7 @@ class Front:
             self._keyring,
             self._drops,
             self._status.find_report,
-            self._tokens.revoked,
+            self._tokens.is_revoked,
             lambda: self._publisher.frames,
             adapt=self._config.adapt_media,
         )
@@ -222,7 +222,7 @@ class Front:
         sockets, encrypted, limits = self._sockets.assets, self._keyring.key is not None, self._config.limits
         guard = ChannelGuard(sockets.monitor, limits, limits.subscribers, REQUEST_BYTES, curve=encrypted, name="assets")
         server = AssetServer(sockets, guard, self.now_ns)
-        return AssetService(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.revoked)
+        return AssetService(server, self._clients, self._keyring, self._drops, self._publisher, self._tokens.is_revoked)
 
     def _open_state_again(self) -> zmq.Socket[bytes]:
         state = self._sockets.open_state(self._sockets.ports.state)
@@ -263,7 +263,7 @@ class Front:
         """One pass of the loop. True when clients still have something to say."""
         self._downlink.drain()
         if self._authenticator is not None:
-            self._authenticator.answer()
+            self._authenticator.answer_requests()
         more = True
         for _ in range(ROUNDS):
             self._departures.drain_monitor()

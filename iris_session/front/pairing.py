@@ -22,10 +22,10 @@ from iris_session.protocol.client_messages import Pair
 from iris_session.protocol.limits import Drops, TokenBucket
 from iris_session.protocol.names import AuditKind, RefusalCode
 from iris_session.protocol.server_messages import Paired, Refused
-from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, fingerprint, raw_key
-from iris_session.security.file_worker import PATIENCE_S
-from iris_session.security.join_codes import Attempt
-from iris_session.security.keyring import Keyring, stranger_key
+from iris_session.security import JoinCode, KeyHome, KeyPair, KeysBusyError, KeysError, compute_fingerprint, decode_key
+from iris_session.security.join_codes import RedeemResult
+from iris_session.security.keyring import Keyring, parse_pairing_key
+from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
 #: Of everybody together.
 PER_SECOND: Final = 10.0
@@ -84,17 +84,17 @@ class PairingService:
         home, key = self._keyring.home, self._keyring.key
         if home is None or key is None:
             return False
-        signature = home.codes.signature
+        signature = home.join_codes.signature
         if signature != self._signature or (self._unread and time.monotonic() >= self._again_s):
             self._signature = signature
             self._read_codes(home, key)
         now_s = time.time()
-        return any(code.open(now_s) for code in self._codes)
+        return any(code.is_open(now_s) for code in self._codes)
 
     def _read_codes(self, home: KeyHome, key: KeyPair) -> None:
         """What cannot be read now is read again a second later, and complained about once."""
         try:
-            self._codes, unread = home.codes.of(key.fingerprint), ""
+            self._codes, unread = home.join_codes.list_open(key.fingerprint), ""
         except KeysError as error:
             self._codes, unread = (), str(error)
             self._again_s = time.monotonic() + RETRY_S
@@ -105,8 +105,8 @@ class PairingService:
     def handle_pair(self, route: Route, peer: Peer, pair: Pair, now_ns: int) -> None:
         """One `Pair` of a key that is on the list, or is not."""
         address = peer_of(peer.descriptor)[0]
-        key = stranger_key(peer.user_id)
-        known = self._keyring.find(peer.user_id)
+        key = parse_pairing_key(peer.user_id)
+        known = self._keyring.find_key(peer.user_id)
         if known is not None:
             key = known.key
         taken = self._allow_address(address, now_ns)
@@ -128,12 +128,12 @@ class PairingService:
             self._refuse(route, "a key pairs for itself", "leave on_behalf_of empty")
         elif self._keyring.home is None:
             self._refuse(route, "this session takes its keys from a folder", "ask for your public key to be put there")
-        elif fingerprint(raw_key(key)) in self._keyring.revoking:
+        elif compute_fingerprint(decode_key(key)) in self._keyring.pending_revocations:
             self._refuse(route, REVOKED, "ask for another join code")
         elif (again := self._find_earlier_answer(key, pair)) is not None:
             self._outbox.send_to_route(route, again)
         elif not self.has_open_code:
-            mark = fingerprint(raw_key(key))
+            mark = compute_fingerprint(decode_key(key))
             self._audit.record(AuditKind.CODE_REFUSED, now_ns, subject=mark, name=pair.name, address=address)
             self._refuse(route, "no join code can be used now", "run `iris-session pair` where the session runs")
         else:
@@ -142,9 +142,9 @@ class PairingService:
     def _find_earlier_answer(self, key: str, pair: Pair) -> Paired | None:
         """The answer to an attempt that succeeded, where it is made again: the first may have been lost, or too late.
         `None` where it is another one, and for a key that is off the list by now."""
-        mark = fingerprint(raw_key(key))
+        mark = compute_fingerprint(decode_key(key))
         proof, answer = self._recently_paired.get(mark, (b"", None))
-        return answer if pairing.same(proof, pair.proof) and self._keyring.find(mark) is not None else None
+        return answer if pairing.same(proof, pair.proof) and self._keyring.find_key(mark) is not None else None
 
     def tick(self, now_ns: int) -> None:
         """Begins the next attempt when the one before is done."""
@@ -167,7 +167,7 @@ class PairingService:
         """Lets an attempt wait on, or ends it: much may have happened since it came."""
         if now_ns - one.since_ns > PATIENCE_NS:
             self._refuse_busy(one.route)
-        elif fingerprint(raw_key(one.key)) in self._keyring.revoking:
+        elif compute_fingerprint(decode_key(one.key)) in self._keyring.pending_revocations:
             self._refuse(one.route, REVOKED, "ask for another join code")
         elif self._has_exhausted_attempts(one.address, now_ns):
             self._refuse(one.route, SHUT_OUT, "wait ten minutes")
@@ -175,10 +175,10 @@ class PairingService:
             self._pending.append(one)
 
     def _on_attempt_done(
-        self, waiting: _PendingAttempt, key: KeyPair, outcome: Attempt | KeysError, now_ns: int
+        self, waiting: _PendingAttempt, key: KeyPair, outcome: RedeemResult | KeysError, now_ns: int
     ) -> None:
         self._trying = False
-        if isinstance(outcome, Attempt):
+        if isinstance(outcome, RedeemResult):
             self._answer(waiting, outcome, key, now_ns)
         elif isinstance(outcome, KeysBusyError):
             self._refuse_busy(waiting.route)
@@ -190,14 +190,14 @@ class PairingService:
     def close(self) -> None:
         """Nothing was opened."""
 
-    def _answer(self, waiting: _PendingAttempt, attempt: Attempt, key: KeyPair, now_ns: int) -> None:
-        client = raw_key(waiting.key)
-        mark = fingerprint(client)
+    def _answer(self, waiting: _PendingAttempt, attempt: RedeemResult, key: KeyPair, now_ns: int) -> None:
+        client = decode_key(waiting.key)
+        mark = compute_fingerprint(client)
         entry = attempt.entry
         if entry is not None:
             self._wrong.pop(_network_prefix(waiting.address), None)
-            revoked = mark in self._keyring.revoking  # since it asked: the later word counts
-            if revoked or not self._keyring.paired(mark):
+            revoked = mark in self._keyring.pending_revocations  # since it asked: the later word counts
+            if revoked or not self._keyring.confirm_pairing(mark):
                 self._refuse(waiting.route, REVOKED, "ask for another join code")
                 return
             roles = ", ".join(entry.roles) or "any role"
@@ -253,10 +253,10 @@ class PairingService:
         print(f"iris-session: pairing does not work: {error}", file=sys.stderr, flush=True)
 
 
-def _run_attempt(home: KeyHome, key: KeyPair, waiting: _PendingAttempt) -> Attempt:
+def _run_attempt(home: KeyHome, key: KeyPair, waiting: _PendingAttempt) -> RedeemResult:
     pair = waiting.pair
     name = "".join(c for c in pair.name if c.isprintable()).strip() or "unnamed"
-    return home.codes.attempt(key.raw_public, waiting.key, pair.proof, name, home.clients, PATIENCE_S)
+    return home.join_codes.redeem(key.raw_public, waiting.key, pair.proof, name, home.clients, LOCK_TIMEOUT_S)
 
 
 def _network_prefix(address: str) -> str:

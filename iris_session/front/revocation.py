@@ -23,9 +23,9 @@ from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
-from iris_session.security.file_worker import PATIENCE_S
-from iris_session.security.keyring import Keyring, roles_behind
+from iris_session.security.keyring import Keyring, select_gateway_roles
 from iris_session.security.resume_tokens import ResumeTokens
+from iris_session.system.file_worker import LOCK_TIMEOUT_S
 
 CHECK_PERIOD_NS: Final = 100 * MILLISECOND
 #: Between the fault and the end of the TCP connection, so that the fault arrives.
@@ -71,7 +71,7 @@ class RevocationService:
 
     def revoke(self, key_id: str, now_ns: int) -> None:
         """A director's word: ends the key here, and takes it off the list."""
-        self._keyring.revoking[key_id] = None
+        self._keyring.pending_revocations[key_id] = None
         self._disconnect_key(key_id, now_ns, "a director revoked this key")
 
     def disconnect(self, connection: FrontConnection, text: str, now_ns: int, reason: str = "revoked") -> None:
@@ -88,20 +88,20 @@ class RevocationService:
         if now_ns >= self._next_look_ns:
             self._next_look_ns = now_ns + CHECK_PERIOD_NS
             self._write_allow_list(now_ns)
-            self._keyring.look()
-        if self._keyring.gone:
-            gone_keys, self._keyring.gone = self._keyring.gone, {}
+            self._keyring.reload_if_changed()
+        if self._keyring.removed:
+            gone_keys, self._keyring.removed = self._keyring.removed, {}
             for mark, old in gone_keys.items():
-                now = self._keyring.find(mark)
-                if now is None and self._tokens.revoked(mark):
+                now = self._keyring.find_key(mark)
+                if now is None and self._tokens.is_revoked(mark):
                     continue  # a director did it: all is done
                 if now is None:
                     self._audit.record(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
                     self._disconnect_key(mark, now_ns, REVOKED)
                 else:
                     self._apply_roles(mark, now.roles, now_ns)
-        while self._keyring.come:
-            self._tokens.forgive(self._keyring.come.popitem()[0])
+        while self._keyring.added:
+            self._tokens.reinstate_key(self._keyring.added.popitem()[0])
         if self._state_due_ns:
             self._reopen_state(now_ns)
 
@@ -116,11 +116,11 @@ class RevocationService:
                 self.disconnect(one, GATEWAY_REVOKED, now_ns)
             self.disconnect(connection, text, now_ns)
             self._lose(connection, "revoked")  # and those behind it
-        for participant in self._tokens.revoke(key_id):
+        for participant in self._tokens.revoke_key(key_id):
             self._remove_participant(participant, "key revoked", now_ns)
-        if key_id in self._keyring.watching and not self._state_due_ns:
+        if key_id in self._keyring.state_subscribers and not self._state_due_ns:
             self._publisher.replace_socket(None)
-            self._keyring.watching.clear()
+            self._keyring.state_subscribers.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
     def _apply_roles(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
@@ -131,7 +131,7 @@ class RevocationService:
             if roles and connection.hello.role not in roles:
                 lost = [*behind, connection]
             else:
-                left = roles_behind(roles)
+                left = select_gateway_roles(roles)
                 lost = [one for one in behind if left and one.hello.role not in left]
             for one in lost:
                 self._disconnect_role(one, now_ns)
@@ -145,7 +145,7 @@ class RevocationService:
         if not connection.gateway:
             close_tcp(connection.peer.descriptor, connection.address)
         if participant:
-            self._tokens.left(participant)
+            self._tokens.remove_participant(participant)
             self._remove_participant(participant, ROLE_TAKEN, now_ns)
 
     def _list_connections(self, key_id: str) -> list[FrontConnection]:
@@ -168,26 +168,26 @@ class RevocationService:
         """Has the list changed. What it says is decided already: nobody waits for the file."""
         keyring = self._keyring
         if keyring.home is None:
-            keyring.revoking.clear()
+            keyring.pending_revocations.clear()
             return
-        due = bool(keyring.seen) and now_ns >= self._next_seen_ns
-        if self._writing or not (keyring.revoking or due):
+        due = bool(keyring.last_seen) and now_ns >= self._next_seen_ns
+        if self._writing or not (keyring.pending_revocations or due):
             return
-        marks, seen = tuple(keyring.revoking), keyring.seen if due else {}
+        marks, seen = tuple(keyring.pending_revocations), keyring.last_seen if due else {}
         job = partial(_change_allow_list, keyring.home.clients, marks, seen)
         self._writing = keyring.files.submit(job, partial(self._on_written, marks, seen))
         if self._writing and due:
             self._next_seen_ns = now_ns + SEEN_NS
-            keyring.seen = {}
+            keyring.last_seen = {}
 
     def _on_written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
         self._writing = False
         keyring = self._keyring
         if outcome is None:
             for mark in marks:
-                keyring.revoking.pop(mark, None)
+                keyring.pending_revocations.pop(mark, None)
             return
-        keyring.seen = {**seen, **keyring.seen}
+        keyring.last_seen = {**seen, **keyring.last_seen}
         if not isinstance(outcome, KeysBusyError) and str(outcome) != self._reported_error:
             self._reported_error = str(outcome)  # the key stays out of this session; its file is tried again
             print(f"iris-session: the allow-list cannot be changed: {outcome}", file=sys.stderr, flush=True)
@@ -195,6 +195,6 @@ class RevocationService:
 
 def _change_allow_list(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
     for mark in marks:
-        clients.revoke(mark, PATIENCE_S)
+        clients.revoke_key(mark, LOCK_TIMEOUT_S)
     if seen:
-        clients.seen(seen, PATIENCE_S)
+        clients.record_last_seen(seen, LOCK_TIMEOUT_S)

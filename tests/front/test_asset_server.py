@@ -250,12 +250,12 @@ def test_only_the_own_key_fetches_and_a_revoked_one_does_not(lab: Lab, tmp_path:
     bob, other = lab.allowed("bob")
     anns = shop.welcome(shop.fetcher(client, lab.curve(ann)))
     assert anns.answer(anns.ask(shop.addresses[0])) == shop.data[0][:MIB]
-    eve = shop.fetcher(client, lab.curve(KeyPair.new()))
+    eve = shop.fetcher(client, lab.curve(KeyPair.generate()))
     eve.ask(shop.addresses[1])
     posing = shop.fetcher(client, lab.curve(bob))
     assert posing.answer(posing.ask(shop.addresses[1])) == AssetRefusal.NOT_ALLOWED
     shop.session.pump(lambda: shop.drops("assets_unknown_key") > 0, "eve's key is refused")
-    lab.home.clients.revoke(ann.fingerprint)
+    lab.home.clients.revoke_key(ann.fingerprint)
     lab.audits("key_revoked")
     bobs = shop.welcome(shop.fetcher(other, lab.curve(bob)))
     before = anns.take()

@@ -113,7 +113,7 @@ def test_they_are_so_many_at_most() -> None:
 
 def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
     listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
-    desk = Desk(Keyring(KeyPair.new(), read=lambda: listed))
+    desk = Desk(Keyring(KeyPair.generate(), read=lambda: listed))
     desk.join(1, "ann")
     desk.join(2, "gate")
     desk.join(3, "bob", gateway=2)

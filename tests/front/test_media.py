@@ -324,7 +324,7 @@ def test_only_the_own_key_opens_a_connections_media(locked: tuple[Lab, Stage]) -
     bob, other = lab.allowed("bob")
     stage.joined(client)
     stage.joined(other, "bob")
-    eves = stage.viewer(client, lab.curve(KeyPair.new()))
+    eves = stage.viewer(client, lab.curve(KeyPair.generate()))
     bobs = stage.viewer(client, lab.curve(bob))
     stage.drops("unknown_key")
     stage.drops("media_refused")
@@ -348,7 +348,7 @@ def test_a_revoked_key_gets_no_more_media_and_the_others_go_on(locked: tuple[Lab
     stage.joined(other, "bob")
     anns, bobs = stage.viewer(client, lab.curve(ann)), stage.viewer(other, lab.curve(bob))
     stage.until(lambda: min(anns.take(), bobs.take()) >= 1, "media")
-    lab.home.clients.revoke(ann.fingerprint)
+    lab.home.clients.revoke_key(ann.fingerprint)
     lab.audits("key_revoked")
     stage.until(lambda: bobs.take() >= 0 and _quiet(anns), "nothing more for ann")
     last, seen = len(anns.got), bobs.take()
@@ -371,8 +371,8 @@ def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) ->
     bob, viewing = lab.allowed("bob", "operator", "observer")
     stage.joined(viewing, "bob")
     viewer = stage.viewer(viewing, lab.curve(bob), "depth")
-    camera = KeyPair.new()
-    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    camera = KeyPair.generate()
+    lab.home.clients.allow_key("cam-1", camera.public, ("camera",))
     pushes = {pair.public: _pusher(lab, pair) for pair in (camera, bob)}
 
     def sends(pair: KeyPair, data: bytes, condition: Callable[[], bool], what: str) -> None:
@@ -389,7 +389,7 @@ def test_only_sources_hand_in_media_from_elsewhere(locked: tuple[Lab, Stage]) ->
     sends(camera, b"camera", lambda: len(viewer.got) > 0, "frames of the camera")
     before = refused()
     sends(bob, b"bob", lambda: refused() > before, "bob is refused")
-    lab.home.clients.revoke(camera.fingerprint)
+    lab.home.clients.revoke_key(camera.fingerprint)
     before = refused()
     sends(camera, b"revoked", lambda: refused() > before + 20, "the camera is refused")
     seen = len(viewer.got)
@@ -418,8 +418,8 @@ def _send(pusher: zmq.Socket[bytes], data: bytes) -> None:
 def test_a_frame_of_a_source_that_nobody_has_decided_about_is_not_refused(locked: tuple[Lab, Stage]) -> None:
     lab, stage = locked
     stage.publishing = False
-    camera = KeyPair.new()
-    lab.home.clients.allow("cam-1", camera.public, ("camera",))
+    camera = KeyPair.generate()
+    lab.home.clients.allow_key("cam-1", camera.public, ("camera",))
     pusher = _pusher(lab, camera)
     drops = lab.session.process.link.status.drops
 

@@ -15,14 +15,14 @@ from iris_session.front.audit import AuditTrail
 from iris_session.front.connections import ConnectionTable, Peer, Route
 from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, RETRY_S, PairingService
 from iris_session.front.revocation import CHECK_PERIOD_NS, RevocationService
-from iris_session.link.config import SECOND, FrontConfig
+from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
-from iris_session.security.keyring import STRANGER, Keyring, open_keyring
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring, open_keyring
 from iris_session.security.resume_tokens import ResumeTokens
 from tests.front.slow_disk import slow_disk, turns
 
@@ -49,7 +49,7 @@ class Desk:
 
     def __init__(self, folder: Path) -> None:
         self.home = KeyHome(folder)
-        self.server = self.home.server_key()
+        self.server = self.home.load_server_key()
         self.drops = Drops()
         self.outbox: Any = Outbox()
         clients = self.home.clients
@@ -72,7 +72,7 @@ class Desk:
         self.now_ns = 0
 
     def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
-        peer = Peer(descriptor, STRANGER + own.public)
+        peer = Peer(descriptor, PAIRING_PREFIX + own.public)
         self.desk.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
 
     def proof(self, code: str, own: KeyPair) -> bytes:
@@ -108,45 +108,45 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
 
 
 def test_a_disk_that_takes_its_time_keeps_the_loop_from_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own = KeyPair.generate()
+    code, _ = desk.home.join_codes.create(desk.server)
     desk.asks(own, desk.proof(code, own))
     with slow_disk(monkeypatch) as disk:
         turns(desk.turn, disk.waits.is_set)
         for _ in range(5):
             desk.turn()
         assert desk.answers(own) == [], "the answer comes after the write"
-        assert desk.keyring.find(own.fingerprint) is None
+        assert desk.keyring.find_key(own.fingerprint) is None
     assert isinstance(desk.answer(own), Paired)
-    assert desk.keyring.find(own.fingerprint) is not None
+    assert desk.keyring.find_key(own.fingerprint) is not None
     assert list(desk.home.clients.read()) == [own.fingerprint]
 
 
 def test_a_director_revokes_at_once_whatever_the_disk_does(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
+    own = KeyPair.generate()
+    desk.home.clients.allow_key("ann", own.public)
     desk.turn()
     with slow_disk(monkeypatch) as disk:
         desk.revocation.revoke(own.fingerprint, desk.now_ns)
-        assert desk.tokens.revoked(own.fingerprint)
+        assert desk.tokens.is_revoked(own.fingerprint)
         turns(desk.turn, disk.waits.is_set)
         desk.asks(own)
         assert desk.answer(own).message == "this key was revoked just now", "not let in again by the way"
         assert own.fingerprint in desk.home.clients.read()
-    turns(desk.turn, lambda: own.fingerprint not in desk.keyring.revoking)
+    turns(desk.turn, lambda: own.fingerprint not in desk.keyring.pending_revocations)
     assert desk.home.clients.read() == {}
-    assert desk.tokens.revoked(own.fingerprint)
+    assert desk.tokens.is_revoked(own.fingerprint)
 
 
 @pytest.mark.parametrize("when", ["waiting", "writing", "written"])
 def test_a_directors_word_while_the_key_pairs_counts(desk: Desk, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
-    own, first = KeyPair.new(), KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own, first = KeyPair.generate(), KeyPair.generate()
+    code, _ = desk.home.join_codes.create(desk.server)
     with slow_disk(monkeypatch) as disk:
         if when == "waiting":  # behind the attempt of somebody else
             with monkeypatch.context() as patch:
                 patch.setattr(os, "fsync", lambda _: None)
-                other, _ = desk.home.codes.make(desk.server)
+                other, _ = desk.home.join_codes.create(desk.server)
             desk.asks(first, desk.proof(other, first), descriptor=2)
             turns(desk.turn, disk.waits.is_set)
         desk.asks(own, desk.proof(code, own))
@@ -158,49 +158,49 @@ def test_a_directors_word_while_the_key_pairs_counts(desk: Desk, monkeypatch: py
         desk.revocation.revoke(own.fingerprint, desk.now_ns)
     answer = desk.answer(own)
     assert (answer.code, answer.message) == (RefusalCode.CODE, "this key was revoked just now")
-    turns(desk.turn, lambda: not desk.keyring.revoking)
+    turns(desk.turn, lambda: not desk.keyring.pending_revocations)
     desk.turn()
     assert own.fingerprint not in desk.home.clients.read()
-    assert desk.keyring.find(own.fingerprint) is None
-    assert desk.tokens.revoked(own.fingerprint)
+    assert desk.keyring.find_key(own.fingerprint) is None
+    assert desk.tokens.is_revoked(own.fingerprint)
 
 
 def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(desk: Desk) -> None:
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own = KeyPair.generate()
+    code, _ = desk.home.join_codes.create(desk.server)
     desk.asks(own, desk.proof(code, own))
     desk.turn()
     turns(lambda _: None, lambda: bool(desk.home.clients.read()))  # written, and not told yet
-    assert desk.home.clients.revoke("ann") is not None
-    desk.keyring.look()
+    assert desk.home.clients.revoke_key("ann") is not None
+    desk.keyring.reload_if_changed()
     assert desk.answer(own).message == "this key was revoked just now"
-    assert desk.keyring.find(own.fingerprint) is None
+    assert desk.keyring.find_key(own.fingerprint) is None
 
 
 def test_a_list_that_could_not_be_read_just_then_is_read_again(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Revoked while the system had no descriptor to spare: it counts as soon as there is one."""
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
-    desk.keyring.look()
-    desk.home.clients.revoke("ann")
+    own = KeyPair.generate()
+    desk.home.clients.allow_key("ann", own.public)
+    desk.keyring.reload_if_changed()
+    desk.home.clients.revoke_key("ann")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", _no_descriptor)
         for _ in range(3):
-            desk.keyring.look()
-    assert desk.keyring.find(own.fingerprint) is not None
+            desk.keyring.reload_if_changed()
+    assert desk.keyring.find_key(own.fingerprint) is not None
     assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
-    desk.keyring.look()
-    assert desk.keyring.find(own.fingerprint) is None
+    desk.keyring.reload_if_changed()
+    assert desk.keyring.find_key(own.fingerprint) is None
 
 
 def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The code is used up: to be told that one was revoked would be wrong, and of no use."""
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own = KeyPair.generate()
+    code, _ = desk.home.join_codes.create(desk.server)
 
     def unreadable() -> dict[str, AllowedKey]:
         raise KeysError("Too many open files") from OSError(errno.EMFILE, "Too many open files")
@@ -210,29 +210,29 @@ def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
         desk.asks(own, desk.proof(code, own))
         assert isinstance(desk.answer(own), Paired)
     desk.turn()
-    assert desk.keyring.find(own.fingerprint) is not None
+    assert desk.keyring.find_key(own.fingerprint) is not None
 
 
 def test_who_has_paired_and_did_not_hear_it_is_told_again(desk: Desk) -> None:
     """The answer came too late, or its connection broke: the code is used up, and the key is on the list."""
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own = KeyPair.generate()
+    code, _ = desk.home.join_codes.create(desk.server)
     proof = desk.proof(code, own)
     desk.asks(own, proof)
     first = desk.answer(own)
     assert isinstance(first, Paired)
-    _, other = desk.home.codes.make(desk.server)
+    _, other = desk.home.join_codes.create(desk.server)
     desk.asks(own, proof)
     assert desk.answers(own) == [first, first], "at once"
-    kept = desk.home.codes.find(other.id)
+    kept = desk.home.join_codes.find_code(other.id)
     assert kept is not None
     assert kept.attempts_left == other.attempts_left, "it is no attempt at another code"
-    desk.asks(KeyPair.new(), proof, descriptor=2)
+    desk.asks(KeyPair.generate(), proof, descriptor=2)
     desk.asks(own, b"x" * 32)
     turns(desk.turn, lambda: len(desk.answers(own)) == 3)
     assert desk.answers(own)[2].code == RefusalCode.CODE
-    desk.home.clients.revoke(own.fingerprint)
-    turns(desk.turn, lambda: desk.keyring.find(own.fingerprint) is None)
+    desk.home.clients.revoke_key(own.fingerprint)
+    turns(desk.turn, lambda: desk.keyring.find_key(own.fingerprint) is None)
     desk.asks(own, proof)
     turns(desk.turn, lambda: len(desk.answers(own)) == 4)
     assert desk.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
@@ -244,60 +244,59 @@ def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_give
     """As by `cp -p` or rsync: a key that is replaced is out at once. A certificate that is damaged is said, once."""
     folder = tmp_path / "clients"
     folder.mkdir()
-    first, second = KeyPair.new(), KeyPair.new()
+    first, second = KeyPair.generate(), KeyPair.generate()
     server = KeyHome(tmp_path / "home")
-    server.server_key()
+    server.load_server_key()
     drops = Drops()
-    config = FrontConfig(curve_secret_file=str(server.path / "server.key_secret"), curve_clients_dir=str(folder))
-    keyring = open_keyring(config, drops)
+    keyring = open_keyring("", str(server.path / "server.key_secret"), str(folder), drops)
     path = folder / "ann.key"
 
     def write(text: str) -> None:
         path.write_text(text)
         os.utime(path, ns=(0, 0))
-        keyring.look()
+        keyring.reload_if_changed()
 
     write(f'public-key = "{first.public}"')
-    assert keyring.find(first.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is not None
     write(f'public-key = "{second.public}"')
-    assert keyring.find(first.fingerprint) is None
-    assert set(keyring.gone) == {first.fingerprint}
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is None
+    assert set(keyring.removed) == {first.fingerprint}
+    assert keyring.find_key(second.fingerprint) is not None
     (folder / "bob.key").write_text("nothing")
     for _ in range(3):
         (folder / "other").touch()
-        keyring.look()
+        keyring.reload_if_changed()
     said = capsys.readouterr().err
-    assert said.count("nobody is let in by bob.key") == 1
+    assert said.count("certificate bob.key") == 1
     assert "it should be a ZeroMQ certificate" in said
     assert drops.by_reason["certificate_unusable"] == 1
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(second.fingerprint) is not None
     keyring.close()
 
 
 def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(desk: Desk) -> None:
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
+    own = KeyPair.generate()
+    desk.home.clients.allow_key("ann", own.public)
     desk.turn()
     desk.revocation.revoke(own.fingerprint, desk.now_ns)
-    turns(desk.turn, lambda: not desk.keyring.revoking)
-    code, _ = desk.home.codes.make(desk.server)
+    turns(desk.turn, lambda: not desk.keyring.pending_revocations)
+    code, _ = desk.home.join_codes.create(desk.server)
     desk.asks(own, desk.proof(code, own))
     assert isinstance(desk.answer(own), Paired)
     desk.turn()
-    assert not desk.tokens.revoked(own.fingerprint)
+    assert not desk.tokens.is_revoked(own.fingerprint)
 
 
 def test_who_has_no_attempts_left_takes_nothing_from_others(desk: Desk) -> None:
-    eve, ann = KeyPair.new(), KeyPair.new()
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(2):
-        desk.home.codes.make(desk.server)
+        desk.home.join_codes.create(desk.server)
         for _ in range(5):
             before = len(desk.answers(eve))
             desk.asks(eve)
             turns(desk.turn, lambda before=before: len(desk.answers(eve)) > before)
     assert [m.message for m in desk.answers(eve)] == ["this join code is wrong, used or expired"] * 10
-    code, _ = desk.home.codes.make(desk.server)
+    code, _ = desk.home.join_codes.create(desk.server)
     for _ in range(200):
         desk.asks(eve)
     assert desk.drops.by_reason["pair_shut_out"] == 200
@@ -308,7 +307,7 @@ def test_who_has_no_attempts_left_takes_nothing_from_others(desk: Desk) -> None:
 
 def test_one_address_cannot_use_up_what_all_may_ask(desk: Desk) -> None:
     """Not even while there is no code that it could be wrong about."""
-    eve, ann = KeyPair.new(), KeyPair.new()
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(200):
         desk.asks(eve)
     desk.asks(ann, descriptor=2)
@@ -317,8 +316,8 @@ def test_one_address_cannot_use_up_what_all_may_ask(desk: Desk) -> None:
 
 
 def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    code, _ = desk.home.codes.make(desk.server)
-    first, *others = [KeyPair.new() for _ in range(MAX_PENDING + 3)]
+    code, _ = desk.home.join_codes.create(desk.server)
+    first, *others = [KeyPair.generate() for _ in range(MAX_PENDING + 3)]
     desk.asks(first, desk.proof(code, first), descriptor=0)
     with slow_disk(monkeypatch) as disk:
         turns(desk.turn, disk.waits.is_set)
@@ -341,7 +340,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
 ) -> None:
     """No descriptor is left for a while, and the file does not change meanwhile."""
     desk, now_s, tries = Desk(tmp_path / "home"), 1000.0, 0
-    desk.home.codes.make(desk.server)
+    desk.home.join_codes.create(desk.server)
     with monkeypatch.context() as patch:
 
         def fails(_server: str) -> tuple[JoinCode, ...]:
@@ -349,7 +348,7 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(desk.home.codes, "of", fails)
+        patch.setattr(desk.home.join_codes, "list_open", fails)
         patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
         for _ in range(3):
             assert not desk.desk.has_open_code

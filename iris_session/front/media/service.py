@@ -215,7 +215,7 @@ class MediaService:
 
     def _find_source_name(self, mark: str) -> str | None:
         """Name of a key that may hand in frames."""
-        entry = self._keyring.find(mark)
+        entry = self._keyring.find_key(mark)
         if entry is None or self._revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
             return None
         return entry.name
