@@ -87,7 +87,7 @@ class HostileSession:
                 "s", "lab", "live", "p1", 7, "operator", b"t" * 16, False, 0, 500 * MS, 2 * MS, 16 * MS, Endpoints(1, 2)
             )
             return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, welcome))
-        if connection.joined and rng.random() < 0.05:
+        if connection.is_joined and rng.random() < 0.05:
             return encode_server(ServerEnvelope(PROTOCOL_VERSION, 7, ClockPong(self._now_ns - MS, 0, 0)))
         return self._corpus.damaged()
 
@@ -99,7 +99,7 @@ class HostileSession:
         self._now_ns += rng.choice((0, 1, 20, 3000)) * MS
         connection.tick(self._now_ns)
         assert connection.next_deadline_ns(self._now_ns) > 0
-        if rng.random() < 0.1 and connection.joined:
+        if rng.random() < 0.1 and connection.is_joined:
             connection.send(Sample("head", "pose", 1, 0, 0, 0, 0, pose=IDENTITY))
             connection.request(Marker(0, "x"))
         while (waiting := connection.peek_outgoing()) is not None:

@@ -123,7 +123,7 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
     shapes = Deformables(ann)
     world.restless.set()
     assert ann.wait_for(lambda _: bool(shapes.update()), DEADLINE_S), "also who comes while it is"
-    feed = ann.media(shapes._meshes[0].stream).subscribe.subscribe
+    feed = ann.media.subscribe(shapes._meshes[0].stream)
     looks, drawn = {ann.mirror.scene_hash}, {shapes.scene_hash}
     moved = 0
 
@@ -144,7 +144,7 @@ def test_a_cloth_goes_on_while_the_scene_is_patched_all_the_time(
         return shapes.scene_hash == client.mirror.scene_hash
 
     assert ann.wait_for(newest, DEADLINE_S)
-    assert ann.media(feed.stream).subscribe.subscribe is feed, "it is the same subscription"
+    assert ann.media.subscribe(feed.stream) is feed, "it is the same subscription"
     assert shapes.capture_ns["cloth"] > 0
     assert np.isfinite(shapes.vertices["cloth"]).all()
 

@@ -46,7 +46,7 @@ class Watcher:
     def __init__(self, stage: Stage, name: str, stream: str) -> None:
         self.client = stage.join(name, role="observer")
         self.shapes = Deformables(self.client)
-        self.feed = self.client.media(stream).subscribe.subscribe
+        self.feed = self.client.media.subscribe(stream)
         self.poses = self.vertices = 0
         self._time_of: dict[int, float] = {}  # session time -> time of the world
         self._seen = -1
