@@ -1,6 +1,6 @@
 """How well sheets are found: distance x tilt x resolution -> found, position and angle error, milliseconds.
 
-    python tools/detection_table.py            the table of docs/anchors-howto.md, as Markdown
+    python tools/detection_table.py            the table of docs/evidence/detection.md, as Markdown
     python tools/detection_table.py --json     the same as one JSON object
 
 Prints a sheet as PDF, rasterises it, photographs it from random directions (`render_sheet.py`), and looks for it: the
