@@ -23,8 +23,8 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
-from iris_session.scene.cube_maps import Atlas, Cubes, baked, direction_scale
-from iris_session.scene.shapes import height_field, on_deformable, primitive, with_coordinates
+from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
+from iris_session.scene.shapes import height_field, on_deformable, build_primitive, with_coordinates
 
 WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
@@ -112,7 +112,7 @@ class SceneReader:
         self._places = places(spec, bodies)
         self._meshes: dict[tuple[int, int], MeshArrays] = {}
         self._textures: dict[int, Pixels | None] = {}
-        self._cubes = Cubes(spec, store, CUBE_SIDE)
+        self._cubes = CubeMapReader(spec, store, CUBE_SIDE)
         self._baked: dict[tuple[Geometry, int], MeshArrays] = {}
 
     def shown(self, thing: Visual | Deformable) -> bool:
@@ -127,14 +127,14 @@ class SceneReader:
     def form(self, visual: Visual) -> Form:
         """Shape and surface."""
         geometry = visual.geometry
-        cube = self._cubes.worn(visual.material, geometry)
+        cube = self._cubes.find(visual.material, geometry)
         atlas, tint = (None, _WHITE) if cube is None else (cube.atlas, cube.tint)
         texture = self.texture(visual.material) if atlas is None else _with_colours(atlas.pixels)
         mesh = self._mesh(geometry)
         if atlas is not None and mesh is not None and mesh.triangles > MOST_BAKED:
             return Form(MESH, mesh=mesh, tint=_mean_colour(atlas.pixels))
         if mesh is None and texture is not None:
-            mesh = primitive(_ended(geometry))
+            mesh = build_primitive(_ended(geometry))
         if mesh is None:
             return Form(_FORMS.get(geometry.kind, BOX), _half_sizes(geometry), tint=tint)
         if texture is None:
@@ -149,7 +149,7 @@ class SceneReader:
         key = visual.geometry, visual.material
         if key not in self._baked:
             scale = direction_scale(self._spec, visual.geometry, visual.material)
-            self._baked[key] = baked(mesh, visual.geometry, scale, atlas)
+            self._baked[key] = bake_cube_map(mesh, visual.geometry, scale, atlas)
         return self._baked[key]
 
     def texture(self, material: int) -> Pixels | None:

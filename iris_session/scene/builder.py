@@ -17,11 +17,11 @@ from iris_session.protocol.common import IDENTITY, Vec3
 from iris_session.protocol.media import MAX_STREAMS
 from iris_session.protocol.names import GeometryKind, LightKind, TextureKind
 from iris_session.protocol.scene import Camera, Environment, Light, Rgb
-from iris_session.scene.arrays import array_of
-from iris_session.scene.assembly import Flexible, Thing, World, assemble
+from iris_session.scene.arrays import to_array
+from iris_session.scene.assembly import ComposedDeformable, ComposedBody, SceneContent, assemble_scene
 from iris_session.scene.asset_builder import EncodeOptions
 from iris_session.scene.composed import ComposedScene
-from iris_session.scene.elements import Item, Look, Matrix, Picture, cut, matrix_of
+from iris_session.scene.elements import DrawnItem, Appearance, Matrix, TextureImage, truncate_name, to_matrix
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.importers.files import load_file
 from iris_session.scene.importers.units import file_question, side_of
@@ -74,7 +74,7 @@ class SceneBuilder:
 
     def __init__(self, name: str = "scene") -> None:
         self.environment: Environment | None = None
-        self._world = World(cut(name))
+        self._world = SceneContent(truncate_name(name))
 
     @property
     def triangles(self) -> int:
@@ -139,9 +139,9 @@ class SceneBuilder:
         (n, 3), texture coordinates `uvs` (n, 2; v down), `colors` (n, 3 or 4) uint8. Without normals they are made.
         """
         mesh = given_mesh(f"mesh {reprlib.repr(name)}", vertices, triangles, normals, uvs, colors)
-        look = look_of(options) or Look(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else Look().rgba)
+        look = look_of(options) or Appearance(rgba=(1.0, 1.0, 1.0, 1.0) if colors is not None else Appearance().rgba)
         body, matrix = self._place(name, options)
-        self._world.items.append(Item(body, cut(name), matrix, look, mesh))
+        self._world.items.append(DrawnItem(body, truncate_name(name), matrix, look, mesh))
         return name
 
     # --- files --------------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ class SceneBuilder:
         if turn not in ("y", "z"):
             said = f"{where.name} says that {turn} is up" if up is None else f"up is {up!r}"
             raise SceneBuildError(f"{said}: give up='y' or up='z', or None for what the format means")
-        one = array_of(scale, "scale").ndim == 0
+        one = to_array(scale, "scale").ndim == 0
         if one:
             (factor,) = number("scale", scale, "a number, or three, is needed")
         factors = (factor,) * 3 if one else numbers("scale", scale, 3)
@@ -180,11 +180,11 @@ class SceneBuilder:
             raise SceneBuildError("scale is 0: give one of the file's lengths in metres")
         T_thing_file = np.diag([*(loaded.unit * f for f in factors), 1.0]) @ (_FROM_Y_UP if turn == "y" else np.eye(4))
         look = look_of(options)
-        with self._world.whole(), np.errstate(all="ignore"):  # places that are not finite are refused
+        with self._world.atomic(), np.errstate(all="ignore"):  # places that are not finite are refused
             body, T_body_thing = self._place(name, options, named=True)
             self._world.add_nodes(loaded, body, T_body_thing @ T_thing_file, look, flat=self._moves(body))
             placed = [(one.mesh, T_thing_file @ node.matrix) for node in loaded.nodes for one in node.surfaces]
-            self._world.note(file_question(where.name, side_of(placed), factors))
+            self._world.add_notes(file_question(where.name, side_of(placed), factors))
         return name
 
     @takes()
@@ -235,7 +235,7 @@ class SceneBuilder:
         and `radius` [m]. `vertices` (n, 3) [m]: the first ones, world frame. `uvs` (n, 2). `flat`: a normal per face.
         """
         self._new_name(name)
-        if len(self._world.flexibles) >= MAX_STREAMS:
+        if len(self._world.deformables) >= MAX_STREAMS:
             raise SceneBuildError(
                 f"deformable {name!r} is one too many: {MAX_STREAMS} are streamed, join some into one mesh"
             )
@@ -250,9 +250,9 @@ class SceneBuilder:
         what, given, width = ("triangles", triangles, 3) if edges is None else ("edges", edges, 2)
         elements = triangles_of(f"{what} of {whose}", given, len(points), width)
         (half,) = number("radius", radius, above=0.0)
-        look = look_of(looks) or Look()
+        look = look_of(looks) or Appearance()
         coordinates = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))
-        self._world.flexibles.append(Flexible(name, points, elements, coordinates, half, flat, look))
+        self._world.deformables.append(ComposedDeformable(name, points, elements, coordinates, half, flat, look))
         self._world.names.add(name)
         return name
 
@@ -279,7 +279,7 @@ class SceneBuilder:
         if length < 1e-9:
             raise SceneBuildError("direction of a light is 0 0 0: it shines along one")
         light = Light(
-            name=cut(name),
+            name=truncate_name(name),
             kind=kind,
             body=0,
             p_body=_three("position", position),
@@ -308,7 +308,7 @@ class SceneBuilder:
         (angle,) = number("fovy", fovy, above=0.0)
         if angle >= 180.0:
             raise SceneBuildError(f"fovy is {fovy}: degrees below 180")
-        camera = Camera(cut(name), 0, checked_pose(position, quaternion), angle, resolution=resolution)
+        camera = Camera(truncate_name(name), 0, checked_pose(position, quaternion), angle, resolution=resolution)
         self._world.cameras.append((self._body_named(on), camera))
         return name
 
@@ -318,18 +318,18 @@ class SceneBuilder:
         faces = texture_of(pixels, "skybox")
         if faces.shape[0] != 6 * faces.shape[1]:
             raise SceneBuildError(f"a skybox of {faces.shape[1]} x {faces.shape[0]}: six squares below one another")
-        self._world.skybox = Picture(faces, "skybox", TextureKind.SKYBOX)
+        self._world.skybox = TextureImage(faces, "skybox", TextureKind.SKYBOX)
 
     def build(self, store: AssetStore, *, options: EncodeOptions | None = None, threads: int = 0) -> ComposedScene:
         """The scene as it stands; its assets are in `store` afterwards. The same things give the same hash anywhere."""
-        return assemble(self._world, self.environment, store, options, threads)
+        return assemble_scene(self._world, self.environment, store, options, threads)
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _shape(self, kind: str, name: str, size: tuple[float, ...], options: Options) -> str:
-        look = look_of(options) or Look()
+        look = look_of(options) or Appearance()
         body, matrix = self._place(name, options)
-        self._world.items.append(Item(body, cut(name), matrix, look, kind=kind, size=(size[0], size[1], size[2])))
+        self._world.items.append(DrawnItem(body, truncate_name(name), matrix, look, kind=kind, size=(size[0], size[1], size[2])))
         return name
 
     def _place(self, name: str, options: Options, *, named: bool = False) -> tuple[int, Matrix]:
@@ -341,32 +341,32 @@ class SceneBuilder:
         if on and movable:
             raise SceneBuildError(f"{name!r} is to be movable and on {on!r}: one of both")
         if on:
-            return self._body_named(on), matrix_of(T)
+            return self._body_named(on), to_matrix(T)
         if movable:
             self._new_name(name)
             if name == _WORLD:
                 raise SceneBuildError(f"name is {name!r}: that is the frame that all is in, give name= another one")
             self._world.names.add(name)
         if movable or named:
-            self._world.things.append(Thing(cut(name), -1, T, movable))
-            return len(self._world.things) - 1, np.eye(4)
-        return -1, matrix_of(T)
+            self._world.bodies.append(ComposedBody(truncate_name(name), -1, T, movable))
+            return len(self._world.bodies) - 1, np.eye(4)
+        return -1, to_matrix(T)
 
     def _moves(self, body: int) -> bool:
-        return body >= 0 and self._world.things[body].moving
+        return body >= 0 and self._world.bodies[body].moving
 
     def _body_named(self, on: str) -> int:
         """Place of the movable body `on`, -1 for none."""
         if not on:
             return -1
-        for place, thing in enumerate(self._world.things):
+        for place, thing in enumerate(self._world.bodies):
             if thing.moving and thing.name == on:
                 return place
-        names = ", ".join(thing.name for thing in self._world.things if thing.moving) or "none"
+        names = ", ".join(thing.name for thing in self._world.bodies if thing.moving) or "none"
         raise SceneBuildError(f"on={on!r}: no movable body is called so. Movable: {names}")
 
     def _new_name(self, name: str) -> None:
-        if not isinstance(name, str) or not name or len(name) > _MAX_NAME or cut(name) != name:
+        if not isinstance(name, str) or not name or len(name) > _MAX_NAME or truncate_name(name) != name:
             raise SceneBuildError(
                 f"name is {reprlib.repr(name)}: what moves needs one of 1 to {_MAX_NAME} characters, by which it is "
                 "addressed"

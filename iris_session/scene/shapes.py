@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.names import GeometryKind
 from iris_session.protocol.scene import Geometry, HeightField, Material
-from iris_session.scene.mesh_processing import unit
+from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 SLICES: Final = 28
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 _POLE: Final = 1e-6
 
 
-def primitive(geometry: Geometry) -> MeshArrays | None:
+def build_primitive(geometry: Geometry) -> MeshArrays | None:
     """A shape that needs no asset, without texture coordinates; `None` for meshes, height fields, unknown kinds."""
     x, y, z = geometry.size
     size = np.array(geometry.size)
@@ -88,7 +88,7 @@ def _quads(corners: Floats) -> Floats:
 
 
 def _flat(triangles: Floats) -> MeshArrays:
-    normal = unit(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+    normal = normalise(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
     return _mesh(triangles, np.repeat(normal[:, None], 3, axis=1))
 
 
@@ -108,7 +108,7 @@ def _turned(profile: Floats, normals: Floats, size: Floats) -> MeshArrays:
         ring = values[:, None, :1] * turn[None]
         return np.concatenate([ring, np.broadcast_to(values[:, None, 1:], (*ring.shape[:2], 1))], axis=2)
 
-    points, across = around(profile) * size, unit(around(normals) / size)
+    points, across = around(profile) * size, normalise(around(normals) / size)
 
     def corners(values: Floats) -> Floats:
         a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.common import IDENTITY, Pose, Quat, Vec3
 from iris_session.protocol.names import TextureRole
-from iris_session.scene.arrays import array_of
-from iris_session.scene.elements import GREY, MAX_TRIANGLES, Look, Picture
+from iris_session.scene.arrays import to_array
+from iris_session.scene.elements import GREY, MAX_TRIANGLES, Appearance, TextureImage
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import checked_pixels, read_pixels
+from iris_session.scene.images import check_pixels, read_pixels
 from iris_session.scene.importers.references import read_bounded
-from iris_session.scene.mesh_processing import creased_normals, unit
+from iris_session.scene.mesh_processing import compute_creased_normals, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners
 
 _NUMBERS: Final = ("emission", "specular", "shininess", "metallic", "roughness")
@@ -109,7 +109,7 @@ def _meant(name: str, known: Sequence[str]) -> str:
     return f"{near[0]} is meant" if near else f"there are {', '.join(sorted(known))}"
 
 
-def look_of(options: Mapping[str, Any]) -> Look | None:
+def look_of(options: Mapping[str, Any]) -> Appearance | None:
     """The look that the options ask for, `None` where they ask for none."""
     if not options.keys() & Looks.__annotations__.keys():
         return None
@@ -123,19 +123,19 @@ def look_of(options: Mapping[str, Any]) -> Look | None:
     if not all(0.0 <= v <= 1.0 for v in (red, green, blue, alpha)):
         raise SceneBuildError(f"rgba is {given!r}: red, green, blue, alpha from 0 to 1 are needed; (1, 0, 0, 1) is red")
     across, down = numbers("repeat", options.get("repeat", (1.0, 1.0)), 2)
-    pictures: tuple[tuple[str, Picture], ...] = ()
+    pictures: tuple[tuple[str, TextureImage], ...] = ()
     if "texture" in options:
         pixels = texture_of(options["texture"], "texture")
-        pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, Picture(pixels)),)
+        pictures = ((TextureRole.RGBA if pixels.shape[2] == 4 else TextureRole.RGB, TextureImage(pixels)),)
     values: dict[str, Any] = {name: number(name, options[name])[0] for name in _NUMBERS if name in options}
     for name, value in values.items():
         if value < 0.0 or (value > 1.0 and name != "emission"):
             raise SceneBuildError(f"{name} is {value:g}: {'0 or more' if name == 'emission' else 'from 0 to 1'}")
     if "roughness" in values and "shininess" not in values:  # for clients that do not draw by roughness
         values["shininess"] = min(max(1.0 - values["roughness"], 0.0), 1.0)
-    plain = Look(
+    plain = Appearance(
         rgba=(red, green, blue, alpha),
-        pictures=pictures,
+        images=pictures,
         repeat=(across, down),
         uniform=bool(options.get("uniform", False)),
     )
@@ -149,7 +149,7 @@ def texture_of(given: Any, what: str) -> NDArray[np.uint8]:
         if path.is_dir():
             raise SceneBuildError(f"{what} is {str(path)!r}, a folder: the path of a picture is needed, or pixels")
         return read_pixels(read_bounded(path), str(path))
-    return checked_pixels(given, what)
+    return check_pixels(given, what)
 
 
 def path_of(path: Any) -> Path:
@@ -213,7 +213,7 @@ def given_vertices(what: str, values: Any, width: int = 3, count: int | None = N
 
 def triangles_of(what: str, values: Any, vertices: int, width: int = 3) -> NDArray[np.uint32]:
     """Rows of vertex numbers."""
-    array = array_of(values, what)
+    array = to_array(values, what)
     if array.ndim != 2 or array.shape[1] != width or not len(array) or array.dtype.kind not in "iu":
         raise SceneBuildError(
             f"{what}: an array {array.shape} of {array.dtype}: whole numbers of shape (m, {width}) are needed, at "
@@ -233,13 +233,13 @@ def given_mesh(whose: str, vertices: Any, triangles: Any, normals: Any, uvs: Any
     points = given_vertices(f"vertices of {whose}", vertices)
     index = triangles_of(f"triangles of {whose}", triangles, len(points)).astype(np.int64)
     if normals is None:
-        across = creased_normals(points.astype(np.float64), index).astype(np.float32)
+        across = compute_creased_normals(points.astype(np.float64), index).astype(np.float32)
     else:
-        across = np.asarray(unit(given_vertices(f"normals of {whose}", normals, 3, len(points)))[index], np.float32)
+        across = np.asarray(normalise(given_vertices(f"normals of {whose}", normals, 3, len(points)))[index], np.float32)
     uv = None if uvs is None else given_vertices(f"uvs of {whose}", uvs, 2, len(points))[index]
     color = None
     if colors is not None:
-        array = array_of(colors, f"colors of {whose}")
+        array = to_array(colors, f"colors of {whose}")
         if array.dtype != np.uint8 or array.ndim != 2 or array.shape[1] not in (3, 4) or len(array) != len(points):
             raise SceneBuildError(
                 f"colors of {whose}: {array.shape} of {array.dtype}: ({len(points)}, 3 or 4) of uint8"
