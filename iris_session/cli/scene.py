@@ -344,7 +344,7 @@ def check_model_units(spec: SceneSpec) -> tuple[str, ...]:
 
     Its largest mesh is judged: its places are in metres, and halls may be large.
     """
-    from iris_session.scene.extent import largest_mesh_side, format_unit_hint
+    from iris_session.scene.extent import format_unit_hint, largest_mesh_side
 
     hint = format_unit_hint(largest_mesh_side(spec), _MESH_SCALE_ADVICE)
     return (f"its largest mesh is {hint}",) if hint else ()

@@ -24,7 +24,12 @@ from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
 from iris_session.scene.cube_maps import Atlas, CubeMapReader, bake_cube_map, direction_scale
-from iris_session.scene.shapes import height_field, on_deformable, build_primitive, with_coordinates
+from iris_session.scene.shapes import (
+    add_texture_coordinates,
+    build_height_field,
+    build_primitive,
+    repeat_texture_coordinates,
+)
 
 WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.
@@ -142,7 +147,7 @@ class SceneReader:
         if atlas is not None:
             mesh = self._with_atlas(mesh, visual, atlas)
         else:
-            mesh = with_coordinates(mesh, geometry, self._spec.materials[visual.material])
+            mesh = add_texture_coordinates(mesh, geometry, self._spec.materials[visual.material])
         return Form(MESH, mesh=mesh, uv=mesh.uv, texture=texture)
 
     def _with_atlas(self, mesh: MeshArrays, visual: Visual, atlas: Atlas) -> MeshArrays:
@@ -165,7 +170,7 @@ class SceneReader:
         """The asset of a deformable, with texture coordinates as its material repeats them."""
         arrays = decode_arrays(self._store.get(deformable.address), ArrayKind.DEFORMABLE)
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
-        uv = on_deformable(arrays.get("uv"), worn)
+        uv = repeat_texture_coordinates(arrays.get("uv"), worn)
         return arrays if uv is None else {**arrays, "uv": uv}
 
     def _mesh(self, geometry: Geometry) -> MeshArrays | None:
@@ -180,7 +185,7 @@ class SceneReader:
         if mesh >= 0:
             return decode_mesh(self._store.get(self._spec.meshes[mesh].levels[0].address))
         field = self._spec.hfields[hfield]
-        return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+        return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
 
     def _texture(self, index: int) -> Pixels | None:
         texture = self._spec.textures[index]

@@ -73,7 +73,9 @@ def decode_arrays(
     header, start = read_header(data)
     if header.kind != kind:
         raise AssetDecodeError(f"an asset of kind {header.kind!r}, where {kind!r} is expected")
-    total = sum(_stated_bytes(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays)
+    total = sum(
+        _stated_bytes(info) * (_SCALED // _DTYPES[info.dtype].itemsize if info.scale else 1) for info in header.arrays
+    )
     if total > max_bytes:
         raise AssetDecodeError(f"arrays of {total} bytes, at most {max_bytes} are read")
     view, found = memoryview(data), {}

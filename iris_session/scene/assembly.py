@@ -42,16 +42,16 @@ from iris_session.scene.budget import add_totals
 from iris_session.scene.composed import Articulation, ComposedScene, DeformableSource
 from iris_session.scene.elements import (
     MAX_TRIANGLES,
+    Appearance,
     DrawnItem,
     LoadedFile,
-    Appearance,
     Matrix,
     TextureImage,
     compose_poses,
+    is_solid,
+    split_rigid,
     to_matrix,
     to_pose,
-    split_rigid,
-    is_solid,
     to_vec3,
 )
 from iris_session.scene.errors import SceneBuildError
@@ -313,7 +313,9 @@ def _build_deformables(
     return listed, sources
 
 
-def _deformable_encoder(one: ComposedDeformable, uv: NDArray[np.float32] | None, topology: DeformableTopology) -> Callable[[], bytes]:
+def _deformable_encoder(
+    one: ComposedDeformable, uv: NDArray[np.float32] | None, topology: DeformableTopology
+) -> Callable[[], bytes]:
     return lambda: encode_deformable(one.elements, uv, one.vertices, topology)
 
 
@@ -402,7 +404,9 @@ class SceneContent:
         self.add_skipped(robot.skipped)
         self.add_notes(robot.notes)
 
-    def add_nodes(self, loaded: LoadedFile, body: int, T_body_file: Matrix, look: Appearance | None, *, flat: bool) -> None:
+    def add_nodes(
+        self, loaded: LoadedFile, body: int, T_body_file: Matrix, look: Appearance | None, *, flat: bool
+    ) -> None:
         """A file on `body`. `flat`: everything on that one, else nodes with something on or below them become bodies.
 
         `look`, if there is one, replaces those of the file, and colours at vertices.
@@ -421,7 +425,9 @@ class SceneContent:
                 continue
             if not flat and several and k in used:
                 pose, rest = split_rigid(T_world_body @ matrix)
-                self.bodies.append(ComposedBody(node.name, places[node.parent] if node.parent >= 0 else body, pose, False))
+                self.bodies.append(
+                    ComposedBody(node.name, places[node.parent] if node.parent >= 0 else body, pose, False)
+                )
                 places[k] = len(self.bodies) - 1
                 matrix = np.eye(4)
                 if rest is not None:
@@ -430,7 +436,9 @@ class SceneContent:
                 mesh = surface.mesh
                 if look is not None and mesh.color is not None:
                     mesh = bare.setdefault(id(mesh), replace(mesh, color=None))
-                self.items.append(DrawnItem(places[k], surface.name, matrix, look or surface.appearance or Appearance(), mesh))
+                self.items.append(
+                    DrawnItem(places[k], surface.name, matrix, look or surface.appearance or Appearance(), mesh)
+                )
             self.lights += [(places[k], _place_light(matrix, light)) for light in node.lights]
             if node.cameras:
                 T = _camera_pose(matrix)

@@ -114,7 +114,9 @@ class AssetBuilder:
     def texture_work(self, pixels: Pixels, kind: str) -> Work[TextureNote]:
         """`pixels` (height, width, channels); cube and skybox have six square faces below each other."""
         return Work(
-            TextureNote, (kind.encode(), repr(pixels.shape).encode(), pixels), lambda: self._encode_texture(pixels, kind)
+            TextureNote,
+            (kind.encode(), repr(pixels.shape).encode(), pixels),
+            lambda: self._encode_texture(pixels, kind),
         )
 
     def blob_work(self, raw: Sequence[bytes | NDArray[Any]], encode: Callable[[], bytes]) -> Work[BlobNote]:

@@ -98,7 +98,11 @@ def _choose_mesh_levels(spec: SceneSpec, kept: list[int], limit: int, besides: i
         if spec.visuals[i].geometry.mesh >= 0:
             uses[spec.visuals[i].geometry.mesh] += 1
     total = besides + sum(count_triangles(spec, i) for i in kept)
-    queue = [(_relative_loss(spec.meshes[m], 1, uses[m]), m) for m in range(len(levels)) if _relative_loss(spec.meshes[m], 1, uses[m])]
+    queue = [
+        (_relative_loss(spec.meshes[m], 1, uses[m]), m)
+        for m in range(len(levels))
+        if _relative_loss(spec.meshes[m], 1, uses[m])
+    ]
     heapq.heapify(queue)
     while limit and total > limit and queue:
         _, m = heapq.heappop(queue)
@@ -115,7 +119,9 @@ def _relative_loss(mesh: Mesh, level: int, uses: int) -> float:
     if level >= len(mesh.levels) or not uses:
         return 0.0
     saved = mesh.levels[level - 1].triangles - mesh.levels[level].triangles
-    return (mesh.levels[level].max_error_m + 1e-9) / max(_longest_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
+    return (
+        (mesh.levels[level].max_error_m + 1e-9) / max(_longest_side(mesh), 1e-6) / (uses * saved) if saved > 0 else 0.0
+    )
 
 
 def _choose_texture_levels(spec: SceneSpec, limit: int) -> tuple[tuple[int, ...], int]:

@@ -130,7 +130,9 @@ class Articulation:
         """
         return self.compute_world_poses(IDENTITY, q)
 
-    def compute_world_poses(self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE) -> dict[str, Pose]:
+    def compute_world_poses(
+        self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE
+    ) -> dict[str, Pose]:
         """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
         name; what is below moves with them, whatever is above."""
         self.check_positions(q)

@@ -92,7 +92,9 @@ class CubeMapReader:
         if level.address not in self._read:
             pixels = decode_image(self._store.get(level.address), level.encoding)
             encoding = AssetEncoding.JPEG if level.encoding == AssetEncoding.JPEG else AssetEncoding.PNG
-            self._read[level.address] = _with_atlas(CubeMap(level.address, encoding), split_faces(pixels), self._max_side)
+            self._read[level.address] = _with_atlas(
+                CubeMap(level.address, encoding), split_faces(pixels), self._max_side
+            )
         return self._read[level.address]
 
 
@@ -246,7 +248,9 @@ def _face_coordinates(direction: Floats, face: NDArray[np.int64]) -> tuple[Float
     return (np.stack([u, v], axis=2) + 1) / 2, there
 
 
-def _split_triangles(corners: Floats, face: NDArray[np.int64], tolerance: float) -> tuple[Floats, NDArray[np.int64], Floats]:
+def _split_triangles(
+    corners: Floats, face: NDArray[np.int64], tolerance: float
+) -> tuple[Floats, NDArray[np.int64], Floats]:
     """Triangles in whose edges' middles the coordinates are within `tolerance` of exact ones; with their faces, and the
     coordinates of their corners. Judged by the edge alone, as its other triangle does."""
     done: list[tuple[Floats, NDArray[np.int64], Floats]] = []

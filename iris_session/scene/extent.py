@@ -108,7 +108,8 @@ def format_unit_hint(side_m: float, remedy: str) -> str:
     if mistake is None:
         return ""
     factor, what = mistake
-    return f"{format_length(side_m)} large: {what} {remedy.format(factor=f'{factor:g}')} makes it {format_length(side_m * factor)}"
+    remedied = remedy.format(factor=f"{factor:g}")
+    return f"{format_length(side_m)} large: {what} {remedied} makes it {format_length(side_m * factor)}"
 
 
 def format_size(extent: Extent) -> str:

@@ -33,7 +33,12 @@ from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import decode_image, encode_image
 from iris_session.scene.mesh_processing import normalise
 from iris_session.scene.meshes import MeshArrays, decode_mesh, index_corners
-from iris_session.scene.shapes import height_field, on_deformable, build_primitive, with_coordinates
+from iris_session.scene.shapes import (
+    add_texture_coordinates,
+    build_height_field,
+    build_primitive,
+    repeat_texture_coordinates,
+)
 from iris_session.system.files import write_atomic
 
 _FLOAT, _UINT = 5126, 5125
@@ -106,7 +111,9 @@ class _GlbWriter:
                     self._children_of(nodes[visual.body]).append(node)
         for index, deformable in enumerate(self._spec.deformables):
             if deformable.rgba[3] > 0 and deformable.group in self._spec.groups_shown:
-                node = self._add_node(deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+                node = self._add_node(
+                    deformable.name or f"deformable_{index}", Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+                )
                 self._json["nodes"][node]["mesh"] = self._add_deformable(index)
                 self._children_of(0).append(node)
         add_viewpoints(self._json, self._spec, nodes)
@@ -170,7 +177,7 @@ class _GlbWriter:
                 scale = direction_scale(self._spec, geometry, visual.material)
                 arrays = bake_cube_map(arrays, geometry, scale, cube.atlas)
             elif mapped is not None:
-                arrays = with_coordinates(arrays, geometry, self._spec.materials[visual.material])
+                arrays = add_texture_coordinates(arrays, geometry, self._spec.materials[visual.material])
             self._shared[key] = self._add_attributes(arrays, arrays.uv)
             if arrays.color is not None and bool((arrays.color[:, 3] < 255).any()):
                 self._see_through.add(key)
@@ -198,7 +205,7 @@ class _GlbWriter:
             return decode_mesh(self._store.get(self._spec.meshes[geometry.mesh].levels[0].address))
         if geometry.hfield >= 0:
             field = self._spec.hfields[geometry.hfield]
-            return height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
+            return build_height_field(field, decode_arrays(self._store.get(field.address), ArrayKind.GRID)["elevation"])
         return build_primitive(geometry)
 
     def _add_deformable(self, index: int) -> int:
@@ -214,7 +221,9 @@ class _GlbWriter:
         corners = arrays["position"][arrays["elements"]]
         normal = normalise(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         worn = None if deformable.material < 0 else self._spec.materials[deformable.material]
-        mesh = index_corners(corners, np.repeat(normal[:, None], 3, axis=1), on_deformable(arrays.get("uv"), worn))
+        mesh = index_corners(
+            corners, np.repeat(normal[:, None], 3, axis=1), repeat_texture_coordinates(arrays.get("uv"), worn)
+        )
         return self._add("meshes", {"primitives": [{**self._add_attributes(mesh, mesh.uv), "material": look}]})
 
     def _add_attributes(self, mesh: MeshArrays, uv: NDArray[np.float32] | None) -> dict[str, Any]:
@@ -230,7 +239,9 @@ class _GlbWriter:
 
     def _add_indices(self, index: NDArray[Any]) -> int:
         data = np.ascontiguousarray(index, "<u4")
-        return self._add_accessor_once(data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"})
+        return self._add_accessor_once(
+            data.tobytes(), _INDICES, {"componentType": _UINT, "count": data.size, "type": "SCALAR"}
+        )
 
     def _add_accessor(self, values: NDArray[np.float32], kind: str, *, bounds: bool = False) -> int:
         accessor: dict[str, Any] = {"componentType": _FLOAT, "count": len(values), "type": kind}
@@ -276,7 +287,9 @@ class _GlbWriter:
             self._materials[key] = self._add("materials", look)
         return self._materials[key]
 
-    def _build_material(self, index: int, rgba: Sequence[float], *, mapped: bool, cube: CubeMap | None) -> dict[str, Any]:
+    def _build_material(
+        self, index: int, rgba: Sequence[float], *, mapped: bool, cube: CubeMap | None
+    ) -> dict[str, Any]:
         tint = (1.0, 1.0, 1.0) if cube is None else cube.tint
         colour = [float(v) * part for v, part in zip(rgba, tint, strict=False)]
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
@@ -293,7 +306,11 @@ class _GlbWriter:
             for where, key, texture in (
                 (look, "baseColorTexture", self._add_texture(worn) if cube is None else self._add_atlas(cube)),
                 (look, "metallicRoughnessTexture", self._add_texture(material.texture(TextureRole.ORM))),
-                (found, "occlusionTexture", self._add_texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION))),
+                (
+                    found,
+                    "occlusionTexture",
+                    self._add_texture(material.texture(TextureRole.ORM, TextureRole.OCCLUSION)),
+                ),
                 (found, "normalTexture", self._add_texture(material.texture(TextureRole.NORMAL))),
                 (found, "emissiveTexture", self._add_texture(material.texture(TextureRole.EMISSIVE))),
             ):

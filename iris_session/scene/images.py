@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName, AssetEncoding
-from iris_session.scene.arrays import StoredArray, to_array, decode_arrays, encode_arrays, apply_filter, require_array
+from iris_session.scene.arrays import StoredArray, apply_filter, decode_arrays, encode_arrays, require_array, to_array
 from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Pixels = NDArray[np.uint8]

@@ -21,7 +21,7 @@ from iris_session.scene.arrays import StoredArray, encode_arrays
 from iris_session.scene.asset_builder import AssetBuilder, MeshNote, Work
 from iris_session.scene.mesh_processing import CREASE, normalise
 from iris_session.scene.meshes import MeshArrays, encode_deformable, index_corners
-from iris_session.scene.mujoco_appearance import resolve_rgba, read_name
+from iris_session.scene.mujoco_appearance import read_name, resolve_rgba
 from iris_session.streams.deformable_topology import DeformableTopology, used_vertices
 
 _KINDS: Final = {

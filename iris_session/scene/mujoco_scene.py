@@ -29,14 +29,14 @@ from iris_session.protocol.scene import (
 from iris_session.scene.asset_builder import AssetBuilder, EncodeOptions
 from iris_session.scene.budget import add_totals
 from iris_session.scene.mujoco_appearance import (
+    compute_tracked,
     read_cameras,
-    resolve_rgba,
     read_environment,
-    read_name,
     read_lights,
     read_materials,
+    read_name,
+    resolve_rgba,
     to_pose,
-    compute_tracked,
 )
 from iris_session.scene.mujoco_assets import read_deformables, read_hfields, read_meshes, read_textures
 
@@ -178,7 +178,9 @@ def _read_visual(model: mujoco.MjModel, index: int) -> Visual:
         name=read_name(model, "geom", index),
         T_body_visual=to_pose(model.geom_pos[index], model.geom_quat[index]),
         group=int(model.geom_group[index]),
-        geometry=_read_geometry(model, int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])),
+        geometry=_read_geometry(
+            model, int(model.geom_type[index]), model.geom_size[index], int(model.geom_dataid[index])
+        ),
         material=material,
         rgba=resolve_rgba(model, model.geom_rgba[index], material),
     )

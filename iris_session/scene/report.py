@@ -10,7 +10,7 @@ import msgspec
 
 from iris_session.protocol.names import AssetEncoding, GeometryKind, LightKind
 from iris_session.protocol.scene import Body, SceneSpec, Totals
-from iris_session.scene.budget import QUEST_3, LevelChoice, choose_levels, texture_memory_bytes, count_triangles
+from iris_session.scene.budget import QUEST_3, LevelChoice, choose_levels, count_triangles, texture_memory_bytes
 from iris_session.scene.cube_maps import CUBE_SIDE, find_cube_texture
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
@@ -59,7 +59,9 @@ def build_report(
 ) -> SceneReport:
     """The report of a scene."""
     choice = choose_levels(spec, QUEST_3)
-    heavy = sorted((*_heavy_meshes(spec), *_heavy_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses))
+    heavy = sorted(
+        (*_heavy_meshes(spec), *_heavy_textures(spec)), key=lambda h: -(h.memory + 40 * h.triangles * h.uses)
+    )
     return SceneReport(
         scene_hash=scene_hash,
         totals=spec.totals,
@@ -145,7 +147,9 @@ def _heavy_meshes(spec: SceneSpec) -> Iterator[HeavyAsset]:
             why += f", drawn {uses[i]} times"
         if len(mesh.levels) == 1 and level.triangles > 5_000:
             why += ", no coarser level: it has texture coordinates or colours, or it would save little"
-        yield HeavyAsset("mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why)
+        yield HeavyAsset(
+            "mesh", mesh.name or f"mesh {i}", uses[i], level.bytes, level.triangles, 0, len(mesh.levels), why
+        )
 
 
 def _heavy_textures(spec: SceneSpec) -> Iterator[HeavyAsset]:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.scene import AssetStore, AssetBuilder, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
+from iris_session.scene import AssetBuilder, AssetStore, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mesh_processing import simplify_mesh
 from iris_session.scene.meshes import index_corners

@@ -9,7 +9,7 @@ import pytest
 
 from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
-from iris_session.scene.budget import Budget, choose_levels, add_totals
+from iris_session.scene.budget import Budget, add_totals, choose_levels
 from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import build_report, format_tree

@@ -203,7 +203,9 @@ def test_large_cubes_are_made_smaller_and_jpeg_stays(
     write_glb(spec, store, tmp_path / "a.glb")
     (picture,) = images(tmp_path / "a.glb")
     assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
-    assert list_glb_differences(spec) == ("1 cube textures of more than 32 pixels a face: they are there in a smaller size",)
+    assert list_glb_differences(spec) == (
+        "1 cube textures of more than 32 pixels a face: they are there in a smaller size",
+    )
 
 
 def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:

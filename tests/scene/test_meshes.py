@@ -20,7 +20,7 @@ from iris_session.scene import (
     encode_mesh_quantised,
 )
 from iris_session.scene.arrays import StoredArray
-from iris_session.scene.mesh_processing import simplify_mesh, build_smooth_mesh, sort_rows
+from iris_session.scene.mesh_processing import build_smooth_mesh, simplify_mesh, sort_rows
 from iris_session.scene.meshes import index_corners
 
 

@@ -27,16 +27,16 @@ from iris_session.scene.elements import (
     MAX_FILE_BYTES,
     MAX_NODES,
     MAX_TRIANGLES,
-    LoadedFile,
     Appearance,
+    LoadedFile,
     Matrix,
     Node,
-    TextureImage,
     Surface,
+    TextureImage,
     truncate_name,
 )
 from iris_session.scene.errors import SceneBuildError
-from iris_session.scene.images import PixelBudget, Pixels, read_pixels, drop_alpha
+from iris_session.scene.images import PixelBudget, Pixels, drop_alpha, read_pixels
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.mesh_processing import add_back_sides, merge_vertex_color, normalise
 from iris_session.scene.meshes import MeshArrays, index_corners

@@ -21,11 +21,11 @@ from iris_session.scene.elements import (
     GREY,
     MAX_NODES,
     MAX_TRIANGLES,
-    LoadedFile,
     Appearance,
+    LoadedFile,
     Node,
-    TextureImage,
     Surface,
+    TextureImage,
     truncate_name,
 )
 from iris_session.scene.errors import SceneBuildError
@@ -34,7 +34,7 @@ from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corner
 from iris_session.scene.importers.references import References, read_bounded
 from iris_session.scene.importers.xml_files import check_3mf, check_dae
 from iris_session.scene.mesh_processing import compute_creased_normals, merge_vertex_color, normalise
-from iris_session.scene.meshes import index_corners, find_unique_rows
+from iris_session.scene.meshes import find_unique_rows, index_corners
 
 _UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
 _USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)

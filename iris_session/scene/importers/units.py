@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iris_session.scene.composed import Joint
 from iris_session.scene.elements import Matrix
-from iris_session.scene.extent import LARGEST_M, SMALLEST_M, format_length, find_unit_mistake
+from iris_session.scene.extent import LARGEST_M, SMALLEST_M, find_unit_mistake, format_length
 from iris_session.scene.meshes import MeshArrays
 
 #: Limits of a joint that are no radians: three turns and more one way [rad], and no more than 2.5 turns in degrees.

@@ -20,8 +20,8 @@ import numpy as np
 from iris_session.protocol.common import Pose, Vec3
 from iris_session.protocol.names import GeometryKind, TextureRole
 from iris_session.protocol.scene import Rgba
-from iris_session.scene.composed import Articulation, Joint, ArticulatedBody
-from iris_session.scene.elements import DrawnItem, LoadedFile, Appearance, Matrix, TextureImage, truncate_name, to_pose
+from iris_session.scene.composed import ArticulatedBody, Articulation, Joint
+from iris_session.scene.elements import Appearance, DrawnItem, LoadedFile, Matrix, TextureImage, to_pose, truncate_name
 from iris_session.scene.errors import SceneBuildError
 from iris_session.scene.images import PixelBudget, read_pixels
 from iris_session.scene.importers.files import ENDINGS, ROBOTS, ending, guarded, load_file, present, xacro_advice
@@ -246,7 +246,9 @@ class _Reader:
         scale = np.diag([loaded.unit * x, loaded.unit * y, loaded.unit * z, 1.0])
         self._measure(path, loaded, (x, y, z), scale)
         return [
-            DrawnItem(part, name, matrix @ scale @ node.matrix, surface.appearance or look or Appearance(), surface.mesh)
+            DrawnItem(
+                part, name, matrix @ scale @ node.matrix, surface.appearance or look or Appearance(), surface.mesh
+            )
             for node in loaded.nodes
             for surface in node.surfaces
         ]
@@ -271,7 +273,9 @@ class _Reader:
         key = f"{known.name} {known.color} {known.texture}"
         if key not in self._looks:
             rgba = self._rgba(known)
-            self._looks[key] = Appearance(rgba=rgba, name=truncate_name(known.name or ""), images=self._texture(known.texture))
+            self._looks[key] = Appearance(
+                rgba=rgba, name=truncate_name(known.name or ""), images=self._texture(known.texture)
+            )
         return self._looks[key]
 
     def _rgba(self, material: Any) -> Rgba:
