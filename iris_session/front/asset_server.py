@@ -51,7 +51,7 @@ AssetFolder = tuple[str, tuple[str, ...]]
 
 
 class AssetAccess(NamedTuple):
-    """Who may fetch what. Replaced as a whole, from the front's loop.
+    """Access to assets: which client may fetch which. Replaced as a whole, from the front's loop.
 
     Attributes:
         clients: Connections that may request, with the key of their TCP connection (empty without encryption).

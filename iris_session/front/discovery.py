@@ -1,6 +1,6 @@
 """Discovery of the session by clients: beacons, introductions, and its entry in this machine's session registry.
 
-The beacon announces to every network that the session listens on, five times a second, where the session is. The introduction
+The beacon announces where the session is, five times a second, to every network that it listens on. The introduction
 answers a connection to the TCP port below the control port with a description of the session, once: nothing is read
 and nothing kept, the connection is accepted, written to and closed at once, so that none can hold anything. The
 registry entry lets `iris-session pair` find an encrypted session. Resolving endpoints is the client's part.

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iris_session.front.media.budget import (
-    RAISE_NS,
     NONE_LEVEL,
+    RAISE_NS,
     BudgetController,
     BudgetGrant,
     LinkMeasure,

@@ -148,7 +148,7 @@ class MediaScheduler:
         return True
 
     def unsubscribe(self, number: int, stream: str, reader: int) -> None:
-        """Remove a reader of a subscription, which ends with the last: a reconnecting client may have two for a while."""
+        """Remove a reader of a subscription, which ends with its last one: a reconnecting client may have two."""
         self._by_reader.get(reader, set()).discard((number, stream))
         subscription = self._subscriptions.get((number, stream))
         if subscription is None or reader not in subscription.readers:
