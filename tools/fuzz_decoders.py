@@ -21,7 +21,7 @@ import numpy as np
 from msgspec import inspect
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import plausible
+from iris_session.client.discovery import is_plausible
 from iris_session.client.errors import ClientError
 from iris_session.link import messages as link
 from iris_session.link.config import Ports, SceneInfo
@@ -365,11 +365,16 @@ def check_address(data: bytes) -> None:
 def check_introduction(data: bytes) -> None:
     introduction = codec.decode_introduction(data)
     if introduction is not None:
-        plausible(introduction.beacon)
+        is_plausible(introduction.beacon)
 
 
+<<<<<<< HEAD
 def check_beacon(data: bytes) -> None:
     plausible(codec.decode_beacon(data))
+=======
+def take_beacon(data: bytes) -> None:
+    is_plausible(codec.decode_beacon(data))
+>>>>>>> main
 
 
 def _make_versioned(rng: Random, kind: Any) -> Any:

@@ -5,9 +5,9 @@
     python tools/planted_faults.py --list
 
 The two machines are emulated by `planted_lab`: needs Linux, root, `ip` and `nft`. A fault counts as named when its
-check has the expected state and its text has the expected words, when no other check failed except those that follow from
-the fault, when the exit status fits, and when the output fits on one screen. Before and after, the doctor must find
-nothing failed; otherwise the result does not count. Prints a Markdown table.
+check has the expected state and its text has the expected words, when no other check failed except those that follow
+from the fault, when the exit status fits, and when the output fits on one screen. Before and after, the doctor must
+find nothing failed; otherwise the result does not count. Prints a Markdown table.
 """
 
 from __future__ import annotations
