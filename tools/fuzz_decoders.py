@@ -368,13 +368,8 @@ def check_introduction(data: bytes) -> None:
         is_plausible(introduction.beacon)
 
 
-<<<<<<< HEAD
 def check_beacon(data: bytes) -> None:
-    plausible(codec.decode_beacon(data))
-=======
-def take_beacon(data: bytes) -> None:
     is_plausible(codec.decode_beacon(data))
->>>>>>> main
 
 
 def _make_versioned(rng: Random, kind: Any) -> Any:

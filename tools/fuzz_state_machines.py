@@ -66,13 +66,8 @@ sys.path.insert(0, str(ROOT))  # the harness and the random entries are those of
 MS: Final = 1_000_000
 
 
-<<<<<<< HEAD
-class ClientConnection:
-    """Client connection that talks to a hostile session; some of its welcomes are valid."""
-=======
 class HostileSession:
-    """A client that a hostile session talks to: after an honest welcome now and then, anything."""
->>>>>>> main
+    """Client connection that talks to a hostile session; some of its welcomes are valid."""
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng

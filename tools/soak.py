@@ -274,13 +274,8 @@ class Soak:
                 continue  # the live view and other helpers
             self.result.rss.setdefault(name, []).append((now, process.memory_info().rss / 2**20))
 
-<<<<<<< HEAD
     def _is_everyone_driving(self) -> bool:
-        mirror, state = self.director.mirror, self.director.state
-=======
-    def _everybody_works(self) -> bool:
         mirror, state = self.director.mirror, self.director.scene.state
->>>>>>> main
         if state is None:
             return False
         connected = {p.name: p.id for p in mirror.participants.values() if p.connected}

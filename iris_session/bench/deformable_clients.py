@@ -61,13 +61,8 @@ class DeformableClient:
         self.overflow = 0
 
     def decode_newest(self, recording: bool) -> None:
-<<<<<<< HEAD
         """Decode the newest frame, as an application does before it draws."""
-        frame = self.feed.take()
-=======
-        """Decodes the newest frame, as an application does before it draws."""
         frame = self.feed.pop_newest()
->>>>>>> main
         if frame is None:
             return
         began_ns = time.thread_time_ns()
