@@ -175,7 +175,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
 
 def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
     """The anchors of a file, where one was given."""
-    from iris_session.session.anchors_file import load_anchors
+    from iris_session.session.config import load_anchors
 
     if path is None:
         return config

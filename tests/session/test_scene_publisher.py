@@ -28,8 +28,8 @@ from iris_session.protocol.scene import Environment, RemoveVisual, SetVisual
 from iris_session.protocol.server_messages import MarkerAdded, SceneChanged
 from iris_session.recording import Recording
 from iris_session.scene import AssetStore
-from iris_session.session.cadence import SILENT_NS
-from iris_session.session.resume_note import note_path
+from iris_session.session.publish_loop import SILENT_NS
+from iris_session.session.resume import find_note_path
 from iris_session.session.scene_publisher import AHEAD_NS, _capture
 from iris_session.session.verification import verify_recording
 
@@ -58,7 +58,7 @@ def kinds(session: ScenePublisher) -> list[type]:
 
 def box(session: ScenePublisher) -> list[float]:
     """Where the session has it now."""
-    with session._unchanging():
+    with session._hold_steps():
         assert session._stepper is not None
         return session._stepper.core.world.data.xpos[1].tolist()  # type: ignore[no-any-return]
 
@@ -340,4 +340,4 @@ def test_its_recording_replays_and_cannot_be_resumed(tmp_path: Path) -> None:
         assert 10 < sum(bool(row.plant) for row in rows) <= 62, "only where something was published"
     with pytest.raises(ResumeError, match=r"class 'open'.*serve the file again that was shown"):
         Session(config=SessionConfig(resume=path))
-    assert not note_path(path).exists(), "what nobody can go on from needs none"
+    assert not find_note_path(path).exists(), "what nobody can go on from needs none"

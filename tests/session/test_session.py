@@ -24,8 +24,8 @@ from iris_session.protocol.client_messages import Control
 from iris_session.protocol.scene import AddVisual, RemoveVisual, SetVisual, encode_scene
 from iris_session.protocol.server_messages import EStopChanged, Gap, MarkerAdded, PauseChanged, SceneChanged
 from iris_session.scene import AssetStore
-from iris_session.session import scene_change
-from iris_session.session.core import plant_state
+from iris_session.session import owner
+from iris_session.session.core import read_plant_state
 from iris_session.session.stepper import MAX_HOST_ENTRIES
 from iris_session.session.verification import verify_recording
 
@@ -178,7 +178,7 @@ def test_a_look_can_be_changed_before_the_first_step(tmp_path: Path, monkeypatch
     with pytest.raises(OwnershipError, match="not started"):
         Session(scene_path("handover"), config=config).patch_scene(RemoveVisual(0))
     with Session(scene_path("handover"), config=config) as session:
-        monkeypatch.setattr(scene_change, "MAX_SCENES", 2)
+        monkeypatch.setattr(owner, "MAX_PENDING_SCENES", 2)
         assert session.scene is not None
         seen = session.scene.visuals[0]
         for green in (0.5, 1.0):
@@ -212,15 +212,15 @@ def test_another_scene_begins_with_the_data_that_came_with_its_file(session: Ses
     model = load_model(path)
     data = mujoco.MjData(model)
     data.qpos[0] = 0.3
-    begun = plant_state(model, data)
+    begun = read_plant_state(model, data)
     session.run(seconds=0.05)
     change = session.load_scene(path, data)
     data.qpos[0] = 0.9  # whose it is goes on with it
     session.run(until=change.done)
     change.result()
-    before = session.stepper.core.as_it_is().initial_state
-    session.run(until=lambda: session.stepper.core.as_it_is().initial_state != before, seconds=30.0)
-    assert session.stepper.core.as_it_is().initial_state == begun
+    before = session.stepper.core.current_config().initial_state
+    session.run(until=lambda: session.stepper.core.current_config().initial_state != before, seconds=30.0)
+    assert session.stepper.core.current_config().initial_state == begun
     other = session.load_scene(path, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")))
     with pytest.raises(ConfigError, match="data is of another model"):
         other.result(60.0)
