@@ -1,6 +1,7 @@
-"""Which two headsets are compared when, and what is worth telling of it. The mathematics is `anchors.crosscheck`'s.
+"""Schedule the cross-check of headsets: which pair is compared when, and which disagreement is reported.
 
-One pair at a time, each at most once a second; it is told at most once in five, and only after new looks.
+One pair per call, each pair at most once a second; a pair is reported at most every five seconds, and only after new
+observations. The mathematics is in `anchors.crosscheck`.
 """
 
 from __future__ import annotations
@@ -14,115 +15,127 @@ from typing import Final
 from anchors.alignment import AlignmentEstimate
 from anchors.crosscheck import CrossCheck, CrossCheckConfig, Disagreement
 from anchors.pose import PoseTuple, Vec3
-from iris_session.alignment.estimation import UNSOLVABLE
+from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.entries import CrossChecked, Entry
 
-TELL_NS: Final = 5_000_000_000
-SCAN_NS: Final = 1_000_000_000
-#: Things of one headset that do not stand still, such as its controllers; the names are the client's own.
-MOVING: Final = 4
-#: Things of all headsets together: 20 MB when each was looked at a hundred times.
-_THINGS: Final = 512
-#: A look whose time is further from now is on no clock of this session.
-_PLAUSIBLE_NS: Final = 5_000_000_000
+REPORT_INTERVAL_NS: Final = 5_000_000_000
+SCAN_INTERVAL_NS: Final = 1_000_000_000
+#: Moving targets of one headset, such as its controllers; their names are chosen by the client.
+MAX_MOVING: Final = 4
+#: Targets of all headsets together: 20 MB at a hundred observations each.
+_MAX_TARGETS: Final = 512
+#: An observation whose time is further from now was not stamped with the clock of this session.
+_MAX_CLOCK_OFFSET_NS: Final = 5_000_000_000
 
 Pair = tuple[int, int]
 
 
-class Comparisons:
-    """Looks of all connections; `turn` compares one pair. `anchors`: what stands still, all else moves."""
+class CrossCheckScheduler:
+    """Observations of all connections; each `tick` compares one pair.
+
+    A target is what two headsets observe: an anchor, which stands still, or anything else, which may move.
+    """
 
     def __init__(self, anchors: Collection[str]) -> None:
+        """Create a scheduler; `anchors`: names of the targets that stand still."""
         self._anchors = anchors
-        self._check = CrossCheck(config=CrossCheckConfig(max_things=_THINGS))
-        self._looks: dict[int, int] = {}  # by connection: how many were taken
+        self._check = CrossCheck(config=CrossCheckConfig(max_things=_MAX_TARGETS))
+        self._n_observations: dict[int, int] = {}  # by connection
         self._moving: dict[int, set[str]] = {}
-        self._epochs: dict[int, int] = {}  # tracking epochs that `_moving` is of
-        self._told: dict[Pair, tuple[int, Pair]] = {}  # when, and of how many looks of either
-        self._waiting: deque[Pair] = deque()
+        self._epochs: dict[int, int] = {}  # tracking epochs of `_moving`
+        self._reported: dict[Pair, tuple[int, Pair]] = {}  # time, and number of observations of either then
+        self._pending: deque[Pair] = deque()
         self._next_scan_ns = 0
 
-    def see(
+    def add_observation(
         self,
         connection: int,
-        thing: str,
-        T_tracking_thing: PoseTuple,
+        target: str,
+        T_tracking_target: PoseTuple,
         p_tracking_head: Vec3 | None,
         capture_ns: int,
         tracking_epoch: int,
         viewpoint_id: int,
         now_ns: int,
     ) -> bool:
-        """One look. False: not kept (no pose, old, out of order, or too many things)."""
-        if abs(now_ns - capture_ns) > _PLAUSIBLE_NS:
+        """Add one observation; return false if it is dropped (not a pose, too old, out of order, or too many
+        targets)."""
+        if abs(now_ns - capture_ns) > _MAX_CLOCK_OFFSET_NS:
             return False
         if tracking_epoch > self._epochs.get(connection, tracking_epoch):
-            self._moving.pop(connection, None)  # those of the frame before need not be there any more
-        moving = self._moving.get(connection, set()) | (set() if thing in self._anchors else {thing})
-        if len(moving) > MOVING:
+            self._moving.pop(connection, None)  # targets of the old frame may no longer be there
+        moving = self._moving.get(connection, set()) | (set() if target in self._anchors else {target})
+        if len(moving) > MAX_MOVING:
             return False
         dropped = self._check.dropped
         self._check.see(
-            str(connection), thing, T_tracking_thing, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
+            str(connection), target, T_tracking_target, p_tracking_head, capture_ns, tracking_epoch, viewpoint_id
         )
         if self._check.dropped > dropped:
             return False
         self._moving[connection], self._epochs[connection] = moving, tracking_epoch
-        self._looks[connection] = self._looks.get(connection, 0) + 1
+        self._n_observations[connection] = self._n_observations.get(connection, 0) + 1
         return True
 
-    def forget_looks(self, connection: int) -> None:
-        """Its tracking frame is another one: what it saw before is elsewhere now."""
+    def discard_observations(self, connection: int) -> None:
+        """Discard the observations of a connection whose tracking frame has changed."""
         self._check.forget(str(connection))
         self._moving.pop(connection, None)
         self._epochs.pop(connection, None)
 
-    def forget_thing(self, thing: str) -> None:
-        """It was moved: who looked before saw it elsewhere."""
-        self._check.forget_thing(thing)
+    def discard_target(self, target: str) -> None:
+        """Discard all observations of a target that was moved."""
+        self._check.forget_thing(target)
 
-    def forget(self, connection: int) -> None:
-        """The connection is gone."""
-        self.forget_looks(connection)
-        self._looks.pop(connection, None)
-        for pair in [pair for pair in self._told if connection in pair]:
-            del self._told[pair]
+    def remove_connection(self, connection: int) -> None:
+        """Forget the state of a connection that has ended."""
+        self.discard_observations(connection)
+        self._n_observations.pop(connection, None)
+        for pair in [pair for pair in self._reported if connection in pair]:
+            del self._reported[pair]
 
-    def turn(self, in_force: Mapping[int, AlignmentEstimate], now_ns: int) -> Entry | None:
-        """Compares the pair whose turn it is; the entry that is worth telling, if any."""
-        if not self._waiting and now_ns >= self._next_scan_ns:
-            self._next_scan_ns = now_ns + SCAN_NS
-            self._waiting.extend(pair for pair in combinations(sorted(in_force), 2) if self._due(pair, now_ns))
-        if not self._waiting:
+    def tick(self, in_force: Mapping[int, AlignmentEstimate], now_ns: int) -> Entry | None:
+        """Compare the next pair; return the entry for the authority if a result is to be reported.
+
+        `in_force`: alignment in force by connection.
+        """
+        if not self._pending and now_ns >= self._next_scan_ns:
+            self._next_scan_ns = now_ns + SCAN_INTERVAL_NS
+            self._pending.extend(pair for pair in combinations(sorted(in_force), 2) if self._is_due(pair, now_ns))
+        if not self._pending:
             return None
-        a, b = self._waiting.popleft()
+        a, b = self._pending.popleft()
         if a not in in_force or b not in in_force:
             return None
-        worst = self._worst(in_force[a], in_force[b], (a, b), now_ns)
+        worst = self._find_worst(in_force[a], in_force[b], (a, b), now_ns)
         if worst is None:
             return None
-        self._told[a, b] = (now_ns, self._counts((a, b)))
-        return Entry(a, a, now_ns, _checked(worst, b))
+        self._reported[a, b] = (now_ns, self._count_observations((a, b)))
+        return Entry(a, a, now_ns, _to_message(worst, b))
 
-    def _due(self, pair: Pair, now_ns: int) -> bool:
-        counts = self._counts(pair)
-        told_ns, told = self._told.get(pair, (now_ns - TELL_NS, (0, 0)))
-        return all(counts) and counts != told and now_ns - told_ns >= TELL_NS
+    def _is_due(self, pair: Pair, now_ns: int) -> bool:
+        counts = self._count_observations(pair)
+        reported_ns, reported = self._reported.get(pair, (now_ns - REPORT_INTERVAL_NS, (0, 0)))
+        return all(counts) and counts != reported and now_ns - reported_ns >= REPORT_INTERVAL_NS
 
-    def _counts(self, pair: Pair) -> Pair:
-        return self._looks.get(pair[0], 0), self._looks.get(pair[1], 0)
+    def _count_observations(self, pair: Pair) -> Pair:
+        return self._n_observations.get(pair[0], 0), self._n_observations.get(pair[1], 0)
 
-    def _worst(self, of_a: AlignmentEstimate, of_b: AlignmentEstimate, pair: Pair, now_ns: int) -> Disagreement | None:
-        """Of all things that both saw: the one that is furthest beyond what is expected."""
+    def _find_worst(
+        self, alignment_a: AlignmentEstimate, alignment_b: AlignmentEstimate, pair: Pair, now_ns: int
+    ) -> Disagreement | None:
+        """Return the disagreement furthest beyond its expected error, of all targets that both observed."""
         a, b = pair
         moving = frozenset(self._moving.get(a, ())) & frozenset(self._moving.get(b, ()))
         try:
-            found = self._check.compare({str(a): of_a, str(b): of_b}, now_ns, moving)
-        except UNSOLVABLE:
+            found = self._check.compare({str(a): alignment_a, str(b): alignment_b}, now_ns, moving)
+        except NUMERICAL_ERRORS:
             return None
         found = [one for one in found if math.isfinite(one.error_m) and one.expected_p95_m > 0.0]
         return max(found, key=lambda one: one.error_m / one.expected_p95_m, default=None)
 
 
-def _checked(one: Disagreement, other: int) -> CrossChecked:
-    return CrossChecked(other, one.thing, one.error_m, one.error_rad, one.expected_p95_m, one.p_world, one.n)
+def _to_message(found: Disagreement, other: int) -> CrossChecked:
+    return CrossChecked(
+        other, found.thing, found.error_m, found.error_rad, found.expected_p95_m, found.p_world, found.n
+    )

@@ -1,22 +1,22 @@
-"""Live anchors: who saw what, what is proposed, what is alarming, and which headsets disagree.
+"""Live alignment of all headsets of a session: observations and head poses in, entries for the authority out.
 
-Owns a desk and a watch per connection, where the anchors are now, and the comparison of headsets. It decides nothing:
-entries go to the authority, and what that decides comes back as events (`heard`).
+The service keeps an estimator and a monitor per connection, the present poses of the anchors, and the cross-check of
+headsets. It decides nothing: proposals and alarms go to the authority as entries, and the decisions come back as events
+(`process_event`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Final, Protocol
 
 from anchors.alignment import AlignmentEstimate
 from anchors.drift import Alarm
 from anchors.pose import PoseTuple, Vec3, is_rigid
-from iris_session.alignment.cross_check import Comparisons
-from iris_session.alignment.drift import AlignmentWatch
-from iris_session.alignment.estimation import AlignmentDesk
-from iris_session.front.connections import ConnectionTable, FrontConnection
-from iris_session.link.config import FrontConfig
+from iris_session.alignment.cross_check import CrossCheckScheduler
+from iris_session.alignment.estimator import ConnectionEstimator
+from iris_session.alignment.monitor import AlignmentMonitor
 from iris_session.protocol.client_messages import Observation, Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import AlignmentProposal, Entry
@@ -36,198 +36,239 @@ from iris_session.protocol.server_messages import (
 from iris_session.protocol.status import AlignmentReport
 
 _HEAD: Final = "head"
-_COVARIANCE: Final = 36
-#: Participants whose alignment is remembered while they are away, per connection that there may be.
-_REMEMBERED: Final = 4
+_COVARIANCE_VALUES: Final = 36
+_NO_ANCHORS: Final[Mapping[str, Pose]] = MappingProxyType({})
+_NO_SIZES: Final[Mapping[str, float]] = MappingProxyType({})
+#: Disconnected participants whose alignment is remembered, per possible connection.
+_REMEMBERED_PER_CONNECTION: Final = 4
+#: Proposals whose pivot is remembered: 13 s at five per second, so that corrections that are announced first or slide
+#: in still find theirs.
+_MAX_PIVOTS: Final = 64
 
 
-#: Proposals whose pivot is remembered: of 13 s, so that corrections that are announced or slide in find theirs.
-_PIVOTS: Final = 64
+class HeadsetConnection(Protocol):
+    """What the service needs to know of a connection."""
+
+    @property
+    def number(self) -> int: ...
+
+    @property
+    def participant_id(self) -> str:
+        """Empty until the authority has admitted the participant."""
+        ...
 
 
-class _Person:
-    """What is kept of one connection. Alarms and proposals are stamped so that their order shows in their times.
+class _HeadsetState:
+    """State of one connection.
 
-    `jumped`: tracking epoch and time of the last jump: what was seen before it was seen in another frame, though it may
-    come later (sheets are found in pictures that are tenths of a second old). `pivots`: where the covariances of the
-    last proposals are stated, oldest first.
+    `alarm_ns`, `proposal_ns`: session times of the last alarm and proposal; entries are stamped so that these times
+    show their order. `last_jump`: tracking epoch and capture time of the last jump. An observation captured before it
+    is in the old tracking frame, though it may arrive later (sheets are detected in pictures that are tenths of a
+    second old). `pivots`: pivot of each of the last proposals by its covariance, oldest first.
     """
 
-    __slots__ = ("alarm_ns", "desk", "jumped", "pivots", "proposal_ns", "watch")
-
-    def __init__(self, desk: AlignmentDesk, watch: AlignmentWatch) -> None:
-        self.desk = desk
-        self.watch = watch
-        self.alarm_ns = self.proposal_ns = -1
-        self.pivots: dict[tuple[float, ...], Vec3] = {}
-        self.jumped: tuple[int, int] | None = None
-
-    def proposed(self, proposal: AlignmentProposal) -> None:
-        self.pivots.pop(proposal.covariance, None)
-        self.pivots[proposal.covariance] = proposal.pivot_world
-        if len(self.pivots) > _PIVOTS:
-            del self.pivots[next(iter(self.pivots))]
-
-    def pivot_of(self, covariance: tuple[float, ...]) -> Vec3 | None:
-        """Where this covariance is stated: an `Alignment` does not say it, but it was proposed here. One that slides in
-        is wider than what was proposed, and is stated where the newest is."""
-        return self.pivots.get(covariance) or next(reversed(self.pivots.values()), None)
-
-    def is_of_before(self, observation: Observation) -> bool:
-        """Whether it is of the frame before the last jump."""
-        if self.jumped is None or observation.tracking_epoch != self.jumped[0]:
-            return False
-        return observation.capture_ns < self.jumped[1]
-
-
-class Anchoring:
-    """A `Service`. `offer` takes entries for the authority; false: dropped and counted."""
+    __slots__ = ("alarm_ns", "connection", "estimator", "last_jump", "monitor", "pivots", "proposal_ns")
 
     def __init__(
-        self, config: FrontConfig, clients: ConnectionTable, offer: Callable[[Entry], bool], drops: Drops
+        self, connection: HeadsetConnection, estimator: ConnectionEstimator, monitor: AlignmentMonitor
     ) -> None:
-        self._config = config
-        self._clients = clients
+        self.connection = connection
+        self.estimator = estimator
+        self.monitor = monitor
+        self.alarm_ns = self.proposal_ns = -1
+        self.pivots: dict[tuple[float, ...], Vec3] = {}
+        self.last_jump: tuple[int, int] | None = None
+
+    def remember_pivot(self, proposal: AlignmentProposal) -> None:
+        self.pivots.pop(proposal.covariance, None)
+        self.pivots[proposal.covariance] = proposal.pivot_world
+        if len(self.pivots) > _MAX_PIVOTS:
+            del self.pivots[next(iter(self.pivots))]
+
+    def find_pivot(self, covariance: tuple[float, ...]) -> Vec3 | None:
+        """Return the point of the world at which this covariance is stated, `None` without any proposal.
+
+        An `Alignment` does not carry its pivot. The covariance of a correction that slides in is wider than the
+        proposed one; it is stated at the pivot of the newest proposal.
+        """
+        return self.pivots.get(covariance) or next(reversed(self.pivots.values()), None)
+
+    def is_before_jump(self, observation: Observation) -> bool:
+        """Return whether the observation was captured in the tracking frame before the last jump."""
+        if self.last_jump is None or observation.tracking_epoch != self.last_jump[0]:
+            return False
+        return observation.capture_ns < self.last_jump[1]
+
+
+class AlignmentService:
+    """Estimate, monitor and cross-check the alignment of every headset of a session."""
+
+    def __init__(
+        self,
+        offer: Callable[[Entry], bool],
+        drops: Drops,
+        *,
+        anchors: Mapping[str, Pose] = _NO_ANCHORS,
+        anchor_sizes: Mapping[str, float] = _NO_SIZES,
+        proposal_period_ns: int = 200_000_000,
+        max_connections: int = 64,
+    ) -> None:
+        """Create the service of one session.
+
+        Args:
+            offer: Takes an entry for the authority; returns false if it was dropped (and counted).
+            drops: Counters of what is not used, by reason.
+            anchors: `T_world_anchor` at the start of the session.
+            anchor_sizes: Edge length [m] of printed sheets, where known.
+            proposal_period_ns: Least time between two proposals of one connection.
+            max_connections: Most connections of the session; bounds the memory for disconnected participants.
+        """
         self._offer = offer
         self._drops = drops
+        self._sizes = anchor_sizes
+        self._proposal_period_ns = proposal_period_ns
+        self._max_remembered = _REMEMBERED_PER_CONNECTION * max_connections
         #: `T_world_anchor`, as it is now.
-        self.anchors: dict[str, PoseTuple] = {name: (pose.p, pose.q) for name, pose in config.anchors.items()}
-        self._people: dict[int, _Person] = {}  # by connection, in the order of their turns
-        self._comparisons = Comparisons(self.anchors)
-        self._in_force: dict[str, Alignment] = {}  # by participant, also of those who will come back
+        self.anchors: dict[str, PoseTuple] = {name: (pose.p, pose.q) for name, pose in anchors.items()}
+        self._states: dict[int, _HeadsetState] = {}  # by connection; the least recently estimated first
+        self._cross_check = CrossCheckScheduler(self.anchors)
+        self._in_force: dict[str, Alignment] = {}  # by participant, also of those who may reconnect
         self._stopped: dict[str, None] = {}  # participants whose run was stopped
 
     def __len__(self) -> int:
-        return len(self._people)
+        return len(self._states)
 
-    # --- from clients ------------------------------------------------------------------------------------------------
+    # --- messages of clients -----------------------------------------------------------------------------------------
 
-    def sampled(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
-        """Every sample: those of a head are kept, and watched for jumps."""
+    def process_sample(self, connection: HeadsetConnection, sample: Sample, now_ns: int) -> None:
+        """Record a head pose and check it for a jump; samples of other devices are ignored."""
         if sample.device != _HEAD or sample.pose is None or sample.kind != SampleKind.POSE or not sample.tracked:
             return
-        person = self._people.get(connection.number) or self._meet(connection)
+        state = self._states.get(connection.number) or self._add_connection(connection)
         pose = sample.pose
-        alarm = person.watch.head((pose.p, pose.q), sample.capture_ns, sample.tracking_epoch)
+        alarm = state.monitor.add_head_pose((pose.p, pose.q), sample.capture_ns, sample.tracking_epoch)
         if alarm is not None:
-            self._alarmed(connection.number, person, alarm, sample.tracking_epoch, now_ns)
+            self._process_alarm(connection.number, state, alarm, sample.tracking_epoch, now_ns)
 
-    def observed(self, connection: FrontConnection, observation: Observation, now_ns: int) -> None:
-        """Every observation: for the watch first, then for the estimate."""
+    def process_observation(self, connection: HeadsetConnection, observation: Observation, now_ns: int) -> None:
+        """Check an observation against the present alignment, then add it to the estimate and the cross-check."""
         number = connection.number
-        person = self._people.get(number) or self._meet(connection)
-        if person.is_of_before(observation):
+        state = self._states.get(number) or self._add_connection(connection)
+        if state.is_before_jump(observation):
             self._drops.count("observation_before_jump", number)
             return
-        p_tracking_head = self._head_of(person, observation)
+        p_tracking_head = self._find_head_position(state, observation)
         known = observation.anchor_id in self.anchors
         touch, tracked = observation.kind == AnchorKind.TOUCH, observation.kind == AnchorKind.CONTROLLER
         if known and not touch:
-            alarm = person.watch.observe(observation, p_tracking_head)
+            alarm = state.monitor.check_observation(observation, p_tracking_head)
             if alarm is not None:
-                self._alarmed(number, person, alarm, observation.tracking_epoch, now_ns)
+                self._process_alarm(number, state, alarm, observation.tracking_epoch, now_ns)
         used = True
         if known or not tracked:
-            used = person.desk.observe(observation, p_tracking_head, now_ns)
+            used = state.estimator.add_observation(observation, p_tracking_head, now_ns)
         if (known and not touch and used) or (tracked and not known):
-            kept = self._see(number, observation, p_tracking_head, now_ns)
+            kept = self._add_to_cross_check(number, observation, p_tracking_head, now_ns)
             used = kept if not known else used
         if not used:
             self._drops.count("observation_unusable", number)
 
-    def _head_of(self, person: _Person, observation: Observation) -> Vec3 | None:
+    def _find_head_position(self, state: _HeadsetState, observation: Observation) -> Vec3 | None:
         if observation.device != _HEAD:
             return None
-        T_tracking_head = person.watch.heads.nearest(observation.capture_ns, observation.tracking_epoch)
+        T_tracking_head = state.monitor.heads.find_nearest(observation.capture_ns, observation.tracking_epoch)
         return None if T_tracking_head is None else T_tracking_head[0]
 
-    def _see(self, number: int, seen: Observation, p_tracking_head: Vec3 | None, now_ns: int) -> bool:
-        pose = seen.T_tracking_anchor
-        return self._comparisons.see(
+    def _add_to_cross_check(
+        self, number: int, observation: Observation, p_tracking_head: Vec3 | None, now_ns: int
+    ) -> bool:
+        pose = observation.T_tracking_anchor
+        return self._cross_check.add_observation(
             number,
-            seen.anchor_id,
+            observation.anchor_id,
             (pose.p, pose.q),
             p_tracking_head,
-            seen.capture_ns,
-            seen.tracking_epoch,
-            seen.viewpoint_id,
+            observation.capture_ns,
+            observation.tracking_epoch,
+            observation.viewpoint_id,
             now_ns,
         )
 
-    def _meet(self, connection: FrontConnection) -> _Person:
-        config = self._config
-        desk = AlignmentDesk(self.anchors, config.proposal_period_ns, config.anchor_sizes)
-        person = self._people[connection.number] = _Person(desk, AlignmentWatch(self.anchors))
-        desk.running = connection.participant_id not in self._stopped
-        self._put_in_force(person, self._in_force.get(connection.participant_id))
-        return person
+    def _add_connection(self, connection: HeadsetConnection) -> _HeadsetState:
+        estimator = ConnectionEstimator(self.anchors, self._proposal_period_ns, self._sizes)
+        state = _HeadsetState(connection, estimator, AlignmentMonitor(self.anchors))
+        self._states[connection.number] = state
+        estimator.running = connection.participant_id not in self._stopped
+        self._apply_alignment(state, self._in_force.get(connection.participant_id))
+        return state
 
-    def _alarmed(self, number: int, person: _Person, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
-        """Tells, and forgets what holds no more: of the sheet that was moved, else of the headset."""
+    def _process_alarm(self, number: int, state: _HeadsetState, alarm: Alarm, tracking_epoch: int, now_ns: int) -> None:
+        """Report an alarm and discard the observations it invalidates: of the sheet that was moved, else of the
+        headset."""
         if alarm.kind == AlarmKind.JUMP:
-            person.jumped = (tracking_epoch, min(alarm.capture_ns, now_ns))
-        told = person.watch.told(alarm, now_ns)
-        if told is None:
+            state.last_jump = (tracking_epoch, min(alarm.capture_ns, now_ns))
+        message = state.monitor.to_message(alarm, now_ns)
+        if message is None:
             self._drops.count("alarms_repeated", number)
         else:
-            person.alarm_ns = max(now_ns, person.proposal_ns)  # no proposal made before is later
-            self._offer(Entry(number, number, person.alarm_ns, told))
+            state.alarm_ns = max(now_ns, state.proposal_ns)  # no proposal made before is later
+            self._offer(Entry(number, number, state.alarm_ns, message))
         if alarm.beside:
-            self._comparisons.forget_thing(alarm.anchor_id)
+            self._cross_check.discard_target(alarm.anchor_id)
             return
-        person.desk.start_anew()
-        person.watch.known_wrong()
-        self._comparisons.forget_looks(number)
+        state.estimator.reset()
+        state.monitor.mute()
+        self._cross_check.discard_observations(number)
 
-    def forget(self, number: int) -> None:
-        """The connection is gone."""
-        self._people.pop(number, None)
-        self._comparisons.forget(number)
+    def remove_connection(self, number: int) -> None:
+        """Forget the state of a connection that has ended."""
+        self._states.pop(number, None)
+        self._cross_check.remove_connection(number)
 
-    # --- from the authority ------------------------------------------------------------------------------------------
+    # --- decisions of the authority ----------------------------------------------------------------------------------
 
-    def heard(self, event: EventKind) -> None:
-        """Every event, as clients get it."""
+    def process_event(self, event: EventKind) -> None:
+        """Apply an event of the authority, as clients receive it."""
         if isinstance(event, AlignmentChanged):
-            self._changed(event.participant, event.alignment)
+            self._set_alignment(event.participant, event.alignment)
         elif isinstance(event, AlignmentAlarmed):
             if event.kind == AlarmKind.JUMP:
-                self._changed(event.participant, None)
+                self._set_alignment(event.participant, None)
         elif isinstance(event, ParticipantJoined | ParticipantChanged):
             if event.participant.alignment is None:
-                self._changed(event.participant.id, None)
+                self._set_alignment(event.participant.id, None)
         elif isinstance(event, AlignmentRun):
-            self._ran(event)
+            self._process_run(event)
         elif isinstance(event, AnchorMoved):
-            self._moved(event.anchor_id, event.T_world_anchor)
+            self._move_anchor(event.anchor_id, event.T_world_anchor)
         elif isinstance(event, ParticipantLeft) and not event.grace:
             self._in_force.pop(event.participant, None)
             self._stopped.pop(event.participant, None)
 
-    def shown(self, participants: Iterable[ParticipantInfo]) -> None:
-        """A snapshot: a front that was started anew has heard no events."""
-        for one in participants:
-            if one.alignment is not None and one.id not in self._in_force:
-                self._changed(one.id, one.alignment)
+    def process_snapshot(self, participants: Iterable[ParticipantInfo]) -> None:
+        """Apply the participants of a snapshot: a restarted front has received no events."""
+        for participant in participants:
+            if participant.alignment is not None and participant.id not in self._in_force:
+                self._set_alignment(participant.id, participant.alignment)
 
-    def _changed(self, participant: str, alignment: Alignment | None) -> None:
+    def _set_alignment(self, participant: str, alignment: Alignment | None) -> None:
         self._in_force.pop(participant, None)
         if alignment is not None:
             self._in_force[participant] = alignment
-            _bounded(self._in_force, _REMEMBERED * self._config.limits.connections)
-        for person in self._of(participant):
-            self._put_in_force(person, alignment)
+            _limit_size(self._in_force, self._max_remembered)
+        for state in self._find_states(participant):
+            self._apply_alignment(state, alignment)
 
-    def _put_in_force(self, person: _Person, alignment: Alignment | None) -> None:
+    def _apply_alignment(self, state: _HeadsetState, alignment: Alignment | None) -> None:
         measured = alignment is not None and alignment.kind == AlignmentKind.MEASURED and not alignment.offset
-        person.watch.put_in_force(self._in_force_of(person, alignment), measured, person.desk.running)
+        state.monitor.set_alignment(self._to_estimate(state, alignment), measured, state.estimator.running)
 
-    def _in_force_of(self, person: _Person, alignment: Alignment | None) -> AlignmentEstimate | None:
-        """As the estimators write it. `None`: nothing, or nobody knows how far it may be off."""
-        if alignment is None or len(alignment.covariance) != _COVARIANCE or not self.anchors:
+    def _to_estimate(self, state: _HeadsetState, alignment: Alignment | None) -> AlignmentEstimate | None:
+        """Return an alignment in the form of an estimate, `None` if there is none or its error is unknown."""
+        if alignment is None or len(alignment.covariance) != _COVARIANCE_VALUES or not self.anchors:
             return None
-        pivot_world = person.pivot_of(alignment.covariance)
-        if pivot_world is None:  # a front that was started anew
+        pivot_world = state.find_pivot(alignment.covariance)
+        if pivot_world is None:  # the front was restarted
             pivot_world = next(iter(self.anchors.values()))[0]
         pose = alignment.T_world_tracking
         return AlignmentEstimate(
@@ -243,65 +284,65 @@ class Anchoring:
             advice="",
         )
 
-    def _ran(self, run: AlignmentRun) -> None:
+    def _process_run(self, run: AlignmentRun) -> None:
         self._stopped.pop(run.participant, None)
         if not run.running:
             self._stopped[run.participant] = None
-            _bounded(self._stopped, _REMEMBERED * self._config.limits.connections)
-        for person in self._of(run.participant):
+            _limit_size(self._stopped, self._max_remembered)
+        for state in self._find_states(run.participant):
             if run.running:
-                person.desk.begin()
-                person.watch.begin()
+                state.estimator.start_run()
+                state.monitor.start_run()
             else:
-                person.desk.running = False
+                state.estimator.running = False
 
-    def _moved(self, anchor_id: str, T_world_anchor: Pose) -> None:
+    def _move_anchor(self, anchor_id: str, T_world_anchor: Pose) -> None:
         pose = (T_world_anchor.p, T_world_anchor.q)
         if not is_rigid(pose):
             return
         self.anchors[anchor_id] = pose
-        self._comparisons.forget_thing(anchor_id)
-        for person in self._people.values():
-            person.desk.anchors_moved()
-            person.watch.anchor_moved(anchor_id)
+        self._cross_check.discard_target(anchor_id)
+        for state in self._states.values():
+            state.estimator.on_anchors_moved()
+            state.monitor.on_anchor_moved(anchor_id)
 
-    def _of(self, participant: str) -> list[_Person]:
-        numbers = [c.number for c in self._clients.by_number.values() if c.participant_id == participant]
-        return [self._people[number] for number in numbers if number in self._people]
+    def _find_states(self, participant: str) -> list[_HeadsetState]:
+        return [state for state in self._states.values() if state.connection.participant_id == participant]
 
-    # --- now and then ------------------------------------------------------------------------------------------------
+    # --- periodic work -----------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """At most one estimate or comparison: either takes up to milliseconds, and state waits meanwhile."""
-        for number, person in self._people.items():
-            if person.desk.due(now_ns):
-                self._people[number] = self._people.pop(number)  # whoever had a turn is the last to have another
-                self._propose(number, person, now_ns)
+        """Compute at most one estimate or one cross-check: either takes up to milliseconds and delays state frames."""
+        for number, state in self._states.items():
+            if state.estimator.is_due(now_ns):
+                self._states[number] = self._states.pop(number)  # round robin
+                self._propose(number, state, now_ns)
                 return
-        in_force = {n: p.watch.in_force for n, p in self._people.items() if p.watch.in_force is not None}
-        entry = self._comparisons.turn(in_force, now_ns)
+        in_force = {n: s.monitor.in_force for n, s in self._states.items() if s.monitor.in_force is not None}
+        entry = self._cross_check.tick(in_force, now_ns)
         if entry is not None:
             self._offer(entry)
 
-    def _propose(self, number: int, person: _Person, now_ns: int) -> None:
-        proposal = person.desk.propose(now_ns)
+    def _propose(self, number: int, state: _HeadsetState, now_ns: int) -> None:
+        proposal = state.estimator.propose(now_ns)
         if proposal is None:
             return
-        if person.desk.newest is not None and not proposal.refused:
-            person.watch.estimated(person.desk.newest)
-            person.proposed(proposal)
-        person.proposal_ns = max(now_ns, person.alarm_ns + 1)
-        self._offer(Entry(number, number, person.proposal_ns, proposal))
+        if state.estimator.newest is not None and not proposal.refused:
+            state.monitor.set_estimate(state.estimator.newest)
+            state.remember_pivot(proposal)
+        state.proposal_ns = max(now_ns, state.alarm_ns + 1)
+        self._offer(Entry(number, number, state.proposal_ns, proposal))
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Do nothing: the service holds no resources."""
 
-    def report(self, number: int, half: AlignmentReport | None, now_ns: int) -> AlignmentReport | None:
-        """The authority's half of a participant's report with ours."""
-        person = self._people.get(number)
-        return half if person is None else person.desk.report(half, now_ns)
+    def complete_report(self, number: int, report: AlignmentReport | None, now_ns: int) -> AlignmentReport | None:
+        """Return the authority's report on a participant, completed by the state of the estimator."""
+        state = self._states.get(number)
+        return report if state is None else state.estimator.complete_report(report, now_ns)
 
 
-def _bounded(memory: dict[str, Alignment] | dict[str, None], most: int) -> None:
-    while len(memory) > most:
+def _limit_size(memory: dict[str, Alignment] | dict[str, None], max_size: int) -> None:
+    """Remove the oldest items until at most `max_size` are left."""
+    while len(memory) > max_size:
         del memory[next(iter(memory))]

@@ -31,6 +31,7 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 from anchors.uncertainty import length_p95
+from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.names import AnchorKind
 from iris_session.recording import Look, Looks
@@ -44,8 +45,6 @@ MAX_GROUPS: Final = 200
 GRAIN_NS: Final = 10_000_000_000
 #: 99.9 % quantile of chi-square with 6 degrees of freedom.
 CHI2_6_999: Final = 22.458
-#: What numbers of a stranger can make of linear algebra.
-_UNSOLVABLE: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 
 class Anchors:
@@ -231,7 +230,7 @@ def add(estimator: AlignmentEstimator, look: Look, capture_ns: int) -> bool:
             covariance=covariance_of(seen),
             p_tracking_head=None if seen.kind == AnchorKind.CONTROLLER else look.p_tracking_head,
         )
-    except _UNSOLVABLE:
+    except NUMERICAL_ERRORS:
         estimator.invalid += 1
         return False
 
@@ -240,7 +239,7 @@ def estimate(estimator: AlignmentEstimator) -> AlignmentEstimate:
     """The solution; refused for numbers that nobody can solve."""
     try:
         return estimator.estimate()
-    except _UNSOLVABLE:
+    except NUMERICAL_ERRORS:
         zero, epoch = (0.0, 0.0, 0.0), estimator.tracking_epoch
         text = "what was seen cannot be solved"
         return AlignmentEstimate(IDENTITY_POSE, epoch, (0.0,) * 36, zero, math.inf, 0.0, 0, 0, True, text)

@@ -115,7 +115,7 @@ def make_session_status(
         view.sim_time,
         decision.paused,
         decision.estop,
-        ledger.make_participant_reports(now_ns, core.authority.alignment_reports()),
+        ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
         tuple(ledger.handovers),
         lateness,
         ledger.compute_input_to_ctrl_ms(),
@@ -179,14 +179,14 @@ class StatusReporter:
             load=os.getloadavg()[0],
             cpus=os.cpu_count() or 1,
             memory_bytes=measure_memory_bytes(),
-            participants=stepper.ledger.make_participant_reports(now_ns, core.authority.alignment_reports()),
+            participants=stepper.ledger.make_participant_reports(now_ns, core.authority.build_alignment_reports()),
             robots=make_robot_reports(stepper),
             recorder=processes.recorder,
             drops=processes.drops,
             restarts=processes.restarts,
             warnings=tuple(collect_warnings(stepper, processes.recorder, self.scheduling, warnings)),
             anchors=make_anchor_reports(core.authority.anchors, processes.sheet_sizes),
-            cross_checks=core.authority.cross_check_reports(),
+            cross_checks=core.authority.build_cross_check_reports(),
         )
 
     def _measure_cpu_share(self) -> float:

@@ -21,7 +21,7 @@ from iris_session.protocol.server_messages import (
     ParticipantLeft,
 )
 from iris_session.protocol.status import AlignmentReport
-from tests.alignment.anchor_world import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, inverse_head, misplaced_m
+from tests.alignment.emulated_headsets import ANCHORS, MS, SECOND, SHEET, Lab, Wearer, inverse_head, misplaced_m
 from tests.anchors.worlds import shifted
 
 
@@ -125,7 +125,7 @@ def test_what_a_director_placed_is_contradicted_by_no_sheet(fields: dict[str, ob
     ann.survey()
     got = ann.proposals()[-1]
     pose = Pose(*shifted((got.T_world_tracking.p, got.T_world_tracking.q), (0.3, 0.0, 0.0)))
-    lab.anchoring.heard(AlignmentRun("p1", False, 1))  # no estimate speaks for it
+    lab.service.process_event(AlignmentRun("p1", False, 1))  # no estimate speaks for it
     lab.put_in_force(ann, got, T_world_tracking=pose, **fields)
     ann.watch(ann.place(d=0.5), 40)
     assert ann.alarms() == []
@@ -187,23 +187,23 @@ def test_who_has_no_alignment_any_more_has_none_in_force_here() -> None:
     ann = lab.wearer()
     ann.survey()
     info = ParticipantInfo("p1", "Ann", "operator", True)
-    assert lab.anchoring._people[1].watch.in_force is not None
-    lab.anchoring.heard(ParticipantChanged(info))
-    assert lab.anchoring._people[1].watch.in_force is None
+    assert lab.service._states[1].monitor.in_force is not None
+    lab.service.process_event(ParticipantChanged(info))
+    assert lab.service._states[1].monitor.in_force is None
 
 
 def test_a_stopped_run_proposes_nothing_but_is_watched_and_a_new_one_forgets() -> None:
     lab = Lab()
     ann = lab.wearer()
     ann.survey()
-    lab.anchoring.heard(AlignmentRun("p1", False, 1))
+    lab.service.process_event(AlignmentRun("p1", False, 1))
     look, before = ann.place(d=0.6), len(ann.proposals())
     ann.watch(look, 20)
     assert len(ann.proposals()) == before
     ann.bump(0.05, 0.05)
     ann.watch(look, 5)
     assert [a.kind for a in ann.alarms()] == ["jump"]
-    lab.anchoring.heard(AlignmentRun("p1", True, 2))
+    lab.service.process_event(AlignmentRun("p1", True, 2))
     ann.watch(look, 3)
     assert len(ann.proposals()) == before, "too few observations in the new run"
     ann.watch(look, 10)
@@ -216,12 +216,12 @@ def test_a_stopped_run_stays_stopped_over_a_reconnect_until_its_owner_leaves() -
     ann = lab.wearer()
     ann.survey()
     before = len(ann.proposals())
-    lab.anchoring.heard(AlignmentRun("p1", False, 1))
-    lab.anchoring.forget(1)
+    lab.service.process_event(AlignmentRun("p1", False, 1))
+    lab.service.remove_connection(1)
     ann.watch(ann.place(), 20)
     assert len(ann.proposals()) == before
-    lab.anchoring.heard(ParticipantLeft("p1", "bye", False))
-    lab.anchoring.forget(1)
+    lab.service.process_event(ParticipantLeft("p1", "bye", False))
+    lab.service.remove_connection(1)
     ann.watch(ann.place(), 20)
     assert len(ann.proposals()) > before
 
@@ -233,7 +233,7 @@ def test_an_anchor_that_a_director_moved_is_proposed_at_its_new_place_without_a_
     lab.turn(500)
     before = ann.proposals()[-1]
     moved: PoseTuple = ((1.2, 0.4, 0.9), quat_from_yaw(2.5))
-    lab.anchoring.heard(AnchorMoved("sheet", Pose(*moved)))
+    lab.service.process_event(AnchorMoved("sheet", Pose(*moved)))
     lab.turn(500)
     after = ann.proposals()[-1]
     expected = compose(compose(moved, inverse(SHEET)), (before.T_world_tracking.p, before.T_world_tracking.q))
@@ -248,9 +248,9 @@ def test_who_measures_no_more_is_not_alarmed_by_an_anchor_that_a_director_moved(
     lab = Lab({"sheet": SHEET})
     ann = lab.wearer()
     ann.survey()
-    lab.anchoring.heard(AlignmentRun("p1", False, 1))
+    lab.service.process_event(AlignmentRun("p1", False, 1))
     ann.accept()
-    lab.anchoring.heard(AnchorMoved("sheet", Pose(*shifted(SHEET, (0.5, 0.0, 0.0)))))
+    lab.service.process_event(AnchorMoved("sheet", Pose(*shifted(SHEET, (0.5, 0.0, 0.0)))))
     ann.watch(ann.place(d=0.5), 40)
     assert ann.alarms() == []
 
@@ -300,7 +300,7 @@ def test_three_touched_marks_align() -> None:
     for point in "ab":
         _touch(ann, point)
     assert ann.entries() == []
-    report = lab.anchoring.report(1, None, lab.now_ns)
+    report = lab.service.complete_report(1, None, lab.now_ns)
     assert report is not None
     assert "2 points touched, 3 are needed" in report.advice
     _touch(ann, "c")
@@ -401,10 +401,10 @@ def test_who_left_or_was_bumped_is_not_compared_by_what_it_saw_before() -> None:
     lab.now_ns += 6 * SECOND
     lab.turn(2000)
     assert lab.compared() == []
-    lab.anchoring.heard(AlignmentAlarmed("p2", "jump", "", 1.0))
-    lab.anchoring.forget(1)
-    lab.anchoring.forget(2)
-    assert len(lab.anchoring) == 0
+    lab.service.process_event(AlignmentAlarmed("p2", "jump", "", 1.0))
+    lab.service.remove_connection(1)
+    lab.service.remove_connection(2)
+    assert len(lab.service) == 0
 
 
 def test_a_controller_that_both_see_moves_and_is_compared_at_the_same_instants() -> None:
@@ -451,12 +451,12 @@ def test_the_covariance_in_force_is_stated_where_it_was_proposed() -> None:
     newest = ann.proposals()[-1]
     assert distance(newest.pivot_world, accepted.pivot_world) > 0.2
     lab.put_in_force(ann, accepted)
-    in_force = lab.anchoring._people[1].watch.in_force
+    in_force = lab.service._states[1].monitor.in_force
     assert in_force is not None
     assert in_force.pivot_world == accepted.pivot_world
     assert in_force.error_at(SHEET[0]) == pytest.approx(accepted.error_at_anchor_m)
     lab.put_in_force(ann, newest, covariance=tuple(2.0 * c for c in newest.covariance))
-    sliding = lab.anchoring._people[1].watch.in_force
+    sliding = lab.service._states[1].monitor.in_force
     assert sliding is not None
     assert sliding.pivot_world == newest.pivot_world
 
@@ -468,11 +468,11 @@ def test_a_front_that_was_started_anew_learns_from_a_snapshot_what_is_in_force()
     got = ann.proposals()[-1]
     fresh = Lab()
     bob = fresh.wearer()
-    bob.frame, bob.connection.participant_id = ann.frame, "p1"
-    alignment = lab.anchoring._in_force["p1"]
-    fresh.anchoring.shown([ParticipantInfo("p1", "Ann", "operator", True, alignment=alignment)])
+    bob.frame = ann.frame
+    alignment = lab.service._in_force["p1"]
+    fresh.service.process_snapshot([ParticipantInfo("p1", "Ann", "operator", True, alignment=alignment)])
     bob.watch(bob.place(), 1)
-    in_force = fresh.anchoring._people[1].watch.in_force
+    in_force = fresh.service._states[1].monitor.in_force
     assert in_force is not None
     assert in_force.T_world_tracking[0] == got.T_world_tracking.p
 
@@ -489,16 +489,16 @@ def test_memory_is_bounded() -> None:
         ann.see(look)
         ann.observe(Observation(f"thing{i}", "controller", IDENTITY, lab.now_ns, 1))
         ann.observe(Observation(f"sheet{i}", "qr", IDENTITY, lab.now_ns, 1))
-    person = lab.anchoring._people[1]
-    assert len(person.watch.heads) <= 128
-    assert len(lab.anchoring._comparisons._moving[1]) <= 4
-    assert len(lab.anchoring._comparisons._check._looks) <= 5
-    assert all(len(looks) <= 100 for looks in lab.anchoring._comparisons._check._looks.values())
-    assert set(person.desk._seen) == {"sheet"}
-    assert len(person.desk._estimator._memory) <= 600
+    person = lab.service._states[1]
+    assert len(person.monitor.heads) <= 128
+    assert len(lab.service._cross_check._moving[1]) <= 4
+    assert len(lab.service._cross_check._check._looks) <= 5
+    assert all(len(looks) <= 100 for looks in lab.service._cross_check._check._looks.values())
+    assert set(person.estimator._observed) == {"sheet"}
+    assert len(person.estimator._estimator._memory) <= 600
     for n in range(2000):
-        lab.anchoring.heard(AlignmentRun(f"q{n}", False, 1))
-    assert len(lab.anchoring._stopped) <= 4 * lab.config.limits.connections
+        lab.service.process_event(AlignmentRun(f"q{n}", False, 1))
+    assert len(lab.service._stopped) <= 4 * 64
 
 
 BAD = (math.nan, math.inf, -math.inf, 1e308, 1e-308, 0.0)
@@ -522,7 +522,7 @@ def test_garbage_raises_nothing_and_makes_entries_that_can_be_sent(bad: float) -
             for epoch in (0, 1):
                 for one in (ann, bob):
                     sample = Sample("head", "pose", 1, ns, 1, epoch, 0, pose=pose)
-                    lab.anchoring.sampled(one.connection, sample, lab.now_ns)
+                    lab.service.process_sample(one.connection, sample, lab.now_ns)
                     for kind in ("qr", "board", "controller", "touch", "nonsense"):
                         for anchor in ("sheet", "other", "nothing"):
                             seen = Observation(anchor, kind, pose, ns, epoch, covariance=(bad,) * 36, quality=bad)
@@ -542,11 +542,11 @@ def test_the_report_of_both_halves() -> None:
     lab = Lab()
     ann = lab.wearer()
     half = AlignmentReport(version=7, pending_m=0.1)
-    assert lab.anchoring.report(1, half, 0) is half
+    assert lab.service.complete_report(1, half, 0) is half
     ann.survey(2)
     ann.observe(Observation("sheet", "qr", Pose((math.nan, 0.0, 0.0), IDENTITY.q), lab.now_ns, 1))
     lab.now_ns += SECOND
-    report = lab.anchoring.report(1, half, lab.now_ns)
+    report = lab.service.complete_report(1, half, lab.now_ns)
     assert report is not None
     assert (report.version, report.pending_m) == (7, 0.1)
     assert (report.observations, report.unusable) == (30, 1)
@@ -554,7 +554,7 @@ def test_the_report_of_both_halves() -> None:
     assert [(s.anchor_id, s.observations) for s in report.seen] == [("sheet", 30)]
     assert report.seen[0].age_ns >= SECOND
     assert "1 no poses" in report.advice
-    alone = lab.anchoring.report(1, None, lab.now_ns)
+    alone = lab.service.complete_report(1, None, lab.now_ns)
     assert alone is not None
     assert alone.observations == 30
 
@@ -568,7 +568,7 @@ def test_a_proposal_of_the_same_instant_as_an_alarm_is_later() -> None:
         lab.now_ns += 10 * MS
         ann.head(((x, 0.0, 1.6), IDENTITY.q))
     ann.observe(Observation("sheet", "qr", IDENTITY, lab.now_ns, 1))
-    lab.anchoring.tick(lab.now_ns)
+    lab.service.tick(lab.now_ns)
     alarm, refusal = ann.entries()[-2:]
     assert isinstance(alarm.message, AlignmentAlarm)
     assert isinstance(refusal.message, AlignmentProposal)

@@ -1,0 +1,310 @@
+"""Turn the observations of one connection into alignment proposals at a bounded rate.
+
+By sheets and tracked controllers (`ConnectionEstimator`), and by touched marks (`TouchEstimator`), which take part in
+the same proposals. The mathematics is in `anchors.alignment` and `anchors.touch`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from anchors.alignment import AlignmentEstimate, AlignmentEstimator
+from anchors.controller import controller_covariance
+from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, is_place
+from anchors.touch import Registration, Touch, register
+from iris_session.protocol.client_messages import Observation
+from iris_session.protocol.common import MAX_TEXT, Pose
+from iris_session.protocol.entries import AlignmentProposal
+from iris_session.protocol.names import AnchorKind
+from iris_session.protocol.status import AlignmentReport, AnchorSeen
+
+#: Errors that linear algebra raises for extreme input of a client.
+NUMERICAL_ERRORS: Final = (ArithmeticError, ValueError, np.linalg.LinAlgError)
+AGAINST_GRAVITY: Final = (
+    "against gravity (seen wrongly: step closer; if it is most of them, configure how the sheet lies)"
+)
+#: The authority notifies a wearer of at most one refusal a second; one that follows another sooner may be lost.
+_CLOSE_NS: Final = 1_500_000_000
+#: How fast a tracking frame may drift (docs/anchors.md).
+_DRIFT_M_PER_S: Final = 0.003 / 60.0
+_CONTROLLER: Final = controller_covariance()
+#: Newest touches kept per point, and points kept. Eight points that do not fit take 15 ms to analyse.
+MAX_TOUCHES_PER_POINT: Final = 5
+MAX_POINTS: Final = 8
+_MIN_POINTS: Final = 3
+
+
+class ConnectionEstimator:
+    """Estimator of one connection: a proposal when something new was observed, at most one per period.
+
+    `running`: false while the participant's run is stopped; observations are then ignored. `newest`: the last estimate
+    that was not refused, `None` after a reset.
+    """
+
+    def __init__(
+        self, anchors: Mapping[str, PoseTuple], period_ns: int, sizes: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        """Create an estimator.
+
+        Args:
+            anchors: Present `T_world_anchor`, updated by the owner.
+            period_ns: Least time between two proposals.
+            sizes: Edge length [m] of printed sheets, where known.
+        """
+        self._anchors = anchors
+        self._period_ns = period_ns
+        self._sizes = sizes
+        self.start_run()
+
+    def start_run(self) -> None:
+        """Begin a new run: earlier observations no longer count."""
+        self.running = True
+        self._estimator = AlignmentEstimator(self._anchors, sizes=self._sizes)
+        self._touches = TouchEstimator(self._anchors)
+        self._observed: dict[str, tuple[int, int]] = {}  # anchor -> number of observations, time of the last [ns]
+        self._used = self._unusable = 0
+        self._next_ns = 0
+        self._unknown: tuple[str, int] | None = None  # unknown anchor and tracking epoch, not yet reported
+        self._reported_unknown: tuple[str, int] | None = None
+        self._refused_ns = -_CLOSE_NS
+        self._repeat_refusal = False  # the last refusal came too soon after another: send it once more
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the observations of this run: the tracking frame has changed."""
+        self._estimator.start_anew()
+        self._touches.reset()
+        self._pending = False  # an observation since the last proposal changes the estimate or its advice
+        self._refused: tuple[int, str] | None = None  # tracking epoch and advice of the last refusal
+        self._touched: tuple[int, float, int] | None = None  # alignment by touch: epoch, stated error [m], time [ns]
+        self._last: AlignmentEstimate | None = None  # also when it was refused
+        self.newest: AlignmentEstimate | None = None
+
+    def on_anchors_moved(self) -> None:
+        """Discard estimates, but keep observations: they stay valid when an anchor is given a new pose."""
+        self._touches.on_anchors_moved()
+        self._refused = self._touched = self.newest = None
+        self._pending = self._used > 0
+
+    def add_observation(self, observation: Observation, p_tracking_head: Vec3 | None = None, now_ns: int = 0) -> bool:
+        """Add one observation.
+
+        Returns:
+            False if it is unusable: unknown anchor, old tracking epoch, not a rigid transform, or a sheet of another
+            size than configured.
+        """
+        anchor_id = observation.anchor_id
+        if not self.running:
+            return True  # not judged
+        if anchor_id in self._anchors:
+            used = self._use_observation(observation, p_tracking_head)
+        else:
+            used = False
+            unknown = (anchor_id, observation.tracking_epoch)
+            if unknown != self._reported_unknown:
+                self._unknown = unknown
+        if used:
+            self._used += 1
+            self._observed[anchor_id] = (self._observed.get(anchor_id, (0, 0))[0] + 1, now_ns)
+        else:
+            self._unusable += 1
+        return used
+
+    def _use_observation(self, observation: Observation, p_tracking_head: Vec3 | None) -> bool:
+        pose, covariance = observation.T_tracking_anchor, observation.covariance
+        if observation.kind == AnchorKind.TOUCH:
+            return self._touches.add_touch(observation.anchor_id, pose.p, observation.tracking_epoch)
+        if observation.kind == AnchorKind.CONTROLLER:  # tracked: neither distance nor mirrored poses matter
+            covariance, p_tracking_head = covariance or _CONTROLLER, None
+        misprints = self._estimator.wrong_size
+        try:
+            used = self._estimator.add(
+                observation.anchor_id,
+                (pose.p, pose.q),
+                observation.capture_ns,
+                observation.tracking_epoch,
+                viewpoint_id=observation.viewpoint_id,
+                quality=observation.quality,
+                size_m=observation.size_m,
+                covariance=covariance,
+                p_tracking_head=p_tracking_head,
+            )
+        except NUMERICAL_ERRORS:
+            return False
+        # A sheet of the wrong size is unusable, but the advice must mention it.
+        self._pending = self._pending or used or self._estimator.wrong_size > misprints
+        return used
+
+    def is_due(self, now_ns: int) -> bool:
+        """Return whether `propose` has something to do."""
+        unknown = self._unknown is not None and now_ns - self._refused_ns >= _CLOSE_NS
+        return self.running and now_ns >= self._next_ns and (self._pending or self._touches.pending or unknown)
+
+    def propose(self, now_ns: int) -> AlignmentProposal | None:
+        """Return a proposal from all observations.
+
+        `None`: the same refusal as before for the same reason, or no improvement on marks that were touched. When
+        nothing usable is new, an unknown anchor is reported once: it may hang beside a known one.
+        """
+        self._next_ns = now_ns + self._period_ns
+        if not self._pending and not self._touches.pending and self._unknown is not None:
+            self._reported_unknown, self._unknown, self._refused_ns = self._unknown, None, now_ns
+            return self._refuse_unknown_anchor(*self._reported_unknown)
+        try:
+            estimate = self._estimate(now_ns)
+        except NUMERICAL_ERRORS:
+            text = "the observations of the anchor cannot be solved: look at it from elsewhere"
+            return self._filter_refusal(_to_refusal(self._estimator.tracking_epoch, text), now_ns)
+        if estimate is None:
+            return None
+        self._last = estimate
+        if estimate.refused:
+            return self._filter_refusal(_to_proposal(estimate), now_ns)
+        self._refused, self.newest = None, estimate
+        return _to_proposal(estimate)
+
+    def _estimate(self, now_ns: int) -> AlignmentEstimate | None:
+        """Return an estimate by touched marks if any are new, else by observations; `None` if the latter is worse than
+        a former one by touch."""
+        if self._touches.pending:
+            estimate = self._touches.estimate()
+            if not estimate.refused:
+                self._touched = (estimate.tracking_epoch, estimate.error_at_anchor_m, now_ns)
+            return estimate
+        self._pending = False
+        estimate = self._estimator.estimate()
+        if self._touched is not None and self._touched[0] == estimate.tracking_epoch:
+            _, error_m, touched_ns = self._touched
+            if not estimate.error_at_anchor_m < error_m + _DRIFT_M_PER_S * (now_ns - touched_ns) * 1e-9:
+                return None
+        self._touched = None
+        return estimate
+
+    def _filter_refusal(self, proposal: AlignmentProposal, now_ns: int) -> AlignmentProposal | None:
+        """Return the refusal if it differs from the last one, or if the last one may not have reached the wearer."""
+        refused = (proposal.tracking_epoch, proposal.advice)
+        close = now_ns - self._refused_ns < _CLOSE_NS
+        if refused == self._refused and (close or not self._repeat_refusal):
+            return None
+        self._repeat_refusal, self._refused_ns, self._refused = close, now_ns, refused
+        return proposal
+
+    def _refuse_unknown_anchor(self, anchor_id: str, tracking_epoch: int) -> AlignmentProposal:
+        known = ", ".join(sorted(self._anchors)) or "none"
+        return _to_refusal(tracking_epoch, f"anchor '{anchor_id}' is not of this session; known: {known}")
+
+    def complete_report(self, report: AlignmentReport | None, now_ns: int) -> AlignmentReport | None:
+        """Return the authority's report (`None`: nothing to report) with the counts and advice of this estimator."""
+        if not self._used and not self._unusable:
+            return report
+        last = self._last
+        return msgspec.structs.replace(
+            report or AlignmentReport(running=self.running),
+            observations=self._used,
+            viewpoints=0 if last is None else last.n_viewpoints,
+            unusable=self._unusable,
+            residual_tilt_rad=0.0 if last is None else last.residual_tilt_rad,
+            advice=self._advice()[:MAX_TEXT],
+            seen=tuple(AnchorSeen(a, n, max(0, now_ns - ns)) for a, (n, ns) in sorted(self._observed.items())),
+        )
+
+    def _advice(self) -> str:
+        """Return the advice of the last estimate, and why observations were unusable."""
+        e = self._estimator
+        counted = {"of a void tracking frame": e.stale_epochs, "no poses": e.invalid, "of a wrong size": e.wrong_size}
+        counted[AGAINST_GRAVITY] = e.against_gravity
+        unusable = ", ".join(f"{n} {why}" for why, n in counted.items() if n)
+        parts = ["" if self._last is None else self._last.advice, self._touches.advice]
+        return "; ".join(filter(None, [*parts, f"not used: {unusable}" if unusable else ""]))
+
+
+class TouchEstimator:
+    """Touched marks of one connection: a bounded number of touches, registered together.
+
+    `pending`: enough points were touched, and something is new since the last estimate.
+    """
+
+    def __init__(self, anchors: Mapping[str, PoseTuple]) -> None:
+        """Create an estimator; `anchors`: present `T_world_anchor`, of which only the position is used."""
+        self._anchors = anchors
+        self._touches: dict[str, deque[Vec3]] = {}
+        self._suspects: frozenset[str] = frozenset()
+        self._tracking_epoch = 0
+        self.pending = False
+
+    def add_touch(self, point: str, p_tracking_tip: Vec3, tracking_epoch: int) -> bool:
+        """Add one touch; return false if it is of an older tracking frame or not a finite point."""
+        if tracking_epoch < self._tracking_epoch or not is_place(p_tracking_tip):
+            return False
+        if tracking_epoch > self._tracking_epoch:
+            self.reset()
+            self._tracking_epoch = tracking_epoch
+        kept = self._touches.pop(point, None) or deque(maxlen=MAX_TOUCHES_PER_POINT)
+        if point in self._suspects:  # touched again after a refusal: the earlier touches were wrong
+            kept.clear()
+            self._suspects -= {point}
+        kept.append(p_tracking_tip)
+        self._touches[point] = kept
+        while len(self._touches) > MAX_POINTS:
+            del self._touches[next(iter(self._touches))]
+        self.pending = len(self._touches) >= _MIN_POINTS
+        return True
+
+    @property
+    def advice(self) -> str:
+        """How many points are missing for an estimate; empty if none."""
+        if not 0 < len(self._touches) < _MIN_POINTS:
+            return ""
+        return f"{len(self._touches)} points touched, {_MIN_POINTS} are needed"
+
+    def on_anchors_moved(self) -> None:
+        """Estimate again with the new positions of the marks."""
+        self.pending = len(self._touches) >= _MIN_POINTS
+
+    def reset(self) -> None:
+        """Discard all touches."""
+        self._touches.clear()
+        self._suspects = frozenset()
+        self.pending = False
+
+    def estimate(self) -> AlignmentEstimate:
+        """Return the alignment by all touches kept. Raises one of `NUMERICAL_ERRORS` where they cannot be solved."""
+        self.pending = False
+        touches = [Touch(point, p) for point, kept in self._touches.items() for p in kept]
+        marks = {point: self._anchors[point][0] for point in self._touches}
+        registration = register(marks, touches, self._tracking_epoch)
+        self._suspects = frozenset(registration.suspects)
+        return replace(registration.estimate, advice=registration.estimate.advice or _residuals_text(registration))
+
+
+def _residuals_text(registration: Registration) -> str:
+    residuals = ", ".join(f"'{point}' {r * 1e3:.1f} mm" for point, r in sorted(registration.residuals_m.items()))
+    return f"touched points miss their marks by: {residuals}" if residuals else ""
+
+
+def _to_refusal(tracking_epoch: int, advice: str) -> AlignmentProposal:
+    p, q = IDENTITY_POSE
+    return AlignmentProposal(Pose(p, q), tracking_epoch, (), p, 0.0, refused=True, advice=advice[:MAX_TEXT])
+
+
+def _to_proposal(estimate: AlignmentEstimate) -> AlignmentProposal:
+    p, q = estimate.T_world_tracking
+    return AlignmentProposal(
+        Pose(p, q),
+        estimate.tracking_epoch,
+        tuple(estimate.covariance),
+        estimate.pivot_world,
+        estimate.error_at_anchor_m,
+        residual_tilt_rad=estimate.residual_tilt_rad,
+        n_observations=estimate.n_observations,
+        n_viewpoints=estimate.n_viewpoints,
+        refused=estimate.refused,
+        advice=estimate.advice[:MAX_TEXT],  # it may list many sheets
+    )
