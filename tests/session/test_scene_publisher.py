@@ -30,7 +30,7 @@ from iris_session.recording import Recording
 from iris_session.scene import AssetStore
 from iris_session.session.publish_loop import SILENT_NS
 from iris_session.session.resume import find_note_path
-from iris_session.session.scene_publisher import AHEAD_NS, _capture
+from iris_session.session.scene_publisher import AHEAD_NS, _check_capture
 from iris_session.session.verification import verify_recording
 
 CONFIG = SessionConfig(control_port=0, state_port=0, beacon_port=0, record=False)
@@ -155,9 +155,9 @@ def test_two_states_may_be_of_one_moment(session: ScenePublisher) -> None:
 
 
 def test_what_is_captured_a_moment_ahead_of_the_clock_is_captured_now() -> None:
-    assert _capture(7_000 + AHEAD_NS, 7_000) == 7_000
+    assert _check_capture(7_000 + AHEAD_NS, 7_000) == 7_000
     with pytest.raises(PublishError, match="ahead of"):
-        _capture(7_001 + AHEAD_NS, 7_000)
+        _check_capture(7_001 + AHEAD_NS, 7_000)
 
 
 def test_a_reset_while_a_state_is_published_is_told_with_the_next(session: ScenePublisher) -> None:
