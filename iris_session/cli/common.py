@@ -113,14 +113,14 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
     A client would wait for the session to start. A session given by name is not checked: it has no address yet.
     """
     from iris_session.client.address import Address
-    from iris_session.client.joining import LOCAL
-    from iris_session.client.resolving import resolve
+    from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
+    from iris_session.client.host_lookup import resolve_host
 
     if arguments.session:
         return
-    address = Address.parse(arguments.address or LOCAL)
+    address = Address.parse(arguments.address or LOCAL_ADDRESS)
     until_s = time.monotonic() + CONNECT_S
-    resolving = resolve(address.host, until_s)
+    resolving = resolve_host(address.host, until_s)
     try:
         while True:
             try:

@@ -107,7 +107,7 @@ def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusR
         try:
             report = client.status()
         except (NotConnectedError, RequestTimeoutError) as error:
-            why = str(error) if client.ready else f"no session answers at {client.why_not_in('now')}"
+            why = str(error) if client.ready else f"no session answers at {client.describe_failure('now')}"
             raise CommandError(why) from None
         yield client, report
     finally:

@@ -11,7 +11,7 @@ from typing import Final
 import psutil
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import BeaconListener, FoundSession, ask_introduction
+from iris_session.client.discovery import BeaconListener, FoundSession, request_introduction
 from iris_session.client.errors import ClientError
 from iris_session.doctor.findings import Finding, failed, ok, warning
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
@@ -41,9 +41,9 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
             until = time.monotonic() + LISTEN_S
             while (left := until - time.monotonic()) > 0.0:
                 listener.wait(left)
-                if str(address) in {one.address for one in listener.sessions()}:
+                if str(address) in {one.address for one in listener.poll_sessions()}:
                     break  # the wanted session is heard; a search by name goes on, as two may have the name
-            found, ignored = listener.sessions(), dict(listener.ignored)
+            found, ignored = listener.poll_sessions(), dict(listener.ignored)
     except ClientError as error:
         return warning("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
@@ -224,8 +224,8 @@ def _try_introduction(address: Address, patience_s: float) -> Introduction | Non
 
 
 def _request_introduction(address: Address, patience_s: float) -> Introduction:
-    """Request the introduction, blocking. Raises what `ask_introduction` raises."""
-    steps = ask_introduction(address.host, address.port, patience_s)
+    """Request the introduction, blocking. Raises what `request_introduction` raises."""
+    steps = request_introduction(address.host, address.port, patience_s)
     while True:
         try:
             next(steps)
