@@ -197,7 +197,7 @@ class Listener:
 
     def wait(self, timeout_s: float) -> None: ...
 
-    def sessions(self) -> list[FoundSession]:
+    def poll_sessions(self) -> list[FoundSession]:
         return list(self.sessions_heard)
 
 
