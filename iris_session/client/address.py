@@ -56,8 +56,10 @@ def host_port(host: str, port: int) -> str:
 
 
 def is_host(host: str) -> bool:
-    """Whether it can be the name or address of a host. The system's resolver and libzmq raise errors of their own for
-    what cannot."""
+    """Return whether text can be the name or address of a host.
+
+    The system's resolver and libzmq raise errors of their own for other text.
+    """
     if ":" in host:
         address, _, scope = host.partition("%")
         try:

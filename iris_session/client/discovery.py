@@ -1,6 +1,6 @@
-"""Finding sessions: listening for beacons on UDP, and asking one address for its introduction over TCP.
+"""Discovery of sessions: beacons on UDP, and the introduction of one address over TCP.
 
-Both are said in public by anybody: what is trusted of them is decided in `meeting`.
+Any machine can send either: `endpoint_resolver` decides what is trusted of them.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class BeaconListener:
         self._socket.close()
 
     def poll_sessions(self) -> list[FoundSession]:
-        """Those heard so far, by name."""
+        """Read the beacons that have come, and return the sessions heard so far, by name."""
         for _ in range(MAX_DRAIN):
             try:
                 data, sender = self._socket.recvfrom(MAX_BEACON_BYTES + 1)
@@ -91,7 +91,7 @@ class BeaconListener:
         return sorted(self._found.values(), key=lambda found: (found.name, found.session_id))
 
     def wait(self, timeout_s: float) -> None:
-        """Until something comes, at most `timeout_s`."""
+        """Wait until a beacon comes, at most `timeout_s`."""
         with selectors.DefaultSelector() as selector:  # `select` takes no descriptor above 1023
             selector.register(self._socket, selectors.EVENT_READ)
             selector.select(max(0.0, timeout_s))
@@ -105,7 +105,7 @@ class BeaconListener:
         if not is_plausible(beacon):
             self._count_ignored("malformed")
         elif _is_loopback(beacon.host) and not _is_loopback(sender):
-            self._count_ignored("foreign_loopback")  # somebody else must not send us to a port of our own
+            self._count_ignored("foreign_loopback")  # another machine must not send us to a port of our own
         elif beacon.session_id in self._found:
             self._add_address(beacon)
         elif len(self._found) >= MAX_SESSIONS:
@@ -127,9 +127,18 @@ class BeaconListener:
 
 
 def find_sessions(timeout_s: float = LISTEN_S, *, port: int = DISCOVERY_PORT) -> list[FoundSession]:
-    """The sessions that tell of themselves on the networks of this machine, by name. Listens for `timeout_s`.
+    """Listen for sessions on the networks of this machine.
 
-    Empty where an access point blocks broadcasts: type the address then, or scan the code of `iris-session pair`.
+    Args:
+        timeout_s: Seconds to listen.
+        port: UDP port of beacons.
+
+    Returns:
+        The sessions, by name. Empty where an access point blocks broadcasts: type the address then, or scan the code
+        of `iris-session pair`.
+
+    Raises:
+        ClientError: The port cannot be listened to.
     """
     end = time.monotonic() + timeout_s
     with BeaconListener(port) as listener:
@@ -140,9 +149,9 @@ def find_sessions(timeout_s: float = LISTEN_S, *, port: int = DISCOVERY_PORT) ->
 
 
 def request_introduction(host: str, control_port: int, timeout_s: float) -> Generator[None, None, Introduction]:
-    """Steps towards the introduction of the session at an address; yields wherever it would wait.
+    """Request the introduction of the session at an address; yields wherever it would wait.
 
-    Raises `OSError` (nobody there, no answer) or `ProtocolError` (no introduction, or another protocol version).
+    Raises `OSError` (no peer, no answer) or `ProtocolError` (no introduction, or another protocol version).
     """
     until = time.monotonic() + timeout_s
     target = yield from resolve_host(host, until)
@@ -169,7 +178,10 @@ def request_introduction(host: str, control_port: int, timeout_s: float) -> Gene
 
 
 def is_plausible(beacon: Beacon) -> bool:
-    """Whether its texts may be shown in a terminal, and its address can be one. They come from anybody."""
+    """Return whether the texts of a beacon may be shown in a terminal, and its address can be one.
+
+    Any machine can send a beacon.
+    """
     texts = (beacon.session_id, beacon.session_name, beacon.kind, beacon.key_fingerprint)
     return (
         all(text.isprintable() for text in texts)
