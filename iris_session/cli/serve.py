@@ -176,7 +176,7 @@ def resume_session(arguments: argparse.Namespace) -> Session:
 
 def apply_anchors_file(config: SessionConfig, path: Path | None) -> SessionConfig:
     """Return the configuration with the anchors of a file, if one is given."""
-    from iris_session.session.anchors_file import load_anchors
+    from iris_session.session.config import load_anchors
 
     if path is None:
         return config
@@ -247,8 +247,8 @@ def _serve(
 
 
 def _run_with_live_view(arguments: argparse.Namespace, session: Session | ScenePublisher, out: TextIO) -> None:
-    from iris_session.cli.live import LiveView
+    from iris_session.cli.live import TerminalView
 
-    view = LiveView(session, out, f"iris-session {session.name} on {session.address}")
+    view = TerminalView(session, out, f"iris-session {session.name} on {session.address}")
     with view.open():
         session.run(seconds=arguments.seconds, until=view.update)
