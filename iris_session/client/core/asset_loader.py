@@ -23,8 +23,8 @@ from iris_session.protocol.assets import (
 from iris_session.protocol.names import AssetRefusal
 
 CHUNK_BYTES: Final = 512 << 10
-#: Bounds of the chunk size. A window in less time than `FAST_NS` doubles it: each chunk costs the same work. One that takes
-#: longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
+#: Bounds of the chunk size. A window in less time than `FAST_NS` doubles it: each chunk costs the same work. One that
+#: takes longer than `SLOW_NS` halves it, so that what is lost with a connection is little.
 MIN_CHUNK_BYTES: Final = 64 << 10
 MAX_CHUNK_BYTES: Final = MAX_ASSET_CHUNK_BYTES
 FAST_NS: Final = 100_000_000
