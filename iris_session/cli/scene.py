@@ -199,7 +199,7 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     from iris_session.scene.mujoco_scene import parse_mujoco
 
     model = open_scene(scene).model
-    beginning = World(model, (), ()).initial_data()  # as a session begins: in the keyframe `home`, if there is one
+    beginning = World(model, (), ()).make_initial_data()  # as a session begins: in the keyframe `home`, if there is one
     parsed = parse_mujoco(model, store, data=beginning, name=Path(scene).stem)
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 

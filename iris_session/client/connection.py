@@ -45,7 +45,7 @@ from iris_session.protocol.client_messages import (
     Hello,
     Sample,
     Samples,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import encode_client
 from iris_session.protocol.server_messages import (
@@ -255,9 +255,9 @@ class Connection(Receiving):
         hello = msgspec.structs.replace(
             self.hello, secret=self.identity.secret, resume_token=self.identity.resume_token
         )
-        self._outgoing.push(hello, encode_client(envelope(hello)))
+        self._outgoing.push(hello, encode_client(wrap_message(hello)))
         if self.stop.message is not None:  # anyone may stop, however early
-            self._outgoing.push(self.stop.message, encode_client(envelope(self.stop.message)))
+            self._outgoing.push(self.stop.message, encode_client(wrap_message(self.stop.message)))
 
     def _wait(self, now_ns: int) -> None:
         self.phase = Phase.WAITING
@@ -266,4 +266,4 @@ class Connection(Receiving):
         self._backoff_ns = min(2 * self._backoff_ns, BACKOFF_MAX_NS)
 
     def _queue(self, message: ClientMessage) -> bool:
-        return self._outgoing.push(message, encode_client(envelope(message, self.connection_epoch)))
+        return self._outgoing.push(message, encode_client(wrap_message(message, self.connection_epoch)))

@@ -12,7 +12,7 @@ from iris_session.client.meeting import STEP_NS, Meeting, Met, Wanted
 from iris_session.client.sockets import ClientSockets, CurveKeys
 from iris_session.client.status import Phase
 from iris_session.protocol.names import RefusalCode
-from iris_session.protocol.pairing import normal_code
+from iris_session.protocol.pairing import normalise_code
 from iris_session.protocol.server_messages import Welcome
 
 LOCAL: Final = f"127.0.0.1:{DEFAULT_CONTROL_PORT}"
@@ -25,7 +25,7 @@ def wanted(address: str, session: str, curve: CurveKeys | None, join_code: str) 
     if curve is not None and (session or join_code):
         raise ClientError("curve= names all keys itself: it goes with an address, without name and join code")
     try:
-        code = normal_code(join_code) if join_code else ""
+        code = normalise_code(join_code) if join_code else ""
     except ValueError as error:
         raise ClientError(str(error)) from None
     return Wanted(None if session else Address.parse(LOCAL if address == "" else address), session, curve, code)

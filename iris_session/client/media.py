@@ -14,9 +14,9 @@ from iris_session.client.reporting import PERIOD_NS
 from iris_session.client.sockets import ClientSockets
 from iris_session.protocol.codec import decode_media_header, encode_media_frames
 from iris_session.protocol.errors import ProtocolError
-from iris_session.protocol.media import MediaHeader, is_stream_name, media_topic, not_a_stream
+from iris_session.protocol.media import MediaHeader, describe_bad_stream_name, is_stream_name, make_topic
 from iris_session.protocol.names import BudgetClass, MediaEncoding
-from iris_session.protocol.status import ClientReport, DeliveryBudget, quantiles
+from iris_session.protocol.status import ClientReport, DeliveryBudget, compute_quantiles
 
 #: Ages of frames that are remembered between two reports: more than come in a second.
 MAX_AGES: Final = 256
@@ -163,10 +163,10 @@ class Media:
         if not self._sockets.has_media:
             self._subscribed.clear()
         for stream in self._subscribed - self._feeds.keys():
-            self._sockets.unsubscribe_media(media_topic(self.connection.connection_epoch, stream))
+            self._sockets.unsubscribe_media(make_topic(self.connection.connection_epoch, stream))
         new = [stream for stream in self._feeds if stream not in self._subscribed]
         if new:
-            topics = [media_topic(self.connection.connection_epoch, stream) for stream in new]
+            topics = [make_topic(self.connection.connection_epoch, stream) for stream in new]
             self._sockets.subscribe_media(welcome.endpoints.media, topics)
         self._subscribed = set(self._feeds)
 
@@ -196,7 +196,7 @@ class Media:
 
     def _with_media(self, report: ClientReport, now_ns: int) -> ClientReport:
         """`report` with what came over the media channel since the one before."""
-        ages = quantiles(self._media_ages)
+        ages = compute_quantiles(self._media_ages)
         elapsed_ns, self._media_since_ns = max(PERIOD_NS, now_ns - self._media_since_ns), now_ns
         received, self._media_bytes = self._media_bytes, 0
         self._media_ages.clear()
@@ -216,4 +216,4 @@ class Media:
 
 def _check_name(stream: str) -> None:
     if not is_stream_name(stream):
-        raise InvalidMessageError(not_a_stream(stream))
+        raise InvalidMessageError(describe_bad_stream_name(stream))

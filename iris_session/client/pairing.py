@@ -13,7 +13,7 @@ import zmq
 from iris_session.client.address import Address
 from iris_session.client.errors import ClientError, NotConnectedError, RefusedError, TrustError
 from iris_session.protocol import pairing
-from iris_session.protocol.client_messages import Pair, envelope
+from iris_session.protocol.client_messages import Pair, wrap_message
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
@@ -47,10 +47,10 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
     """
     server_public = raw_key(server_key)
     try:
-        secret = pairing.stretch(code, server_public)
+        secret = pairing.stretch_code(code, server_public)
     except ValueError as error:
         raise ClientError(str(error)) from None
-    request = Pair(name, pairing.client_proof(secret, server_public, own.raw_public), "iris-session")
+    request = Pair(name, pairing.make_client_proof(secret, server_public, own.raw_public), "iris-session")
     asking: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
     try:
         asking.linger = 0
@@ -60,10 +60,10 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
         asking.curve_publickey = own.public.encode()
         asking.curve_secretkey = own.secret.encode()
         asking.connect(f"tcp://{address}")
-        answer = yield from _ask(asking, encode_client(envelope(request)), address)
+        answer = yield from _ask(asking, encode_client(wrap_message(request)), address)
     finally:
         asking.close()
-    if not pairing.same(answer.proof, pairing.server_proof(secret, server_public, own.raw_public)):
+    if not pairing.is_same_proof(answer.proof, pairing.make_server_proof(secret, server_public, own.raw_public)):
         raise TrustError(
             f"the session at {address} does not know the join code, so it is not the one that gave it out: "
             "nothing was stored; look at the address and the code"

@@ -12,7 +12,7 @@ from iris_session.client.connection import Connection
 from iris_session.client.errors import NotConnectedError, RequestTimeoutError
 from iris_session.client.state_stream import SceneState
 from iris_session.client.status import Phase
-from iris_session.protocol.status import ClientReport, GetStatus, Quantiles, StatusReport, quantiles
+from iris_session.protocol.status import ClientReport, GetStatus, Quantiles, StatusReport, compute_quantiles
 
 PERIOD_NS: Final = 1_000_000_000
 #: Frames of one period that are remembered: more than are ever sent in a second.
@@ -62,7 +62,7 @@ class ArrivalMeter:
         if elapsed_ns < PERIOD_NS:
             return None
         if self._ages_ns or not self._delivered:
-            self._ages = quantiles(self._ages_ns)
+            self._ages = compute_quantiles(self._ages_ns)
         report = ClientReport(
             0.0 if self._ages is None else self._ages.p50,
             0.0 if self._ages is None else self._ages.p99,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.client.errors import InvalidMessageError
-from iris_session.protocol.client_messages import ClientMessage, envelope
+from iris_session.protocol.client_messages import ClientMessage, wrap_message
 from iris_session.protocol.codec import decode_client, encode_client
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.errors import ProtocolError
@@ -31,7 +31,7 @@ def checked_bytes(message: ClientMessage, connection_epoch: int = 0) -> bytes:
     """The encoded envelope of `message`, decoded once as the session will do. Raises `InvalidMessageError`."""
     kind = type(message).__name__
     try:
-        data = encode_client(envelope(message, connection_epoch))
+        data = encode_client(wrap_message(message, connection_epoch))
         decode_client(data)
     except ProtocolError as error:
         text = str(error).removeprefix(f"{kind.lower()}: ")

@@ -1,4 +1,6 @@
-"""Every bound of the control room in one frozen struct. SI units, radians, rates in Hz; defaults for table-top arms."""
+"""Bounds of control in one frozen struct, and its error. SI units, radians, rates in Hz; defaults for
+table-top arms.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +36,12 @@ _POSITIVE: Final = (
     "grasp_max_force",
     "grasp_max_torque",
 )
+
+
+class ControlError(ValueError):
+    """A robot, object or configuration that control cannot drive as described. One line that says what would be
+    right.
+    """
 
 
 class ControlConfig(msgspec.Struct, frozen=True):

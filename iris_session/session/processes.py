@@ -254,7 +254,7 @@ class SessionProcesses:
             recording_class=recording_class,
             tick_period_ns=core.world.tick_period_ns,
             config=msgspec.msgpack.encode(core.as_it_is()),
-            model=pack_model(core.world.model_bytes()),
+            model=pack_model(core.world.encode_model()),
             scene_hash=core.world.scene_hash,
             robots=core.scene.robots,
             objects=core.scene.objects,
@@ -289,7 +289,7 @@ class SessionProcesses:
 
     def _watch_plant(self, stepper: Stepper) -> None:
         """Contacts that MuJoCo drops change what happens: said once, and counted."""
-        seen = stepper.core.world.trouble
+        seen = stepper.core.world.dropped_counts
         for what, count in seen.items():
             before = self._trouble_seen.get(what, 0)
             if what not in self._trouble:

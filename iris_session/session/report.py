@@ -56,7 +56,7 @@ class Reporter:
         """The session now. Fields of the front are left at their defaults."""
         now_ns = stepper.clock()
         pacer, times = self.pacer, self.times
-        stats = None if pacer is None else pacer.stats(now_ns)
+        stats = None if pacer is None else pacer.get_stats(now_ns)
         if times is not None and stats is not None:
             times.mark(stats)
         last, core = stepper.last, stepper.core

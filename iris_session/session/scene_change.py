@@ -14,7 +14,7 @@ import mujoco
 
 from iris_session.authority.config import check_config
 from iris_session.physics import Pacer, find_objects, find_robots
-from iris_session.physics.load import load_model, model_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, encode_model, load_model
 from iris_session.protocol.entries import HOST, Entry, SceneLoaded, ScenePatched, decode_entry, encode_entry
 from iris_session.protocol.scene import PatchOp, SceneError, SceneSpec
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -171,10 +171,10 @@ def prepare(
     objects: tuple[ObjectSpec, ...] | None,
 ) -> NextScene:
     """Everything that takes long, without touching the session that `core` is of. None: found in the model."""
-    binary = model_bytes(model)
+    binary = encode_model(model)
     found = tuple(find_robots(model) if robots is None else robots)
     things = tuple(find_objects(model) if objects is None else objects)
-    message = SceneLoaded(scene_hash(binary), found, things, state)
+    message = SceneLoaded(compute_scene_hash(binary), found, things, state)
     # What is journaled is what is used: whole numbers in float fields become floats, lists tuples.
     scene = decode_entry(encode_entry(Entry(HOST, HOST, 0, message))).message
     assert isinstance(scene, SceneLoaded)

@@ -179,7 +179,7 @@ class Session(Owner, SceneChanges):
         began_ns = max(now_ns, pacer.next_deadline_ns)
         stepper.step(1)
         if not follow_timestep(stepper, pacer, times, began_ns):
-            lateness_ns = pacer.finished(self.clock())
+            lateness_ns = pacer.finish_tick(self.clock())
             times.finished(lateness_ns)
             stepper.lateness_ns = max(stepper.lateness_ns, lateness_ns)
 
@@ -210,7 +210,7 @@ class Session(Owner, SceneChanges):
         """End-effector targets `T_world_tip` per robot, for an environment's own controller."""
         self._live()
         with self._unchanging():
-            return {} if self._core is None else dict(self._core.controller.targets())
+            return {} if self._core is None else dict(self._core.controller.get_targets())
 
     @classmethod
     def attach(cls, model: mujoco.MjModel, data: mujoco.MjData, config: SessionConfig | None = None) -> Self:
@@ -297,7 +297,7 @@ class Session(Owner, SceneChanges):
 
     def lateness(self, *, anew: bool = False) -> PacerStats | None:
         """Accounting of ticks of the newest `run()`, None before it. `anew`: its percentiles begin again from here."""
-        return None if self._pacer is None else self._pacer.stats(self.clock(), anew=anew)
+        return None if self._pacer is None else self._pacer.get_stats(self.clock(), anew=anew)
 
     # --- inside ------------------------------------------------------------------------------------------------------
 

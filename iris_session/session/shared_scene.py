@@ -22,10 +22,10 @@ from iris_session.protocol.scene import (
     PatchOp,
     SceneError,
     SceneSpec,
-    asset_addresses,
+    apply_patch,
     encode_scene,
-    merged,
-    patched,
+    list_assets,
+    merge_patches,
 )
 from iris_session.scene import AssetStore, Hold, SceneBuildError
 from iris_session.scene.composed import ComposedScene
@@ -93,7 +93,7 @@ class SharedScenes:
         a session that goes on shows what it showed. Takes long for a model that was never shared before. From any
         thread."""
         poses = np.zeros((len(world.bodies), 7))
-        world.poses(poses)
+        world.read_poses(poses)
         plain = SceneInfo(
             world.scene_hash, world.robot_infos, world.bodies, poses.tobytes(), tick_period_ns=world.tick_period_ns
         )
@@ -104,12 +104,12 @@ class SharedScenes:
             parsed = self._composed or parse_mujoco(
                 world.model,
                 store,
-                data=world.initial_data(initial_state),
+                data=world.make_initial_data(initial_state),
                 name=self._name,
                 sites=self._sites,
                 tendons=self._tendons,
             )
-            shown = _stored(store, patched(parsed.spec, patches), plain, tuple(patches))
+            shown = _stored(store, apply_patch(parsed.spec, patches), plain, tuple(patches))
         except (OSError, SceneBuildError, SceneError) as error:  # the session is worth more than its picture
             return Shown(plain, notes=(f"{NOTHING_TO_SEE}: {error}",))
         return shown._replace(notes=tuple(f"left out for clients: {what}" for what in parsed.skipped))
@@ -122,14 +122,14 @@ class SharedScenes:
                 "; ".join(note for note in self.notes if NOTHING_TO_SEE in note) or "`assets` of SessionConfig is False"
             )
             raise SceneError(f"this session shares no specification of its scene: {why}")
-        merging = merged(newest.patches, ops)
+        merging = merge_patches(newest.patches, ops)
         if len(merging) > MAX_PATCHES:
             raise SceneError(
                 f"{len(merging)} operations since the scene was loaded, at most {MAX_PATCHES}, of which those on one "
                 "visual count once: load the scene anew"
             )
         info = msgspec.structs.replace(newest.info, patches=newest.info.patches + 1)
-        return _stored(self._store, patched(newest.spec, ops), info, merging)._replace(notes=newest.notes)
+        return _stored(self._store, apply_patch(newest.spec, ops), info, merging)._replace(notes=newest.notes)
 
     def take(self, shown: Shown) -> SceneInfo:
         """It is the newest from now on; its files stay, and those of the one before, which the front still serves.
@@ -186,7 +186,7 @@ class _Look(NamedTuple):
 
 
 def _stored(store: AssetStore, spec: SceneSpec, info: SceneInfo, patches: tuple[PatchOp, ...]) -> Shown:
-    named = asset_addresses(spec)
+    named = list_assets(spec)
     if missing := next((address for address in named if address not in store), ""):
         raise SceneError(f"asset {missing} is not in {store.root}: put it there (AssetStore.put) before it is shown")
     address = store.put(encode_scene(spec))

@@ -25,7 +25,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
 )
 from iris_session.protocol.session_mirror import SessionMirror
-from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, quantiles
+from iris_session.protocol.status import AlignmentReport, ParticipantReport, Quantiles, compute_quantiles
 from iris_session.protocol.steps import ControlStatus, Decision
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ class SessionLedger:
 
     def receive_to_step(self, robot: str) -> Quantiles | None:
         """How long the newest samples behind a robot's motion waited for the step that used them."""
-        return quantiles(self._receive_to_step_ns.get(robot, ()))
+        return compute_quantiles(self._receive_to_step_ns.get(robot, ()))
 
     def input_to_ctrl_ms(self) -> dict[str, float]:
         """Per robot: age of the newest applied sample when its step began to use it."""
@@ -244,7 +244,7 @@ def make_status(
     now_ns = stepper.clock()
     lateness = {}
     if pacer is not None:
-        stats = pacer.stats(now_ns)
+        stats = pacer.get_stats(now_ns)
         lateness = {
             "ticks": stats.ticks,
             "late": stats.late,

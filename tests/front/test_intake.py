@@ -25,7 +25,7 @@ from iris_session.protocol.client_messages import (
     Hello,
     Marker,
     TrackingEpoch,
-    envelope,
+    wrap_message,
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Audit, Entry, Join
@@ -82,7 +82,7 @@ class Desk:
         self.sent.append((frames[0], decode_server(frames[1]).message, frames[2:]))
 
     def take(self, message: ClientMessage, peer: Peer = ANN, epoch: int = 0, behalf: str = "", extra: int = 0) -> None:
-        data = encode_client(envelope(message, epoch, behalf))
+        data = encode_client(wrap_message(message, epoch, behalf))
         self.intake.handle_message(ROUTE, peer, memoryview(data), extra)
 
     def join(self, peer: Peer = ANN, **hello: object) -> Welcome:
@@ -264,15 +264,15 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
     for i in range(desk.limits.connections - 1):
         desk.now_ns += 1_000_000_000
         hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
-        desk.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
+        desk.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(wrap_message(hello))), 0)
     assert len(desk.clients) == desk.limits.connections
     desk.now_ns += 1_000_000_000
     desk.coalescer.take_batch()
     late, back = Peer(7, ""), Peer(8, "")
-    data = encode_client(envelope(HELLO))
+    data = encode_client(wrap_message(HELLO))
     desk.intake.handle_message(b"late", late, memoryview(data), 0)
     assert isinstance(desk.sent[-1][1], Refused)
-    data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
+    data = encode_client(wrap_message(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
     desk.intake.handle_message(b"back", back, memoryview(data), 0)
     (entry,) = desk.coalescer.take_batch()
     assert isinstance(entry.message, Join)
@@ -281,7 +281,7 @@ def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
 
 def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(desk: Desk) -> None:
     for i in range(1000):
-        data = encode_client(envelope(Hello("operator", "Eve")))
+        data = encode_client(wrap_message(Hello("operator", "Eve")))
         desk.intake.handle_message(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
     refused = desk.last()
     assert isinstance(refused, Refused)

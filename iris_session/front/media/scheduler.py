@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from iris_session.front.media.budget import MILLISECOND, NOTHING, SECOND
 from iris_session.protocol.codec import encode_media_header
-from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, media_topic
+from iris_session.protocol.media import CLASSES, MAX_STREAMS, MediaHeader, MediaPush, is_stream_name, make_topic
 
 #: A stream of which nothing came for so long may be taken over by another source, and is forgotten after the other.
 TAKEOVER_NS: Final = 3 * SECOND
@@ -312,7 +312,7 @@ class MediaScheduler:
         header = MediaHeader(
             name, CLASSES[level], push.scene_epoch, stream.seq, push.capture_ns, now_ns, push.encoding, wish.dropped
         )
-        topic = media_topic(number, name) + CLASSES[level].encode()
+        topic = make_topic(number, name) + CLASSES[level].encode()
         if not send(topic, encode_media_header(header), frame):
             return False
         wish.taken += 1
