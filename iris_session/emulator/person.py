@@ -107,14 +107,14 @@ class Person:
     @property
     def next_ns(self) -> int:
         """When `step` has something to do at the latest."""
-        arrival = self._uplink.next_ns
+        arrival = self._uplink.next_arrival_ns
         return self.headset.next_sample_ns if arrival is None else min(arrival, self.headset.next_sample_ns)
 
     def step(self, now_ns: int) -> None:
         """One round of the loop, after `client.poll`."""
         self._now_ns = now_ns
         if self.display.wants_vertices:
-            for name in self._deformables.tend():
+            for name in self._deformables.update():
                 shapes = self._deformables
                 self.display.take_vertices(name, shapes.vertices[name], shapes.capture_ns[name])
         for samples, seen in self._uplink.pop(now_ns):

@@ -3,7 +3,7 @@
 A tick is `mj_step2` then `mj_step1`: the arithmetic of `mj_step` shifted by half a step, so that after a tick every
 derived quantity (poses, contacts) belongs to the new state. Write `ctrl` and `xfrc_applied` between ticks as usual.
 
-In a user's loop the world is a twin that `set_state_bytes` brings up to date, because after `mj_step` the user's own
+In a user's loop the world is a twin that `restore_state` brings up to date, because after `mj_step` the user's own
 derived quantities are those of the state before it.
 """
 

@@ -12,12 +12,12 @@ from iris_session.cli.common import CommandError
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 from iris_session.client import FoundSession
-from iris_session.security import KeyHome, KeyPair, fingerprint, raw_key
+from iris_session.security import KeyHome, KeyPair, compute_fingerprint, decode_key
 
-KEY = KeyPair.new().public
+KEY = KeyPair.generate().public
 PLAIN = FoundSession("handover", "127.0.0.1:7721", "s1", "live", "", ("127.0.0.1:7721",))
 NEW = FoundSession("lab-1", "10.0.0.5:7721", "s2", "live", "mark", ("10.0.0.5:7721", "10.1.0.5:7721"))
-KNOWN = FoundSession("lab-2", "10.0.0.6:7721", "s3", "replay", fingerprint(raw_key(KEY)), ("10.0.0.6:7721",))
+KNOWN = FoundSession("lab-2", "10.0.0.6:7721", "s3", "replay", compute_fingerprint(decode_key(KEY)), ("10.0.0.6:7721",))
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[FoundSession]
 def test_what_is_heard_is_listed_with_what_is_known_of_it(
     heard: list[FoundSession], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    KeyHome().servers.pin("10.0.0.6:7721", "lab-2", KEY)
+    KeyHome().known_servers.pin("10.0.0.6:7721", "lab-2", KEY)
     heard += [PLAIN, NEW, KNOWN]
     assert main(["sessions"]) == 0
     plain, new, known = capsys.readouterr().out.splitlines()
@@ -67,7 +67,7 @@ def test_a_block_of_ports_is_chosen_as_one() -> None:
     assert make_session_config(demo, "x").control_port == 0
     demo = build_parser().parse_args(["demo", "handover", "--port-base", "7730"])
     assert make_session_config(demo, "x").control_port == 7731
-    with pytest.raises(CommandError, match="names all ports"):
+    with pytest.raises(CommandError, match="--port-base"):
         make_session_config(options("--port-base", "7730", "--state-port", "9"), "x")
     for text in ("0", "65535", "x", "-1"):
         with pytest.raises(SystemExit):
@@ -78,7 +78,7 @@ def test_where_to_listen_is_said_once() -> None:
     given = options("--interface", "eth0", "--interface", "10.0.0.5", "--advertise", "lab.example", "--no-beacon")
     config = make_session_config(given, "x")
     assert (config.interfaces, config.advertise, config.beacon_port) == (("eth0", "10.0.0.5"), "lab.example", 0)
-    with pytest.raises(CommandError, match="give one of them"):
+    with pytest.raises(CommandError, match="--interface and --host"):
         make_session_config(options("--interface", "eth0", "--host", "0.0.0.0"), "x")
 
 

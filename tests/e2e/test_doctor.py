@@ -62,7 +62,7 @@ def test_somebody_listens_who_never_answers() -> None:
         listener.bind(("127.0.0.1", 0))
         listener.listen(16)
         found = doctor(f"127.0.0.1:{listener.getsockname()[1]}")
-    found.named("join", "nobody answers as a session")
+    found.named("join", "no session answers")
     assert found.checks["tcp"]["state"] == "ok"
 
 
@@ -135,7 +135,7 @@ def test_wrong_code(encrypted: Server, home: Path) -> None:
 
 
 def test_role_that_the_key_may_not_have(encrypted: Server, home: Path) -> None:
-    KeyHome().clients.allow("looker", KeyHome(home).identity().public, ("observer",))
+    KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
     found = doctor(encrypted.address, "--role", "director", home=home)
     found.named("role", "role")
     assert found.failed() == {"role"}
@@ -145,7 +145,7 @@ def test_role_that_the_key_may_not_have(encrypted: Server, home: Path) -> None:
 
 
 def test_another_key_than_the_known_one(encrypted: Server, home: Path) -> None:
-    KeyHome(home).servers.pin(encrypted.address, "arm", KeyPair.new().public)
+    KeyHome(home).known_servers.pin(encrypted.address, "arm", KeyPair.generate().public)
     found = doctor(encrypted.address, home=home)
     found.named("server_key", "is known for", "iris-session keys forget")
     assert found.failed() == {"server_key"}
@@ -247,7 +247,7 @@ def test_no_alignment_no_lease_and_a_stopped_client(plain: Server) -> None:
         )
         carl.send_signal(signal.SIGSTOP)
         found = doctor(plain.address)
-        found.named("alignment", "bob has no alignment", "look at the sheet")
+        found.named("alignment", "bob has no alignment", "bring the sheet into view")
         found.named("leases", "bob has no robot", "left: ann", "right: carl", state="warning")
         found.named("clients", "carl")
         assert found.failed() == {"alignment", "clients"}, found.troubles()
@@ -317,7 +317,7 @@ def test_session_that_somebody_stopped(plain: Server) -> None:
         director = join("dora", role="director", alignment="not_needed")
         director.estop("look out")
         wait(lambda: director.mirror.estop, "the stop")
-        doctor(plain.address).named("session", "e-stop")
+        doctor(plain.address).named("session", "emergency stop")
         director.clear_estop()
 
 
@@ -337,5 +337,5 @@ def test_session_that_stands_still(plain: Server) -> None:
         found = doctor(plain.address)
     finally:
         plain.process.send_signal(signal.SIGCONT)
-    found.named("session", "stands still")
+    found.named("session", "has not taken a step")
     assert {"session", "join"} <= found.failed()

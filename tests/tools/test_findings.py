@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from iris_session.client.address import Address
-from iris_session.client.connection import Connection
+from iris_session.client.core.connection import ClientConnection
 from iris_session.client.errors import ClientError
 from iris_session.client.identity import Identity
 from iris_session.front.state_publisher import StatePublisher
@@ -32,8 +32,8 @@ from iris_session.recording.messages import decode_header
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowList
 from iris_session.security.curve import load_public
-from iris_session.security.files import PrivateFolder
-from iris_session.security.session_notes import SessionNotes
+from iris_session.security.private_folder import PrivateFolder
+from iris_session.security.session_registry import SessionRegistry
 from iris_session.streams.rigid import RigidDecoder
 
 MS = 1_000_000
@@ -73,7 +73,7 @@ def test_counts_of_a_row_that_do_not_fit_are_damage() -> None:
 @pytest.mark.parametrize("content", [b'[{"name": "\xff"}]', b"[" * 100_000, b'[{"pid": 1'])
 def test_damaged_files_of_keys_are_one_kind_of_error(tmp_path: Path, content: bytes) -> None:
     tmp_path.chmod(0o700)
-    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionNotes)):
+    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionRegistry)):
         (tmp_path / name).touch(0o600)
         (tmp_path / name).write_bytes(content)
         with pytest.raises(KeysError):
@@ -86,7 +86,7 @@ def test_a_note_of_a_process_that_cannot_be(tmp_path: Path) -> None:
     file.touch(0o600)
     note = {"session_id": "s", "name": "lab", "pid": 2**40, "hosts": [], "control": 1, "server": ""}
     file.write_bytes(msgspec.json.encode([note]))
-    assert SessionNotes(PrivateFolder(tmp_path)).read() == []
+    assert SessionRegistry(PrivateFolder(tmp_path)).read() == []
 
 
 @pytest.mark.parametrize("line", [b"public-key", b"public-key = abc", b'public-key = "\xff\xff"', b"public-key ="])
@@ -97,8 +97,8 @@ def test_damaged_certificates_are_one_kind_of_error(tmp_path: Path, line: bytes)
         load_public(path)
 
 
-def joined(heartbeat_ns: int) -> Connection:
-    connection = Connection(Hello("operator", "Ann"), Identity(b"s" * 16))
+def joined(heartbeat_ns: int) -> ClientConnection:
+    connection = ClientConnection(Hello("operator", "Ann"), Identity(b"s" * 16))
     connection.open(10**12)
     tell(
         connection,
@@ -107,7 +107,7 @@ def joined(heartbeat_ns: int) -> Connection:
     return connection
 
 
-def tell(connection: Connection, message: Message) -> None:
+def tell(connection: ClientConnection, message: Message) -> None:
     connection.receive([encode_server(ServerEnvelope(1, 7, message))], 10**12)  # type: ignore[arg-type]
 
 
@@ -140,7 +140,7 @@ def test_what_a_session_says_does_not_pile_up_in_a_client() -> None:
         tell(connection, Reply(0, True, leases=(Lease(f"robot{i}", "robot", "exclusive", "p1", 1),)))
     assert len(connection.counters.faults) <= 65
     assert sum(connection.counters.faults.values()) == 6000
-    assert len(connection.answers._granted) <= 4096
+    assert len(connection.requests._granted) <= 4096
 
 
 def test_frames_of_bodies_that_are_not_are_refused_unchanged() -> None:
