@@ -48,7 +48,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     """Bounds of control. Raises `ValueError` for values that cannot work.
 
     `output`: `ctrl` solves inverse kinematics and writes `data.ctrl`; `targets` only moves the end-effector targets
-    (`Controller.targets()`), for an environment with its own controller: it needs no mink and writes no `ctrl`.
+    (`Controller.get_targets()`), for an environment with its own controller: it needs no mink and writes no `ctrl`.
     """
 
     output: str = OUTPUT_CTRL

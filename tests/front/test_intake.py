@@ -241,15 +241,15 @@ def test_a_full_house_lets_back_in_who_has_a_token(rig: IntakeRig) -> None:
     for i in range(rig.limits.connections - 1):
         rig.now_ns += 1_000_000_000
         hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
-        rig.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
+        rig.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(wrap_message(hello))), 0)
     assert len(rig.clients) == rig.limits.connections
     rig.now_ns += 1_000_000_000
     rig.coalescer.take_batch()
     late, back = Peer(7, ""), Peer(8, "")
-    data = encode_client(envelope(HELLO))
+    data = encode_client(wrap_message(HELLO))
     rig.intake.handle_message(b"late", late, memoryview(data), 0)
     assert isinstance(rig.sent[-1][1], Refused)
-    data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
+    data = encode_client(wrap_message(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
     rig.intake.handle_message(b"back", back, memoryview(data), 0)
     (entry,) = rig.coalescer.take_batch()
     assert isinstance(entry.message, Join)
