@@ -330,7 +330,7 @@ def test_samples_and_observations_are_recorded_as_received() -> None:
         rig.take(sample, epoch=epoch)
         rig.take(together(8), epoch=epoch)
         rig.take(observation, epoch=epoch)
-        frame = encode_client(envelope(sample, epoch)).replace(double, single)
+        frame = encode_client(wrap_message(sample, epoch)).replace(double, single)
         rig.intake.handle_message(ROUTE, ANN, memoryview(frame), 0)
         recorded = []
         while recorder.poll(0):
