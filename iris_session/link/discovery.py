@@ -16,7 +16,7 @@ from typing import Final, Self
 
 from iris_session.protocol.codec import decode_beacon
 from iris_session.protocol.discovery import DISCOVERY_PORT, Beacon
-from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.limits import MAX_BEACON_BYTES
 
 #: Sessions kept, and addresses of one session: any host can send beacons.
@@ -100,7 +100,7 @@ class BeaconListener:
         try:
             beacon = decode_beacon(data)
         except ProtocolError as error:
-            self._count_ignored("other_version" if isinstance(error, VersionError) else "malformed")
+            self._count_ignored("other_version" if isinstance(error, ProtocolVersionError) else "malformed")
             return
         if not is_plausible(beacon):
             self._count_ignored("malformed")
