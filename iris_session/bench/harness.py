@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from iris_session.bench.clients import ClientJob, Job
 from iris_session.bench.report import BenchError
+from iris_session.demo.impairment import make_link_address, start_links
 from iris_session.netsim.process import ImpairmentProcess
-from iris_session.netsim.session_link import link_address, links_before
 from iris_session.physics import PacerStats
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
@@ -51,7 +51,7 @@ def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJ
     """Each of `specs` on a link of its own, and the profile by link; as they are when `profile` is empty."""
     if not profile:
         return list(specs), {}
-    placed = [msgspec.structs.replace(spec, link=link_address(i)) for i, spec in enumerate(specs)]
+    placed = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
     return placed, dict.fromkeys((spec.link for spec in placed), profile)
 
 
@@ -165,7 +165,7 @@ def measure(
             curve_clients="" if keys is None else str(folder / "clients"),
         )
         session = stack.enter_context(Session(model, config=config))
-        proxy = stack.enter_context(links_before(session, links, seed)) if links else None
+        proxy = stack.enter_context(start_links(session, links, seed)) if links else None
         arena = BenchRun(session, [], {}, proxy)
         for i, group in enumerate(groups):
             job = make_job(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from anchors.pose import PoseTuple
-    from iris_session.demo.named_scenes import Scene
+    from iris_session.demo.named_scenes import NamedScene
 
 
 #: Whatever is there has taken a connection by then.
@@ -188,14 +188,14 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), default=None, help="lease mode of every robot")
 
 
-def open_scene(scene: str) -> Scene:
+def open_scene(scene: str) -> NamedScene:
     """The scene of that name, or in that file; a file or folder in the way of a name is no scene."""
-    from iris_session.demo.named_scenes import Scene, scene_by_name
+    from iris_session.demo.named_scenes import NamedScene, scene_by_name
     from iris_session.physics import load_model
 
     path = Path(scene)
     if path.suffix or path.is_file():
-        return Scene(load_model(path))
+        return NamedScene(load_model(path))
     return scene_by_name(scene)
 
 

@@ -33,11 +33,11 @@ class Goal(Protocol):
         """What it is called when it is reached, one word."""
         ...
 
-    def begun(self, vertices: Vertices) -> bool:
+    def has_begun(self, vertices: Vertices) -> bool:
         """What must have been seen at some time before it counts."""
         ...
 
-    def met(self, vertices: Vertices) -> bool:
+    def is_met(self, vertices: Vertices) -> bool:
         """Whether it lies as it should."""
         ...
 
@@ -51,13 +51,13 @@ class FoldGoal:
     within_m: float = 0.05
     name: str = "folded"
 
-    def begun(self, vertices: Vertices) -> bool:
-        return all(gap > 2.0 * self.within_m for gap in self._gaps(vertices))
+    def has_begun(self, vertices: Vertices) -> bool:
+        return all(gap > 2.0 * self.within_m for gap in self._measure_gaps(vertices))
 
-    def met(self, vertices: Vertices) -> bool:
-        return all(gap <= self.within_m for gap in self._gaps(vertices))
+    def is_met(self, vertices: Vertices) -> bool:
+        return all(gap <= self.within_m for gap in self._measure_gaps(vertices))
 
-    def _gaps(self, vertices: Vertices) -> list[float]:
+    def _measure_gaps(self, vertices: Vertices) -> list[float]:
         return [float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in self.pairs]
 
 
@@ -75,14 +75,14 @@ class StowGoal:
     lifted_m: float = 0.10
     name: str = "stowed"
 
-    def begun(self, vertices: Vertices) -> bool:
+    def has_begun(self, vertices: Vertices) -> bool:
         return bool(vertices[:, 2].min() >= self.table_z + self.lifted_m)
 
-    def met(self, vertices: Vertices) -> bool:
+    def is_met(self, vertices: Vertices) -> bool:
         return bool((vertices >= self.low).all() and (vertices <= self.high).all())
 
 
-class GoalWatch:
+class GoalMonitor:
     """Follows one goal from tick to tick. `at_s`: simulated time at which it was reached, `None` until then."""
 
     def __init__(self, goal: Goal) -> None:
@@ -92,15 +92,15 @@ class GoalWatch:
         self._rest: Vertices | None = None
         self._rest_since_s = 0.0
 
-    def observe(self, now_s: float, vertices: Vertices, touching: Sequence[str]) -> bool:
+    def update(self, now_s: float, vertices: Vertices, touching: Sequence[str]) -> bool:
         """Takes in the world after a tick; true in the one in which the goal is reached."""
         if self.at_s is not None:
             return False
-        self._begun = self._begun or self.goal.begun(vertices)
+        self._begun = self._begun or self.goal.has_begun(vertices)
         moved = self._rest is None or float(np.abs(vertices - self._rest).max()) > STILL_M
         if moved or touching:
             self._rest, self._rest_since_s = vertices, now_s
-        elif self._begun and now_s - self._rest_since_s >= STILL_S and self.goal.met(vertices):
+        elif self._begun and now_s - self._rest_since_s >= STILL_S and self.goal.is_met(vertices):
             self.at_s = now_s
             return True
         return False

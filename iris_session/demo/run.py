@@ -16,10 +16,10 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from iris_session.demo.goals import GoalWatch
-from iris_session.demo.plays import Play
+from iris_session.demo.demos import Demo
+from iris_session.demo.goals import GoalMonitor
+from iris_session.demo.impairment import get_address_over, make_link_address, start_links
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
-from iris_session.netsim.session_link import address_over, link_address, links_before
 from iris_session.protocol.client_messages import Episode
 from iris_session.protocol.names import EpisodeAction
 from iris_session.session.config import SessionConfig
@@ -55,11 +55,11 @@ class EmulatorProcess:
         self.reports: dict[str, HeadsetReport] = {}
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         return self._process.is_running
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether somebody here has not yet come to the end of a task that has one."""
         reports = [self.reports.get(name) for name in self._awaited]
         return any(r is None or not (r.done or r.failed) for r in reports)
@@ -119,7 +119,7 @@ class DemoResult(msgspec.Struct, frozen=True):
 
 
 def run_demo(
-    play: Play,
+    demo: Demo,
     config: SessionConfig,
     timeout_s: float = 90.0,
     on_session: Callable[[Session], AbstractContextManager[Callable[[], object]]] | None = None,
@@ -131,19 +131,19 @@ def run_demo(
     `profile`: every process of people joins over a bad link like this, with the weather of `seed`; empty: directly.
     """
     session = Session(
-        play.model, config=dataclasses.replace(config, anchors=play.anchors, anchor_sizes=play.anchor_sizes)
+        demo.model, config=dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes)
     )
-    judge = _Judge(play, session)
+    judge = _GoalTracker(demo, session)
     with ExitStack() as stack:
         stack.enter_context(session.signals())
         stack.enter_context(session)
         update = stack.enter_context(on_session(session)) if on_session is not None else (lambda: None)
-        groups = _groups(play.people)
-        links = {link_address(i): profile for i in range(len(groups))} if profile else {}
+        groups = _group_by_process(demo.headsets)
+        links = {make_link_address(i): profile for i in range(len(groups))} if profile else {}
         if links:
-            stack.enter_context(links_before(session, links, seed))
-        addresses = [address_over(session, link) for link in links] or [session.address] * len(groups)
-        people = stack.enter_context(_People(addresses, groups, timeout_s))
+            stack.enter_context(start_links(session, links, seed))
+        addresses = [get_address_over(session, link) for link in links] or [session.address] * len(groups)
+        people = stack.enter_context(_EmulatorGroup(addresses, groups, timeout_s))
         next_read_ns = began_ns = 0
 
         def finished() -> bool:
@@ -151,11 +151,11 @@ def run_demo(
             update()
             now_ns = session.clock()
             began_ns = began_ns or now_ns  # making the loop ready is no part of its pace
-            judge.look()
+            judge.update()
             if now_ns < next_read_ns:
                 return False
             next_read_ns = now_ns + READ_PERIOD_NS
-            return people.finished() and judge.settled()
+            return people.is_finished() and judge.is_settled()
 
         session.run(seconds=timeout_s + 5.0, until=finished)
         run_s = max(session.clock() - began_ns, 1) * 1e-9
@@ -166,15 +166,15 @@ def run_demo(
         recording = session.recording
     reports = people.reports
     # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
-    verified, verification = (None, "not verified: interrupted") if interrupted else _verify(recording)
-    problems = ["interrupted before its end"] if interrupted else _problems(play, reports, status, timeout_s)
+    verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
+    problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, status, timeout_s)
     if not interrupted:
-        problems += judge.problems()
+        problems += judge.list_problems()
     if verified is False:
         problems.append(verification)
     return DemoResult(
-        ok=not problems and len(reports) == len(play.people),
-        demo=play.name,
+        ok=not problems and len(reports) == len(demo.headsets),
+        demo=demo.name,
         seconds=round(seconds, 3),
         participants=tuple(sorted(reports)),
         handovers=status.handovers,
@@ -191,59 +191,59 @@ def run_demo(
         real_time_factor=round(status.sim_time / run_s, 3),
         state_age_ms_p99={name: round(r.age_ms_p99, 2) for name, r in reports.items() if math.isfinite(r.age_ms_p99)},
         problems=tuple(problems),
-        notes=play.notes,
+        notes=demo.notes,
         interrupted=interrupted,
-        goals=judge.status(),
+        goals=judge.get_status(),
     )
 
 
-class _Judge:
+class _GoalTracker:
     """Follows the goals of a play, tick by tick, and has the verdict recorded as that of an episode."""
 
-    def __init__(self, play: Play, session: Session) -> None:
+    def __init__(self, play: Demo, session: Session) -> None:
         self._name = play.name
         self._session = session
-        self._watches = tuple(GoalWatch(goal) for goal in play.goals)
+        self._monitors = tuple(GoalMonitor(goal) for goal in play.goals)
         self._began = False
         self._finished_s: float | None = None
 
-    def look(self) -> None:
+    def update(self) -> None:
         """After every tick."""
-        if not self._watches:
+        if not self._monitors:
             return
         if not self._began:
             self._began = True
             self._session.post(Episode(0, EpisodeAction.START, self._name))
         world = self._session.stepper.core.world
         now_s, reached = world.view().sim_time, False
-        for watch in self._watches:
+        for watch in self._monitors:
             name = watch.goal.deformable
-            reached |= watch.observe(now_s, world.flexes.vertices(name), world.flexes.touching(name))
-        if reached and all(watch.at_s is not None for watch in self._watches):
+            reached |= watch.update(now_s, world.flexes.vertices(name), world.flexes.touching(name))
+        if reached and all(watch.at_s is not None for watch in self._monitors):
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
 
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Asked when everybody is done: whether the goals are reached, or evidently will not be."""
         now_s = self._session.clock() * 1e-9
         self._finished_s = now_s if self._finished_s is None else self._finished_s
-        return all(watch.at_s is not None for watch in self._watches) or now_s - self._finished_s > SETTLE_S
+        return all(watch.at_s is not None for watch in self._monitors) or now_s - self._finished_s > SETTLE_S
 
-    def status(self) -> tuple[GoalStatus, ...]:
+    def get_status(self) -> tuple[GoalStatus, ...]:
         return tuple(
             GoalStatus(w.goal.deformable, w.goal.name, None if w.at_s is None else round(w.at_s, 3))
-            for w in self._watches
+            for w in self._monitors
         )
 
-    def problems(self) -> list[str]:
+    def list_problems(self) -> list[str]:
         """The goals that were not reached."""
         return [
             f"the {w.goal.deformable} was not {w.goal.name}, let go and at rest"
-            for w in self._watches
+            for w in self._monitors
             if w.at_s is None
         ]
 
 
-def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
+def _group_by_process(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
     """Who shares a process: nobody as long as two people work, else see `WORKERS_PER_PROCESS`."""
     workers = [spec for spec in specs if not spec.observer]
     observers = [spec for spec in specs if spec.observer]
@@ -252,7 +252,7 @@ def _groups(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
     return groups + [observers[i : i + OBSERVERS_PER_PROCESS] for i in range(0, len(observers), OBSERVERS_PER_PROCESS)]
 
 
-class _People:
+class _EmulatorGroup:
     """The emulated people of a demo, in processes of their own."""
 
     def __init__(self, addresses: Sequence[str], groups: Sequence[Sequence[HeadsetSpec]], timeout_s: float) -> None:
@@ -279,20 +279,20 @@ class _People:
         """The newest report of everybody, by name."""
         return {name: r for process in (*self._workers, *self._observers) for name, r in process.reports.items()}
 
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Reads the reports; whether everybody whose task has an end has come to it."""
         for process in (*self._workers, *self._observers):
             process.poll()
-        return not any(process.running and process.busy for process in self._workers)
+        return not any(process.is_running and process.is_busy for process in self._workers)
 
     def close(self) -> None:
         for process in (*self._workers, *self._observers):
             process.close()
 
 
-def _problems(play: Play, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
+def _list_problems(play: Demo, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
     """Why this was no success; empty when it was one."""
-    tasks = {spec.name: spec for spec in play.people}
+    tasks = {spec.name: spec for spec in play.headsets}
     problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
     problems += [
         f"{name}: not done within {timeout_s:g} s, at '{r.phase}'"
@@ -306,7 +306,7 @@ def _problems(play: Play, reports: dict[str, HeadsetReport], status: SessionStat
     return problems
 
 
-def _verify(recording: Path | None) -> tuple[bool | None, str]:
+def _verify_recording(recording: Path | None) -> tuple[bool | None, str]:
     if recording is None:
         return None, "not recorded"
     report = verify_recording(recording)

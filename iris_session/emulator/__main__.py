@@ -15,9 +15,8 @@ import msgspec
 from iris_session.client import ClientError
 from iris_session.client.joining import wanted
 from iris_session.client.meeting import Wanted, settle
-from iris_session.emulator.equipment import behaviour_of, curve_of
-from iris_session.emulator.orders import Orders
-from iris_session.emulator.runner import JOIN_TIMEOUT_S, run_headsets
+from iris_session.emulator.operator import load_curve_keys, make_spec_behaviour
+from iris_session.emulator.runner import JOIN_TIMEOUT_S, DisturbanceReader, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 
 #: Fields of a headset with several numbers, written as `eye=0.3/-0.9/0.5`. Fields of a field have both names:
@@ -27,13 +26,13 @@ LISTS: Final = frozenset({"eye", "gaze", "recentre_at_s", "bump_at_s", "bump_m"}
 
 def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     """Exit status 0 when nobody failed, 1 when somebody did, 2 for unusable input. Errors begin with `prog`."""
-    options = _parser().parse_args(argv)
+    options = _build_parser().parse_args(argv)
     try:
-        specs = _specs(options)
+        specs = _parse_specs(options)
         sought = wanted(options.address, options.session, None, options.code)
         for spec in specs:
-            behaviour_of(spec, spec.robot)
-            curve_of(spec)
+            make_spec_behaviour(spec, spec.robot)
+            load_curve_keys(spec)
     except (msgspec.MsgspecError, OSError, ValueError, ClientError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
@@ -47,8 +46,8 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _frame: stopped.append(received))
-    say = _say_json if options.json else _say_line
-    orders = Orders(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
+    say = _print_json if options.json else _print_line
+    orders = DisturbanceReader(sys.stdin.fileno(), [spec.name for spec in specs]) if options.orders else tuple
     try:
         reports = run_headsets(
             str(sought.address), specs, options.seconds, say, lambda: bool(stopped), options.join_timeout, orders
@@ -63,7 +62,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     return int(any(report.failed for report in reports))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m iris_session.emulator", description=__doc__)
     parser.add_argument("--address", default="", help="control channel of the session, HOST:PORT, or an iris:// URI")
     parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
@@ -81,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
+def _parse_specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     specs: list[HeadsetSpec] = []
     if options.specs == "-" and options.orders:
         raise ValueError("--specs - and --orders both read standard input: write the specs into a file")
@@ -92,7 +91,7 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
         pairs: dict[str, Any] = dict(part.partition("=")[::2] for part in text.split(","))
         for key in LISTS & pairs.keys():
             pairs[key] = [float(value) for value in pairs[key].split("/")]
-        nested = _nested(pairs)
+        nested = _nest_fields(pairs)
         _check_fields(nested, HeadsetSpec)
         specs.append(msgspec.convert(nested, HeadsetSpec, strict=False))
     if not specs:
@@ -102,7 +101,7 @@ def _specs(options: argparse.Namespace) -> list[HeadsetSpec]:
     return [msgspec.structs.replace(spec, **keys) for spec in specs]
 
 
-def _nested(pairs: Mapping[str, Any]) -> dict[str, Any]:
+def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
     """`model.drift_m_per_min` is a field of a field."""
     nested: dict[str, Any] = {}
     for key, value in pairs.items():
@@ -137,20 +136,22 @@ def _read(path: str) -> bytes:
         return file.read()
 
 
-def _say_json(report: HeadsetReport, *, final: bool = False) -> None:
+def _print_json(report: HeadsetReport, *, final: bool = False) -> None:
     print(msgspec.json.encode({"final": final, **msgspec.to_builtins(report)}).decode(), flush=True)
 
 
-def _say_line(report: HeadsetReport, *, final: bool = False) -> None:
+def _print_line(report: HeadsetReport, *, final: bool = False) -> None:
     phase = next(reversed(report.phases), report.phase)
     text = f"{report.name:<12} {phase:<20} samples {report.samples:<6} frames {report.frames:<6}"
-    text += f" age p99 {_known(report.age_ms_p99, 'ms')}, alignment {_known(report.alignment_error_mm, 'mm')}"
+    text += (
+        f" age p99 {_format_value(report.age_ms_p99, 'ms')}, alignment {_format_value(report.alignment_error_mm, 'mm')}"
+    )
     if report.failed:
         text += f"  FAILED: {report.failed}"
     print(("end  " if final else "     ") + text, flush=True)
 
 
-def _known(value: float, unit: str) -> str:
+def _format_value(value: float, unit: str) -> str:
     """Before there is state or an alignment: not a number."""
     return "-" if math.isnan(value) else f"{value:.1f} {unit}"
 

@@ -30,7 +30,7 @@ from anchors.pose import (
     quat_normalize,
     quat_rotate,
 )
-from iris_session.emulator.sheet_noise import SheetNoise, of_viewpoint
+from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 from iris_session.netsim.latency import LinkModel
 
 #: Where the sheet lies in the demo scene: on the table in front of the people, facing up (body `sheet`).
@@ -61,7 +61,7 @@ class HeadsetModel(msgspec.Struct, frozen=True):
     link: LinkModel = LinkModel()
 
 
-class Headset:
+class EmulatedHeadset:
     """One headset on one head. `tracking_epoch` counts the jumps of its tracking frame; `worn` is up to the user."""
 
     def __init__(self, model: HeadsetModel, seed: int, start_ns: int = 0) -> None:
@@ -77,11 +77,11 @@ class Headset:
         self._detect_ns = int(1e9 / model.detection_hz)
         self._next_sample_ns = start_ns + int(self.rng.uniform(0.0, self._period_ns))
         self._next_detection_ns = start_ns
-        self._new_frame(start_ns)
+        self._start_frame(start_ns)
 
     # --- tracking frame -----------------------------------------------------------------------------------------------
 
-    def T_world_tracking(self, now_ns: int) -> PoseTuple:
+    def get_T_world_tracking(self, now_ns: int) -> PoseTuple:
         """The truth, drift included; only judges of the alignment may look at it."""
         minutes = (now_ns - self._epoch_ns) / 60e9
         (x, y, z), q = self._T_world_tracking0
@@ -89,16 +89,16 @@ class Headset:
         yaw = quat_from_yaw(self._yaw_drift * minutes)
         return ((x + dx * minutes, y + dy * minutes, z + dz * minutes), quat_mul(yaw, q))
 
-    def recentre(self, now_ns: int) -> None:
+    def recentre_frame(self, now_ns: int) -> None:
         """The user recentred, or tracking was lost and found: another tracking frame, a new tracking epoch."""
         self.tracking_epoch += 1
         self._biases.clear()
-        self._new_frame(now_ns)
+        self._start_frame(now_ns)
 
-    def bump(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
+    def bump_frame(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
         """The tracking frame jumps, and the headset does not notice: by `shift_m` (world), turned about the vertical
         through `p_world`. Returns `T_new_old`: what was tracked at x is tracked at `T_new_old * x` from now on."""
-        old = self.T_world_tracking(now_ns)
+        old = self.get_T_world_tracking(now_ns)
         turn = quat_from_yaw(yaw_rad)
         arm = quat_rotate(turn, (old[0][0] - p_world[0], old[0][1] - p_world[1], old[0][2] - p_world[2]))
         x, y, z = (p_world[i] + arm[i] + shift_m[i] for i in range(3))
@@ -106,28 +106,28 @@ class Headset:
         self._epoch_ns = now_ns  # the drift so far is in the new pose
         return compose(inverse(self._T_world_tracking0), old)
 
-    def drift(self, m_per_min: float, now_ns: int) -> None:
+    def start_drift(self, m_per_min: float, now_ns: int) -> None:
         """From now on the tracking frame drifts at this speed, in the direction that is its own."""
-        self._T_world_tracking0 = self.T_world_tracking(now_ns)
+        self._T_world_tracking0 = self.get_T_world_tracking(now_ns)
         self._epoch_ns = now_ns
         x, y, z = self._way
         self._drift = (m_per_min * x, m_per_min * y, m_per_min * z)
 
     def track(self, T_world_device: PoseTuple, now_ns: int) -> PoseTuple:
         """`T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
-        return self.add_noise(compose(inverse(self.T_world_tracking(now_ns)), T_world_device))
+        return self.add_noise(compose(inverse(self.get_T_world_tracking(now_ns)), T_world_device))
 
     def add_noise(self, T_tracking_device: PoseTuple) -> PoseTuple:
         """A tracked pose with the noise of one reading."""
         p, q = T_tracking_device
-        noise = self._normals(6)
+        noise = self._draw_normals(6)
         s, r = self.model.position_sigma_m, self.model.rotation_sigma_rad
         turn = quat_from_rotvec((r * noise[3], r * noise[4], r * noise[5]))
         return ((p[0] + s * noise[0], p[1] + s * noise[1], p[2] + s * noise[2]), quat_mul(q, turn))
 
     # --- sampling -----------------------------------------------------------------------------------------------------
 
-    def sample_due(self, now_ns: int) -> bool:
+    def is_sample_due(self, now_ns: int) -> bool:
         """True once for every sampling instant that has passed; those missed are counted, not made up for."""
         if now_ns < self._next_sample_ns:
             return False
@@ -140,7 +140,7 @@ class Headset:
     def next_sample_ns(self) -> int:
         return self._next_sample_ns
 
-    def detection_due(self, now_ns: int) -> bool:
+    def is_detection_due(self, now_ns: int) -> bool:
         """True when the detector has a new camera image to look at."""
         if now_ns < self._next_detection_ns:
             return False
@@ -149,7 +149,7 @@ class Headset:
 
     # --- the sheet ----------------------------------------------------------------------------------------------------
 
-    def sees(self, T_world_head: PoseTuple, T_world_anchor: PoseTuple) -> bool:
+    def can_see(self, T_world_head: PoseTuple, T_world_anchor: PoseTuple) -> bool:
         """Whether the sheet is in the field of view, near enough, and not seen too much from the side."""
         d = distance(T_world_head[0], T_world_anchor[0])
         if not 0.05 < d <= self.model.max_distance_m:
@@ -164,37 +164,37 @@ class Headset:
         self, T_world_head: PoseTuple, T_world_anchor: PoseTuple, now_ns: int, viewpoint_id: int
     ) -> PoseTuple | None:
         """`T_tracking_anchor` as detected from here, `None` when the sheet is not seen."""
-        if not self.sees(T_world_head, T_world_anchor):
+        if not self.can_see(T_world_head, T_world_anchor):
             return None
         noise, view = self.model.sheet, _direction(T_world_head[0], T_world_anchor[0])
         p, q = np.array([T_world_anchor[0]]), np.array([T_world_anchor[1]])
         if self.rng.random() < noise.wrong_share:
-            p[0], q[0] = noise.wrong(p[0], q[0], np.array(view), self.rng)
+            p[0], q[0] = noise.make_wrong_detection(p[0], q[0], np.array(view), self.rng)
         else:
             d = distance(T_world_head[0], T_world_anchor[0])
-            units, scale_unit = self._sheet_units(viewpoint_id)
-            p, q = noise.seen(p, q, np.array((view, *_across(view))), d, units[None], scale_unit)
+            units, scale_unit = self._draw_sheet_units(viewpoint_id)
+            p, q = noise.observe(p, q, np.array((view, *_compute_perpendiculars(view))), d, units[None], scale_unit)
         (x, y, z), (w, a, b, c) = p[0].tolist(), q[0].tolist()
-        return compose(inverse(self.T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
+        return compose(inverse(self.get_T_world_tracking(now_ns)), ((x, y, z), quat_normalize((w, a, b, c))))
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
-    def _new_frame(self, now_ns: int) -> None:
+    def _start_frame(self, now_ns: int) -> None:
         """A tracking frame somewhere within 3 m, any yaw, a little tilted, drifting in its own direction."""
-        tilt = self._normals(2)
+        tilt = self._draw_normals(2)
         level = quat_from_yaw(self.rng.uniform(-math.pi, math.pi))
         tilted = quat_from_rotvec((self.model.tilt_sigma_rad * tilt[0], self.model.tilt_sigma_rad * tilt[1], 0.0))
         x, y = self.rng.uniform(-3.0, 3.0, 2).tolist()
         z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, as the run time likes
         self._T_world_tracking0 = ((x, y, z), quat_mul(tilted, level))
-        way = self._normals(3)
+        way = self._draw_normals(3)
         length = max(1e-9, math.hypot(*way))
         self._way: Vec3 = (way[0] / length, way[1] / length, way[2] / length)
         self._yaw_drift = self.model.drift_rad_per_min * (1.0 if self.rng.random() < 0.5 else -1.0)
         self._epoch_ns = now_ns
-        self.drift(self.model.drift_m_per_min, now_ns)
+        self.start_drift(self.model.drift_m_per_min, now_ns)
 
-    def _sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
+    def _draw_sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
         """Six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of scale."""
         key = (self.tracking_epoch, viewpoint_id)
         if key not in self._biases:
@@ -202,13 +202,13 @@ class Headset:
                 del self._biases[next(iter(self._biases))]
             self._biases[key] = self.rng.standard_normal(7)
         common = self._biases[key]
-        return of_viewpoint(common[:6], self.rng.standard_normal(6)), float(common[6])
+        return mix_viewpoint_noise(common[:6], self.rng.standard_normal(6)), float(common[6])
 
-    def _normals(self, n: int) -> list[float]:
+    def _draw_normals(self, n: int) -> list[float]:
         return [float(x) for x in self.rng.standard_normal(n)]
 
 
-def look_at(eye: Vec3, target: Vec3) -> PoseTuple:
+def compute_look_at(eye: Vec3, target: Vec3) -> PoseTuple:
     """Head pose at `eye` with X towards `target` and no roll. They must not be one above the other."""
     x = _direction(eye, target)
     yaw = math.atan2(x[1], x[0])
@@ -230,7 +230,7 @@ def _cross(a: Vec3, b: Vec3) -> Vec3:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def _across(e1: Vec3) -> tuple[Vec3, Vec3]:
+def _compute_perpendiculars(e1: Vec3) -> tuple[Vec3, Vec3]:
     """Two unit vectors across `e1`."""
     helper: Vec3 = (0.0, 0.0, 1.0) if abs(e1[2]) < 0.9 else (1.0, 0.0, 0.0)
     c = _cross(e1, helper)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from iris_session.demo.scenes.generators import room
-from iris_session.demo.scenes.models import model_file, read_model
+from iris_session.demo.scenes.generators import make_room
+from iris_session.demo.scenes.models import find_model_file, load_model_spec
 from iris_session.demo.scenes.parts import add_board, add_sheet
 
 STATIONS: Final = ("south", "north")
@@ -37,8 +37,8 @@ def aloha_scene() -> Any:
     """The scene as an `mujoco.MjSpec`, keyframe `home`. Raises `ModelNotFoundError` without the model."""
     import mujoco
 
-    spec = room("aloha")
-    path = model_file("aloha", "scene.xml")
+    spec = make_room("aloha")
+    path = find_model_file("aloha", "scene.xml")
     qpos: list[float] = []
     ctrl: list[float] = []
     for index, name in enumerate(STATIONS):
@@ -72,7 +72,7 @@ def _station(path: Any) -> Any:
     """One station without what belongs to a scene of its own: floor, lights, sky, targets."""
     import mujoco
 
-    spec = read_model(path)
+    spec = load_model_spec(path)
     spec.option.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     spec.delete(spec.geom("floor"))
     for thing in [*spec.lights, *(b for b in spec.bodies if b.mocap)]:

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from iris_session.demo.scenes.generators import ARM_FILE, ARM_HOME, FINGER_OPEN, arm_names, bearing_of, place_arm
-from iris_session.demo.scenes.parts import add_sheet, sheet_place
+from iris_session.demo.scenes.generators import ARM_FILE, ARM_HOME, FINGER_OPEN, arm_names, compute_bearing, place_arm
+from iris_session.demo.scenes.parts import add_sheet, get_sheet_position
 from iris_session.protocol.common import Vec3
 
 #: Two arms stand so far from the middle [m], as in handover.xml.
@@ -61,8 +61,8 @@ def _with_two_arms(file: str, change: Callable[[Any], None] | None = None) -> An
             change(arm)
         for option in _OPTIONS:  # MuJoCo warns where they differ
             setattr(arm.option, option, getattr(spec.option, option))
-        place_arm(spec, RADIUS, bearing_of(i, 2)).attach_body(arm.body("base"), f"{name}/", "")
-    add_sheet(spec, sheet_place(2))
+        place_arm(spec, RADIUS, compute_bearing(i, 2)).attach_body(arm.body("base"), f"{name}/", "")
+    add_sheet(spec, get_sheet_position(2))
     qpos = [*resting, *([*ARM_HOME, FINGER_OPEN, FINGER_OPEN] * 2)]
     spec.add_key(name="home", qpos=qpos, ctrl=[*ARM_HOME, FINGER_OPEN] * 2)
     return spec

@@ -32,13 +32,13 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
     if not 1 <= n <= 12:
         raise ValueError(f"n_arms_scene makes 1 to 12 arms, not {n}")
     n_objects = (n + 1) // 2 if objects is None else objects
-    radius = circle_radius(n)
-    spec = room(f"{n}_arms")
+    radius = compute_circle_radius(n)
+    spec = make_room(f"{n}_arms")
     add_round_table(spec, radius + 0.25)
     for i, name in enumerate(arm_names(n)):
         arm = mujoco.MjSpec.from_file(str(ARM_FILE))
-        arm.material("accent").rgba = [*hue(i / n), 1.0]
-        place_arm(spec, radius, bearing_of(i, n)).attach_body(arm.body("base"), f"{name}/", "")
+        arm.material("accent").rgba = [*compute_hue(i / n), 1.0]
+        place_arm(spec, radius, compute_bearing(i, n)).attach_body(arm.body("base"), f"{name}/", "")
     qpos = [*ARM_HOME, FINGER_OPEN, FINGER_OPEN] * n
     for k in range(n_objects):
         qpos += add_object(spec, k, n_objects, radius - 0.38)
@@ -46,12 +46,12 @@ def n_arms_scene(n: int, objects: int | None = None) -> Any:
     return spec
 
 
-def circle_radius(n: int, least: float = 0.6, apart: float = 0.72) -> float:
+def compute_circle_radius(n: int, least: float = 0.6, apart: float = 0.72) -> float:
     """Radius [m] of the circle on which `n` arms stand: at least `least`, neighbours at least `apart`."""
     return max(least, 0.5 * apart / math.sin(math.pi / max(n, 2)))
 
 
-def bearing_of(i: int, n: int) -> float:
+def compute_bearing(i: int, n: int) -> float:
     """Where the `i`-th of `n` stands, seen from the middle of the table [rad]; the first at -x, as in handover.xml."""
     return math.pi + 2.0 * math.pi * i / n
 
@@ -84,7 +84,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
     import mujoco
 
     rng = np.random.default_rng(seed)
-    spec = room(f"{n}_free_bodies", floor_z=0.0)
+    spec = make_room(f"{n}_free_bodies", floor_z=0.0)
     spec.option.gravity = [0, 0, 0]
     qpos: list[float] = []
     qvel: list[float] = []
@@ -103,7 +103,7 @@ def free_bodies_scene(n: int = 300, seed: int = 0) -> Any:
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX if i % 2 else mujoco.mjtGeom.mjGEOM_ELLIPSOID,
             size=list(map(float, rng.uniform(0.03, 0.12, size=3))),
-            rgba=[*hue(i / n), 1.0],
+            rgba=[*compute_hue(i / n), 1.0],
             contype=0,
             conaffinity=0,
         )
@@ -138,7 +138,7 @@ def _circling(rng: np.random.Generator) -> tuple[list[float], list[float], list[
     return tuple(list(map(float, v)) for v in values)  # type: ignore[return-value]
 
 
-def room(name: str, floor_z: float = -0.75) -> Any:
+def make_room(name: str, floor_z: float = -0.75) -> Any:
     """An empty room: options as in `handover.xml`, sky, checker floor at `floor_z`, two lights."""
     import mujoco
 
@@ -216,7 +216,7 @@ def add_object(spec: Any, k: int, count: int, distance: float) -> list[float]:
     return [*pos, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
 
 
-def hue(x: float) -> tuple[float, float, float]:
+def compute_hue(x: float) -> tuple[float, float, float]:
     """A distinct, muted colour for `x` in 0 to 1."""
     return (
         0.5 + 0.35 * math.cos(2 * math.pi * (x + 0.55)),

@@ -11,7 +11,7 @@ from iris_session.physics.errors import ModelInvalidError, ModelNotFoundError, o
 VARIABLE: Final = "IRIS_DATA"
 
 
-def model_file(folder: str, name: str) -> Path:
+def find_model_file(folder: str, name: str) -> Path:
     """Absolute path of `models/<folder>/<name>` in the data folder. Raises `ModelNotFoundError` saying what to set."""
     source = f"{folder} of MuJoCo Menagerie (github.com/google-deepmind/mujoco_menagerie)"
     value = os.environ.get(VARIABLE, "")
@@ -27,7 +27,7 @@ def model_file(folder: str, name: str) -> Path:
     return path
 
 
-def read_model(path: Path) -> Any:
+def load_model_spec(path: Path) -> Any:
     """An `mujoco.MjSpec` of the model, ready to be attached: absolute asset folders, no keyframes.
 
     Raises `ModelInvalidError` for a file that MuJoCo cannot read.

@@ -55,7 +55,7 @@ def add_sheet(spec: Any, p_world: Vec3) -> None:
         )
 
 
-def sheet_place(n_arms: int) -> Vec3:
+def get_sheet_position(n_arms: int) -> Vec3:
     """Where the sheet lies in a scene of `n_arms` around a round table: before two arms as in `handover.xml`, else in
     the middle."""
     return (0.0, -0.45, 0.0) if n_arms <= 2 else (0.0, 0.0, 0.0)

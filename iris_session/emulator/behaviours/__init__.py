@@ -6,12 +6,10 @@
 
 from __future__ import annotations
 
-from iris_session.emulator.behaviours.arms import arm_kind
-from iris_session.emulator.behaviours.base import Behaviour, HandInput, OperatorView
+from iris_session.emulator.behaviours.arms import get_arm_kind
+from iris_session.emulator.behaviours.base import Behaviour, CombinedBehaviour, HandInput, OperatorView
 from iris_session.emulator.behaviours.folder import Folder
-from iris_session.emulator.behaviours.giver import Giver
-from iris_session.emulator.behaviours.hands import Hands
-from iris_session.emulator.behaviours.receiver import Receiver
+from iris_session.emulator.behaviours.handover import Giver, Receiver
 from iris_session.emulator.behaviours.stower import Stower
 from iris_session.emulator.behaviours.wander import Idle, Wander
 from iris_session.protocol.names import Device
@@ -21,7 +19,7 @@ __all__ = [
     "Folder",
     "Giver",
     "HandInput",
-    "Hands",
+    "CombinedBehaviour",
     "Idle",
     "OperatorView",
     "Receiver",
@@ -56,13 +54,13 @@ def make_behaviour(
         partner = "right" if robot == "left" else "left"
     match name:
         case "giver":
-            return Giver(robot, object, partner, device, arm_kind(arm))
+            return Giver(robot, object, partner, device, get_arm_kind(arm))
         case "receiver":
-            return Receiver(robot, object, partner, device, arm_kind(arm), place)
+            return Receiver(robot, object, partner, device, get_arm_kind(arm), place)
         case "folder":
-            return Folder(robot, object, partner, device, arm_kind(arm))
+            return Folder(robot, object, partner, device, get_arm_kind(arm))
         case "stower":
-            return Stower(robot, object, device, arm_kind(arm), place)
+            return Stower(robot, object, device, get_arm_kind(arm), place)
         case "wander":
             return Wander(robot, device, seed)
         case "idle":

@@ -56,7 +56,7 @@ VIPERX: Final = ArmKind(
 ARM_KINDS: Final[dict[str, ArmKind]] = {"arm": ARM, "iiwa": IIWA, "viperx": VIPERX}
 
 
-def arm_kind(name: str) -> ArmKind:
+def get_arm_kind(name: str) -> ArmKind:
     """The kind of that name. Raises `ValueError` listing the kinds."""
     if name not in ARM_KINDS:
         raise ValueError(f"no operator knows the arm '{name}'. Known arms: {', '.join(ARM_KINDS)}")

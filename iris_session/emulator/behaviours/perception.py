@@ -14,7 +14,7 @@ SMOOTHING_S = 0.07
 STILL_M = 0.005
 
 
-class Seen:
+class TrackedPose:
     """A pose smoothed over `SMOOTHING_S`, and since when it stays where it is."""
 
     def __init__(self, pose: PoseTuple, now_s: float) -> None:
@@ -39,7 +39,7 @@ class Seen:
         return self._now_s - self.rest_since_s
 
 
-class Eyes:
+class Perception:
     """Watches bodies and robot tips by name. `missing`: which of them were never seen so far.
 
     `arm`: the kind of the robots. `perhaps`: bodies that need not be there.
@@ -52,12 +52,12 @@ class Eyes:
         parts = tuple(f"{robot}/{part}" for robot in robots for part in (*arm.fingers, arm.base))
         self._bodies = bodies + parts
         self._robots = robots
-        self._perhaps = perhaps
-        self._seen: dict[str, Seen] = {}
+        self._optional = perhaps
+        self._tracked: dict[str, TrackedPose] = {}
         self._others: list[Vec3] = []
         self.missing: tuple[str, ...] = self._bodies
 
-    def look(self, view: OperatorView) -> None:
+    def observe(self, view: OperatorView) -> None:
         """Takes in the present picture. What is not in it stays as it was last seen."""
         now_s = view.session_time_ns * 1e-9
         poses = [(name, view.body_pose(name)) for name in self._bodies]
@@ -65,49 +65,51 @@ class Eyes:
         for name, pose in poses:
             if pose is None:
                 continue
-            if name in self._seen:
-                self._seen[name].update(pose, now_s)
+            if name in self._tracked:
+                self._tracked[name].update(pose, now_s)
             else:
-                self._seen[name] = Seen(pose, now_s)
-        self.missing = tuple(name for name, _ in poses if name not in self._seen)
-        self._others = [pose[0] for pose in map(view.body_pose, self._perhaps) if pose is not None]
+                self._tracked[name] = TrackedPose(pose, now_s)
+        self.missing = tuple(name for name, _ in poses if name not in self._tracked)
+        self._others = [pose[0] for pose in map(view.body_pose, self._optional) if pose is not None]
 
     @property
-    def ready(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether everything was seen."""
         return not self.missing
 
-    def others(self) -> list[Vec3]:
+    def list_obstacles(self) -> list[Vec3]:
         """Where those of `perhaps` are [m] that are there."""
         return self._others
 
-    def body(self, name: str) -> PoseTuple:
-        return self._seen[name].pose
+    def get_body(self, name: str) -> PoseTuple:
+        return self._tracked[name].pose
 
-    def tip(self, robot: str) -> PoseTuple:
-        return self._seen[f"tip {robot}"].pose
+    def get_tip(self, robot: str) -> PoseTuple:
+        return self._tracked[f"tip {robot}"].pose
 
-    def base(self, robot: str) -> PoseTuple:
-        return self._seen[f"{robot}/{self._arm.base}"].pose
+    def get_base(self, robot: str) -> PoseTuple:
+        return self._tracked[f"{robot}/{self._arm.base}"].pose
 
-    def still_s(self, name: str) -> float:
+    def get_still_s(self, name: str) -> float:
         """For how long [s] the body `name` has kept still."""
-        return self._seen[name].still_s
+        return self._tracked[name].still_s
 
-    def pads(self, robot: str) -> tuple[Vec3, Vec3]:
+    def compute_pads(self, robot: str) -> tuple[Vec3, Vec3]:
         """Where the faces of the two finger pads are [m], world frame."""
-        one, other = (self._seen[f"{robot}/{finger}"].pose for finger in self._arm.fingers)
+        one, other = (self._tracked[f"{robot}/{finger}"].pose for finger in self._arm.fingers)
         return apply(one, self._arm.pads[0]), apply(other, self._arm.pads[1])
 
-    def gap(self, robot: str) -> float:
+    def compute_gap(self, robot: str) -> float:
         """Distance between the finger pads [m]."""
-        return distance(*self.pads(robot))
+        return distance(*self.compute_pads(robot))
 
-    def holds(self, robot: str, name: str, half_width: float) -> bool:
+    def is_holding(self, robot: str, name: str, half_width: float) -> bool:
         """Whether the pads of `robot` lie on the two sides of `name` (half width [m] along its y), closed on it."""
-        (px, py, pz), q = self.body(name)
+        (px, py, pz), q = self.get_body(name)
         inverse_q = quat_conj(q)
-        local = [apply(((0.0, 0.0, 0.0), inverse_q), (p[0] - px, p[1] - py, p[2] - pz)) for p in self.pads(robot)]
+        local = [
+            apply(((0.0, 0.0, 0.0), inverse_q), (p[0] - px, p[1] - py, p[2] - pz)) for p in self.compute_pads(robot)
+        ]
         low, high = sorted(p[1] for p in local)
         on_both_sides = abs(low + half_width) < 0.006 and abs(high - half_width) < 0.006
         along = all(abs(p[0]) < 0.15 and abs(p[2]) < 0.02 for p in local)
