@@ -13,8 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from iris_session.client import ClientError
-from iris_session.client.joining import wanted
-from iris_session.client.meeting import Wanted, settle
+from iris_session.client.endpoint_resolver import ConnectRequest, parse_connect_request, resolve_blocking
 from iris_session.emulator.operator import load_curve_keys, make_spec_behaviour
 from iris_session.emulator.runner import JOIN_TIMEOUT_S, DisturbanceReader, run_headsets
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
@@ -29,7 +28,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     options = _build_parser().parse_args(argv)
     try:
         specs = _parse_specs(options)
-        sought = wanted(options.address, options.session, None, options.code)
+        sought = parse_connect_request(options.address, options.session, None, options.code)
         for spec in specs:
             make_spec_behaviour(spec, spec.robot)
             load_curve_keys(spec)
@@ -39,7 +38,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
     try:
         if sought.address is None or sought.join_code or sought.address.join_code:
             # Everybody here has the key of this user: it is paired once, not by each of them.
-            sought = Wanted(settle(sought, options.join_timeout).address)
+            sought = ConnectRequest(resolve_blocking(sought, options.join_timeout).address)
     except ClientError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 1

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_yaw
-from iris_session.client import Client, CurveKeys, PoseBuffer, SceneState, Shown
+from iris_session.client import Client, CurveKeys, PoseBuffer, SceneState, ShownPoses
+from iris_session.client.core.scene_follower import pose_at
 from iris_session.client.deformables import Deformables
-from iris_session.client.scene_view import pose_at
 from iris_session.emulator.behaviours import Behaviour, CombinedBehaviour, HandInput, make_behaviour
 from iris_session.emulator.gaze import Gaze, interpolate_pose
 from iris_session.emulator.headset import EmulatedHeadset
@@ -122,7 +122,7 @@ class EmulatedOperator:
         """One round of the loop, after `client.poll`."""
         self._now_ns = now_ns
         if self.display.wants_vertices:
-            for name in self._deformables.tend():
+            for name in self._deformables.update():
                 shapes = self._deformables
                 self.display.add_vertices(name, shapes.vertices[name], shapes.capture_ns[name])
         for samples, seen in self._uplink.pop(now_ns):
@@ -408,7 +408,7 @@ class HeadsetDisplay:
         #: A behaviour has asked for a vertex: somebody must tell where they are.
         self.wants_vertices = False
         self._epoch = 0
-        self._shown: Shown | None = None
+        self._shown: ShownPoses | None = None
         self._now_ns = 0
 
     def add_state(self, state: SceneState) -> None:
@@ -427,7 +427,7 @@ class HeadsetDisplay:
     def refresh(self, session_ns: int) -> None:
         """The next picture."""
         self._now_ns = max(self._now_ns, session_ns)
-        self._shown = self.buffer.show(self._now_ns)
+        self._shown = self.buffer.poses_at(self._now_ns)
 
     @property
     def ready(self) -> bool:

@@ -88,7 +88,7 @@ def _fail_late_joins(people: Sequence[EmulatedOperator], timeout_s: float, now_n
     for person in people:
         waited_s = (now_ns - person.started_ns) * 1e-9
         if person.report.phase == "join" and waited_s >= timeout_s:
-            text = person.client.why_not_in(f"within {waited_s:.1f} s")
+            text = person.client.describe_failure(f"within {waited_s:.1f} s")
             person.fail(f"no session let us in at {text}", now_ns)
 
 

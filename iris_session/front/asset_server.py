@@ -7,10 +7,9 @@ It makes pauses instead, whenever the front's loop is late.
 
 from __future__ import annotations
 
-import sys
+import logging
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -28,6 +27,8 @@ from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
 from iris_session.security import KeyPair, compute_fingerprint
 from iris_session.security.zap import ZAP_ENDPOINT, answer_zap_requests, is_curve_request
 from iris_session.system.priority import run_at_low_priority
+
+log = logging.getLogger(__name__)
 
 IDLE_MS: Final = 50
 #: Requests taken, and chunks sent, before the rest is looked at.
@@ -152,8 +153,7 @@ class AssetServer:
         self._count_reasons(["assets_fault"])
         if repr(error) != self._reported_fault:
             self._reported_fault = repr(error)
-            text = f"iris-session: a fault in the thread of assets, which goes on: {self._reported_fault}\n"
-            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+            log.error("fault in the thread of assets, which continues: %s", self._reported_fault, exc_info=error)
         time.sleep(FAULT_S)
 
     def _serve(self) -> None:

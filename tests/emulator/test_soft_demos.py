@@ -62,7 +62,7 @@ def test_nobody_knows_any_other_deformable(behaviour: type) -> None:
 def stower(monkeypatch: pytest.MonkeyPatch) -> Stower:
     """Its hand and the box are at the origin, and the fingers 3 cm apart; where the body is, a test says."""
     made = Stower("left", "rose")
-    for name, value in {"tip": IDENTITY_POSE, "body": IDENTITY_POSE, "gap": 0.03}.items():
+    for name, value in {"get_tip": IDENTITY_POSE, "get_body": IDENTITY_POSE, "compute_gap": 0.03}.items():
         monkeypatch.setattr(made.perception, name, lambda _, value=value: value)
     return made
 
