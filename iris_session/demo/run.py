@@ -222,7 +222,7 @@ class _GoalTracker:
         now_s, reached = world.view().sim_time, False
         for watch in self._monitors:
             name = watch.goal.deformable
-            reached |= watch.update(now_s, world.flexes.vertices(name), world.flexes.touching(name))
+            reached |= watch.update(now_s, world.flexes.read_vertices(name), world.flexes.find_touching_robots(name))
         if reached and all(watch.at_s is not None for watch in self._monitors):
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
 
