@@ -60,5 +60,5 @@ ARM_KINDS: Final[dict[str, ArmKind]] = {"arm": ARM, "iiwa": IIWA, "viperx": VIPE
 def get_arm_kind(name: str) -> ArmKind:
     """Return the arm model of that name. Raises `ValueError` listing the kinds."""
     if name not in ARM_KINDS:
-        raise ValueError(f"no operator knows the arm '{name}'. Known arms: {', '.join(ARM_KINDS)}")
+        raise ValueError(f"unknown arm '{name}'. Known arms: {', '.join(ARM_KINDS)}")
     return ARM_KINDS[name]
