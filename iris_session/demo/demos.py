@@ -1,8 +1,8 @@
-"""What is played in the demos: for each a scene, where its sheet lies, and who does what. Nothing runs here.
+"""The demos: for each its scene, the pose of its sheet, and its cast of emulated operators. Nothing runs here.
 
-`handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; always there.
-`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two people with two arms each. `cloth`: two people
-fold a cloth. `soft`: two people stow a soft body each.
+`handover`: two arms drawn from primitives and a hammer, or up to eight around a round table; needs no data.
+`iiwa`: the same with KUKA iiwa 14 arms. `aloha`: two ALOHA stations, two operators with two arms each. `cloth`: two
+operators fold a cloth. `soft`: two operators stow a soft body each.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ MAX_OPERATORS: Final = 8
 MAX_OBSERVERS: Final = 16
 #: In the order in which they join.
 NAMES: Final = ("ann", "bob", "cem", "dia", "eli", "fay", "gus", "hoa")
-#: A person sits so far behind his arm, and his eyes are so far above the table [m].
+#: Distance of an operator behind the arm, and height of the eyes above the table [m].
 _BEHIND, _EYES = 0.45, 0.55
 
 
 @dataclass(frozen=True)
 class Demo:
-    """A demo ready to run. `objects`: what must change hands. `goals`: what must be reached with deformables. `notes`:
-    what a reader should know about the cast."""
+    """A demo ready to run. `objects`: objects that must be handed over. `goals`: goals for deformables. `notes`:
+    remarks
+    about the cast for the reader of the result."""
 
     name: str
     model: mujoco.MjModel
@@ -58,7 +59,7 @@ class Demo:
 
 
 def make_demo(name: str, operators: int = 2, observers: int = 0, seed: int = 0) -> Demo:
-    """The demo `name`. Raises `ConfigError` for people that it cannot use, `ModelNotFoundError` without its models."""
+    """Return the demo `name`. Raises `ConfigError` for an unusable cast, `ModelNotFoundError` without its models."""
     if name not in DEMOS:
         raise ConfigError(f"there is no demo '{name}': {', '.join(DEMOS)}")
     if not 0 <= observers <= MAX_OBSERVERS:
@@ -93,14 +94,14 @@ def _make_iiwa(operators: int, seed: int) -> Demo:
 
 
 def _make_without_cast(name: str, scene: NamedScene, objects: tuple[str, ...]) -> Demo:
-    """Without its cast."""
+    """Return a demo without its cast."""
     return Demo(name, scene.model, scene.anchors, (), objects, anchor_sizes=scene.anchor_sizes)
 
 
 def _check_operators(demo: str, operators: int) -> None:
     if not 2 <= operators <= MAX_OPERATORS:
         raise ConfigError(
-            f"demo {demo} takes 2 to {MAX_OPERATORS} operators, not {operators}: each has an arm of his own, and it "
+            f"demo {demo} takes 2 to {MAX_OPERATORS} operators, not {operators}: each has an arm, and it "
             "takes two to hand something over"
         )
 
@@ -110,8 +111,8 @@ def _list_objects(operators: int) -> tuple[str, ...]:
 
 
 def _cast_around_table(play: Demo, operators: int, radius: float, arm: str, seed: int) -> Demo:
-    """Casts neighbours as pairs: the first gives to the second, the third to the fourth. Who is left over has no
-    partner."""
+    """Cast adjacent operators as pairs: the first gives to the second, the third to the fourth. With an odd number the
+    last one has no partner."""
     sheet = play.anchors[DEFAULT_ANCHOR_ID]
     robots = arm_names(operators)
     people = []
@@ -138,7 +139,7 @@ def _cast_around_table(play: Demo, operators: int, radius: float, arm: str, seed
 
 
 def _compute_seat(i: int, operators: int, radius: float, sheet: Vec3) -> Vec3:
-    """Two people stand side by side before the sheet, more of them behind their arms."""
+    """Return the eye position: two operators stand side by side before the sheet, more of them behind their arms."""
     if operators == 2:
         return (0.35 * (2 * i - 1), sheet[1] - 0.5, _EYES)
     bearing = compute_bearing(i, operators)
@@ -168,7 +169,7 @@ def _make_aloha(operators: int, seed: int) -> Demo:
             place=place,
         )
 
-    far, near = (0.015, 0.53), (-0.015, -0.53)  # where what was taken is laid: on the own table, out of the way
+    far, near = (0.015, 0.53), (-0.015, -0.53)  # where a receiver lays the board: on its own table, out of the way
     ann = (
         hand("south", "right", "giver", "red_board", "north/left", far),
         hand("south", "left", "receiver", "blue_board", "north/right", near),
@@ -184,7 +185,7 @@ def _make_aloha(operators: int, seed: int) -> Demo:
     return dataclasses.replace(play, headsets=people)
 
 
-# --- things that bend -------------------------------------------------------------------------------------------------
+# --- deformables ------------------------------------------------------------------------------------------------------
 
 
 def _make_cloth(operators: int, seed: int) -> Demo:
@@ -206,7 +207,7 @@ def _cast_at_table(
     behaviours: tuple[str, str],
     things: tuple[str, str],
 ) -> Demo:
-    """Two people side by side before the sheet, one arm each."""
+    """Cast two operators side by side before the sheet, one arm each."""
     if operators != 2:
         raise ConfigError(
             f"demo {name} has two arms at one table: 2 operators, not {operators}. For more people: "
@@ -241,7 +242,7 @@ DEMOS: Final[dict[str, Callable[[int, int], Demo]]] = {
 
 
 def _make_observer(i: int, count: int, sheet: PoseTuple, seed: int) -> HeadsetSpec:
-    """Somebody who only looks, 1.2 m from the sheet."""
+    """Return an observer 1.2 m from the sheet."""
     x, y, z = sheet[0]
     bearing = -0.5 * math.pi + 2.0 * math.pi * (i + 0.5) / count
     eye = (x + 1.2 * math.cos(bearing), y + 1.2 * math.sin(bearing), z + _EYES)

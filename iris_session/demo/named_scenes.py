@@ -1,6 +1,6 @@
-"""Scenes that are known by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
+"""Scenes by name: drawn from primitives, or built around models of real robots (from `IRIS_DATA`).
 
-Each comes with the place of its alignment sheet. Names like `arms4` say how many arms there are.
+Each comes with the pose of its alignment sheet. Names like `arms4` say how many arms there are.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ANCHOR_ID: Final = next(iter(DEFAULT_ANCHORS))
 
 @dataclass(frozen=True)
 class NamedScene:
-    """A model, and where its sheet lies: the default is for scenes that do not say."""
+    """A model and the poses of its sheets; the default is for scenes that do not specify one."""
 
     model: mujoco.MjModel
     anchors: Mapping[str, PoseTuple] = field(default_factory=lambda: DEFAULT_ANCHORS)
@@ -41,34 +41,34 @@ class NamedScene:
 
 
 def make_arms(n: int) -> NamedScene:
-    """`n` arms drawn from primitives around a round table."""
+    """Return `n` arms drawn from primitives around a round table."""
     spec = n_arms_scene(n)
     add_sheet(spec, get_sheet_position(n))
     return NamedScene(spec.compile(), _place_sheet(get_sheet_position(n)))
 
 
 def make_iiwa(n: int) -> NamedScene:
-    """`n` KUKA iiwa 14 arms around a round table."""
+    """Return `n` KUKA iiwa 14 arms around a round table."""
     return NamedScene(iiwa_scene(n).compile(), _place_sheet(get_sheet_position(n)))
 
 
 def make_aloha() -> NamedScene:
-    """Two ALOHA stations face to face."""
+    """Return two ALOHA stations face to face."""
     return NamedScene(aloha_scene().compile(), _place_sheet((0.0, 0.0, SHEET_Z)))
 
 
 def make_cloth() -> NamedScene:
-    """Two arms and a cloth between them."""
+    """Return two arms and a cloth between them."""
     return NamedScene(cloth_scene().compile(), _place_sheet(get_sheet_position(2)))
 
 
 def make_soft() -> NamedScene:
-    """Two arms, a soft body before each, and an open box."""
+    """Return two arms, a soft body before each, and an open box."""
     return NamedScene(soft_scene().compile(), _place_sheet(get_sheet_position(2)))
 
 
 def load_packaged(name: str) -> NamedScene:
-    """An MJCF file of the package."""
+    """Return a scene from an MJCF file of the package."""
     return NamedScene(load_model(scene_path(name)))
 
 
@@ -78,7 +78,7 @@ def _place_sheet(p_world: tuple[float, float, float]) -> dict[str, PoseTuple]:
 
 #: Endings of files in place of a name, for the error text; `serve` shows those that MuJoCo does not simulate.
 FILES: Final = ".xml, .mjcf, .mjb; to be shown: .urdf, .glb, .gltf, .stl, .obj, .ply, .off, .dae, .3mf"
-#: How the scenes of `SCENE_NAMES` are made.
+#: Constructors of the scenes of `SCENE_NAMES`.
 SCENES: Final[dict[str, Callable[[], NamedScene]]] = {
     "handover": lambda: load_packaged("handover"),
     "arm": lambda: load_packaged("arm"),
@@ -93,13 +93,16 @@ NUMBERED: Final[dict[str, Callable[[int], NamedScene]]] = {"arms": make_arms, "i
 
 
 def scene_by_name(name: str) -> NamedScene:
-    """Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot."""
+    """Return a scene by name.
+
+    Raises `ConfigError` that lists the names, `ModelNotFoundError` without the model of a real robot.
+    """
     if name in SCENES:
         return SCENES[name]()
     match = re.fullmatch(r"([a-z]+)([0-9]{1,3})", name)
     if match is None or match[1] not in NUMBERED:
         names = ", ".join(SCENE_NAMES)
-        raise ConfigError(f"no scene is called '{name}'. Scenes: {names}; or give a file ({FILES})")
+        raise ConfigError(f"unknown scene '{name}'; expected one of {names}, or a file ({FILES})")
     try:
         return NUMBERED[match[1]](int(match[2]))
     except ValueError as error:  # out of range

@@ -1,8 +1,8 @@
-"""Runs a demo: a session in this process, emulated people in others, and a result that says whether it worked.
+"""Run a demo: a session in this process, emulated operators in others, and a result with a verdict.
 
-It counts only if the session's own detector saw every object change hands by contact alone, if every goal with a
-deformable was reached (`goals`; told in the recording as the verdict of an episode), and if the recording verifies bit
-for bit. What is played is in `plays`.
+A run succeeds only if the session's own detector saw every handover by contact alone, if every goal with a deformable
+was reached (`goals`; recorded as the verdict of an episode), and if the recording verifies bit for bit. The demos
+themselves are in `demos`.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from iris_session.session.status import SessionStatus
 from iris_session.session.verification import verify_recording
 from iris_session.system.process import PIPE, ChildProcess
 
-#: How often the reports of the emulated people are read [ns].
+#: Period at which the reports of the emulated headsets are read [ns].
 READ_PERIOD_NS: Final = 100_000_000
-#: Until the session that the demo itself started lets its people in: a busy machine may take its time.
+#: Time to join the session that the demo itself started: a busy machine may be slow.
 JOIN_TIMEOUT_S: Final = 60.0
-#: So long a deformable may take to come to rest after everybody is done [s].
+#: Time for a deformable to come to rest after all operators are done [s].
 SETTLE_S: Final = 3.0
-#: People who work share a process in pairs, people who only look in fours.
+#: Operators per process, when there are more than two; observers per process.
 WORKERS_PER_PROCESS: Final = 2
 OBSERVERS_PER_PROCESS: Final = 4
 
 
 class EmulatorProcess:
-    """Emulated people in a process of their own. `poll()` reads what they report, without waiting."""
+    """Emulated headsets in a process of their own. `poll()` reads their reports without waiting."""
 
     def __init__(self, address: str, specs: Sequence[HeadsetSpec], seconds: float) -> None:
         options = ["--address", address, "--specs", "-", "--json", "--join-timeout", str(JOIN_TIMEOUT_S)]
@@ -61,7 +61,7 @@ class EmulatorProcess:
 
     @property
     def is_busy(self) -> bool:
-        """Whether somebody here has not yet come to the end of a task that has one."""
+        """True until every task that has an end is done or failed."""
         reports = [self.reports.get(name) for name in self._awaited]
         return any(r is None or not (r.done or r.failed) for r in reports)
 
@@ -70,13 +70,13 @@ class EmulatorProcess:
         return self._process.pid
 
     def poll(self) -> None:
-        """Takes over the newest report of each person."""
+        """Read the newest report of each headset."""
         for line in self._process.read_available_lines():
             report = msgspec.json.decode(_nan_for_null(line), type=HeadsetReport, strict=False)
             self.reports[report.name] = report
 
     def close(self) -> None:
-        """Ends the process if it still runs, and reads its last words. Can be called twice."""
+        """End the process if it still runs, and read its last reports. Can be called twice."""
         self._process.stop(terminate_s=5.0)
         self.poll()
         self._process.close()
@@ -89,7 +89,7 @@ def _nan_for_null(line: bytes) -> bytes:
 
 
 class GoalStatus(msgspec.Struct, frozen=True):
-    """What became of a goal: `at_s` of simulated time it was reached, `None` when it was not."""
+    """Outcome of a goal: simulated time `at_s` at which it was reached, `None` when it was not."""
 
     deformable: str
     goal: str
@@ -97,8 +97,9 @@ class GoalStatus(msgspec.Struct, frozen=True):
 
 
 class DemoResult(msgspec.Struct, frozen=True):
-    """What `demo NAME --json` prints. `alignment_mm`, by person: stated p95 and true error at the sheet; nobody who
-    never was aligned."""
+    """Result of a demo, as printed by `demo NAME --json`. `alignment_mm`: stated p95 and true error at the sheet, by
+    name
+    of the headset; without those that were never aligned."""
 
     ok: bool
     demo: str
@@ -127,9 +128,9 @@ def run_demo(
     profile: str = "",
     seed: int = 0,
 ) -> DemoResult:
-    """Runs `play` to its end. `on_session`: a context around the running session; gives what its loop calls always.
+    """Run `demo` to its end. `on_session`: a context around the running session that yields a function for every loop.
 
-    `profile`: every process of people joins over a bad link like this, with the weather of `seed`; empty: directly.
+    `profile`: each emulator process joins over an impaired link of this profile, with `seed`; empty: directly.
     """
     session = Session(
         demo.model, config=dataclasses.replace(config, anchors=demo.anchors, anchor_sizes=demo.anchor_sizes)
@@ -154,7 +155,7 @@ def run_demo(
             nonlocal next_read_ns, began_ns
             update()
             now_ns = session.clock()
-            began_ns = began_ns or now_ns  # making the loop ready is no part of its pace
+            began_ns = began_ns or now_ns  # preparing the loop is not part of its pace
             judge.update()
             if now_ns < next_read_ns:
                 return False
@@ -169,7 +170,7 @@ def run_demo(
         seconds = session.clock() * 1e-9
         recording = session.recording
     reports = people.reports
-    # Ctrl-C asks for an end now; `iris-session verify` has all the time it needs.
+    # Ctrl-C requests an immediate end; `iris-session verify` has all the time it needs.
     verified, verification = (None, "not verified: interrupted") if interrupted else _verify_recording(recording)
     problems = ["interrupted before its end"] if interrupted else _list_problems(demo, reports, status, timeout_s)
     if not interrupted:
@@ -202,7 +203,7 @@ def run_demo(
 
 
 class _GoalTracker:
-    """Follows the goals of a play, tick by tick, and has the verdict recorded as that of an episode."""
+    """Tracks the goals of a demo tick by tick, and records the verdict as that of an episode."""
 
     def __init__(self, play: Demo, session: Session) -> None:
         self._name = play.name
@@ -212,7 +213,7 @@ class _GoalTracker:
         self._finished_s: float | None = None
 
     def update(self) -> None:
-        """After every tick."""
+        """Process one tick."""
         if not self._monitors:
             return
         if not self._began:
@@ -227,7 +228,7 @@ class _GoalTracker:
             self._session.post(Episode(0, EpisodeAction.SUCCESS, self._name))
 
     def is_settled(self) -> bool:
-        """Asked when everybody is done: whether the goals are reached, or evidently will not be."""
+        """Return True, once all tasks are done, when the goals are reached or evidently will not be."""
         now_s = self._session.clock() * 1e-9
         self._finished_s = now_s if self._finished_s is None else self._finished_s
         return all(watch.at_s is not None for watch in self._monitors) or now_s - self._finished_s > SETTLE_S
@@ -239,16 +240,16 @@ class _GoalTracker:
         )
 
     def list_problems(self) -> list[str]:
-        """The goals that were not reached."""
+        """Return one line per goal that was not reached."""
         return [
-            f"the {w.goal.deformable} was not {w.goal.name}, let go and at rest"
+            f"the {w.goal.deformable} was not {w.goal.name}, released and at rest"
             for w in self._monitors
             if w.at_s is None
         ]
 
 
 def _group_by_process(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec]]:
-    """Who shares a process: nobody as long as two people work, else see `WORKERS_PER_PROCESS`."""
+    """Group headsets by process: one each for up to two operators, else `WORKERS_PER_PROCESS`."""
     workers = [spec for spec in specs if not spec.observer]
     observers = [spec for spec in specs if spec.observer]
     each = 1 if len(workers) <= 2 else WORKERS_PER_PROCESS
@@ -257,7 +258,7 @@ def _group_by_process(specs: Sequence[HeadsetSpec]) -> list[Sequence[HeadsetSpec
 
 
 class _EmulatorGroup:
-    """The emulated people of a demo, in processes of their own."""
+    """The emulated headsets of a demo, in their own processes."""
 
     def __init__(self, addresses: Sequence[str], groups: Sequence[Sequence[HeadsetSpec]], timeout_s: float) -> None:
         self._workers: list[EmulatorProcess] = []
@@ -280,11 +281,11 @@ class _EmulatorGroup:
 
     @property
     def reports(self) -> dict[str, HeadsetReport]:
-        """The newest report of everybody, by name."""
+        """The newest report of each headset, by name."""
         return {name: r for process in (*self._workers, *self._observers) for name, r in process.reports.items()}
 
     def is_finished(self) -> bool:
-        """Reads the reports; whether everybody whose task has an end has come to it."""
+        """Read the reports and return True when every task that has an end has ended."""
         for process in (*self._workers, *self._observers):
             process.poll()
         return not any(process.is_running and process.is_busy for process in self._workers)
@@ -295,7 +296,7 @@ class _EmulatorGroup:
 
 
 def _list_problems(play: Demo, reports: dict[str, HeadsetReport], status: SessionStatus, timeout_s: float) -> list[str]:
-    """Why this was no success; empty when it was one."""
+    """Return the reasons why the demo failed, empty after a success."""
     tasks = {spec.name: spec for spec in play.headsets}
     problems = [f"{name}: {report.failed}" for name, report in reports.items() if report.failed]
     problems += [

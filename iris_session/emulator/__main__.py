@@ -1,4 +1,5 @@
-"""`python -m iris_session.emulator`: emulated people from the command line, or driven by a parent with JSON lines."""
+"""`python -m iris_session.emulator`: emulated headsets from the command line, or with JSON lines for a parent
+process."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ LISTS: Final = frozenset({"eye", "gaze", "recentre_at_s", "bump_at_s", "bump_m"}
 
 
 def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
-    """Exit status 0 when nobody failed, 1 when somebody did, 2 for unusable input. Errors begin with `prog`."""
+    """Return exit status 0 when all succeeded, 1 when one failed, 2 for unusable input. Errors begin with `prog`."""
     options = _build_parser().parse_args(argv)
     try:
         specs = _parse_specs(options)
@@ -37,7 +38,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
         return 2
     try:
         if sought.address is None or sought.join_code or sought.address.join_code:
-            # Everybody here has the key of this user: it is paired once, not by each of them.
+            # All headsets here use the key of this user, which is paired once.
             sought = ConnectRequest(resolve_blocking(sought, options.join_timeout).address)
     except ClientError as error:
         print(f"{prog}: {error}", file=sys.stderr)
@@ -55,7 +56,7 @@ def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
             say(report, final=True)
             if report.failed:
                 print(f"{prog}: {report.name}: {report.failed}", file=sys.stderr)
-    except BrokenPipeError:  # whoever started us is gone
+    except BrokenPipeError:  # the parent process has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return int(any(report.failed for report in reports))
@@ -66,14 +67,16 @@ def _build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--address", default="", help="control channel of the session, HOST:PORT, or an iris:// URI")
     parser.add_argument("--session", default="", metavar="NAME", help="find the session of that name on the network")
     parser.add_argument("--code", default="", metavar="CODE", help="join code, the first time at a session")
-    parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one person, see specs")
+    parser.add_argument(
+        "--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset, see specs"
+    )
     parser.add_argument("--specs", default="", metavar="FILE", help="JSON list of HeadsetSpec, - for standard input")
     parser.add_argument("--seconds", type=float, default=None, help="at most this long")
     parser.add_argument(
-        "--join-timeout", type=float, default=JOIN_TIMEOUT_S, metavar="S", help="give up when no session lets us in"
+        "--join-timeout", type=float, default=JOIN_TIMEOUT_S, metavar="S", help="fail when not joined after this time"
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key")
-    parser.add_argument("--curve-key", default="", metavar="FILE", help="our own CURVE secret key, of everybody here")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="own CURVE secret key, for all headsets here")
     parser.add_argument("--orders", action="store_true", help="take orders from standard input, such as: bump NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line on standard output")
     return parser
@@ -101,7 +104,7 @@ def _parse_specs(options: argparse.Namespace) -> list[HeadsetSpec]:
 
 
 def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
-    """`model.drift_m_per_min` is a field of a field."""
+    """Nest dotted keys: `model.drift_m_per_min` is a field of the field `model`."""
     nested: dict[str, Any] = {}
     for key, value in pairs.items():
         *path, name = key.split(".")
@@ -116,12 +119,12 @@ def _nest_fields(pairs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_fields(pairs: Mapping[str, Any], kind: type[msgspec.Struct], path: str = "") -> None:
-    """Raises `ValueError` that lists the fields there are, also those of a field."""
+    """Raise `ValueError` for an unknown field, listing the known ones, also in nested structs."""
     fields = {field.name: field.type for field in msgspec.structs.fields(kind)}
     for name, value in pairs.items():
         if name not in fields:
             known = ", ".join(f"{path}{one}" for one in sorted(fields))
-            raise ValueError(f"--headset: there is no field '{path}{name}'; fields: {known}")
+            raise ValueError(f"--headset: unknown field '{path}{name}'; fields: {known}")
         inner = fields[name]
         whole = not (isinstance(inner, type) and issubclass(inner, msgspec.Struct))
         if whole and isinstance(value, Mapping):
@@ -151,7 +154,7 @@ def _print_line(report: HeadsetReport, *, final: bool = False) -> None:
 
 
 def _format_value(value: float, unit: str) -> str:
-    """Before there is state or an alignment: not a number."""
+    """Format a value, `-` while it is not a number (before the first state or alignment)."""
     return "-" if math.isnan(value) else f"{value:.1f} {unit}"
 
 

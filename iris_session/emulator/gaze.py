@@ -1,6 +1,6 @@
-"""Where the head of an emulated person is and what it looks at: around the sheet, at the work, and glances in between.
+"""Head motion of an emulated operator: around the sheet, towards the work, and glances in between.
 
-The cameras detect a sheet only while the head keeps still: every place where it comes to rest is a viewpoint.
+The cameras detect a sheet only while the head is at rest: every resting pose is a viewpoint.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MOVE_S: Final = 0.6  # the head moves from one place to the next, at about 1 m/s
 
 
 class Gaze:
-    """One head. `pose`: `T_world_head`. `viewpoint_id`: of the place it is at, or on its way to."""
+    """Pose of one head over time. `pose`: `T_world_head`. `viewpoint_id`: of the pose that it has or moves to."""
 
     def __init__(self, spec: HeadsetSpec) -> None:
         self._spec = spec
@@ -29,16 +29,16 @@ class Gaze:
         self._glance_ns: int | None = None  # when the next one begins, or the present one began
 
     def move_to_viewpoint(self, index: int, now_ns: int) -> None:
-        """To the `index`-th place around the sheet."""
+        """Move to the `index`-th viewpoint around the sheet."""
         self._move(compute_viewpoint_pose(self._spec, index), now_ns)
 
     def look_at_sheet(self, now_ns: int) -> None:
-        """At the seat, looking at the sheet."""
+        """Move to the seat, facing the sheet."""
         self._glance_ns = None
         self._move(self._seat, now_ns)
 
     def look_at_work(self, now_ns: int) -> None:
-        """At the seat, looking at the work; from time to time at the sheet, from another side every time."""
+        """Move to the seat, facing the work; now and then glance at the sheet, from another viewpoint each time."""
         spec = self._spec
         every_ns, glance_ns = int(spec.glance_every_s * 1e9), int((MOVE_S + spec.glance_s) * 1e9)
         if self._glance_ns is None:
@@ -53,11 +53,11 @@ class Gaze:
             self._move(self._at_work, now_ns)
 
     def is_still(self, now_ns: int) -> bool:
-        """Whether the head has come to rest."""
+        """Return True when the head has come to rest."""
         return now_ns - self._moved_ns >= MOVE_S * 1e9
 
     def _move(self, to: PoseTuple, now_ns: int) -> None:
-        """Moves the head towards a pose, within `MOVE_S` of first being asked to."""
+        """Move the head towards a pose, which it reaches `MOVE_S` after the first call."""
         if to != self._to:
             self._from, self._to, self._moved_ns = self.pose, to, now_ns
             self.viewpoint_id += 1
@@ -66,7 +66,7 @@ class Gaze:
 
 
 def interpolate_pose(a: PoseTuple, b: PoseTuple, fraction: float) -> PoseTuple:
-    """The pose at `fraction` of the way from `a` to `b`: straight line and shortest turn."""
+    """Return the pose at `fraction` of the way from `a` to `b`: straight line and shortest turn."""
     r = quat_to_rotvec(quat_mul(quat_conj(a[1]), b[1]))
     turn = quat_from_rotvec((fraction * r[0], fraction * r[1], fraction * r[2]))
     p, q = a[0], b[0]
@@ -77,7 +77,7 @@ def interpolate_pose(a: PoseTuple, b: PoseTuple, fraction: float) -> PoseTuple:
 
 
 def compute_viewpoint_pose(spec: HeadsetSpec, index: int) -> PoseTuple:
-    """Where the head goes for the `index`-th look: 0.4 to 0.6 m from the sheet, spread +-50 deg about the seat."""
+    """Return the head pose of the `index`-th viewpoint: 0.4 to 0.6 m from the sheet, spread +-50 deg about the seat."""
     x, y, z = spec.T_world_anchor[0]
     seat = math.atan2(spec.eye[1] - y, spec.eye[0] - x)
     share = 0.5 if spec.viewpoints == 1 else index / (spec.viewpoints - 1)

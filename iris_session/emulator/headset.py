@@ -1,6 +1,6 @@
-"""An emulated XR headset: its own tracking frame, what its cameras make of a printed sheet, and how it samples.
+"""An emulated XR headset: its own tracking frame, its detections of a printed sheet, and its sampling.
 
-It knows the physical truth (`T_world_...`) and gives only what a real headset would: poses in its tracking frame, with
+It knows the true poses (`T_world_...`) and reports only what a real headset would: poses in its tracking frame, with
 noise. Random numbers come from one seeded generator, time is passed in: the same calls give the same readings.
 
 Frames: world as in the session (Z up). A head pose has X forward, Y left, Z up. The anchor frame lies in the sheet,
@@ -33,7 +33,7 @@ from anchors.pose import (
 from iris_session.emulator.sheet_noise import SheetNoise, mix_viewpoint_noise
 from iris_session.netsim.latency import LinkModel
 
-#: Where the sheet lies in the demo scene: on the table in front of the people, facing up (body `sheet`).
+#: Pose of the sheet in the demo scene: on the table in front of the operators, facing up (body `sheet`).
 DEFAULT_T_WORLD_ANCHOR: Final[PoseTuple] = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
 DEFAULT_ANCHOR_ID: Final = "table"
 DEFAULT_SHEET_M: Final = 0.16
@@ -41,7 +41,7 @@ MAX_VIEWPOINTS: Final = 256  # viewpoints whose systematic error is remembered
 
 
 class HeadsetModel(msgspec.Struct, frozen=True):
-    """What kind of headset it is. The defaults are a good standalone headset of 2024.
+    """Properties of a headset model. The defaults are those of a good standalone headset of 2024.
 
     `sheet`: the noise that docs/anchors.md fixes. Tracking noise and drift: our assumption for inside-out tracking in a
     textured room.
@@ -69,7 +69,7 @@ class EmulatedHeadset:
         self.rng = np.random.default_rng(seed)
         self.tracking_epoch = 0
         self.worn = True
-        self.late_samples = 0  # sampling instants that were passed over because nobody asked in time
+        self.late_samples = 0  # sampling instants that were missed because the loop was late
         self._T_world_tracking0: PoseTuple = IDENTITY_POSE
         self._drift: Vec3 = (0.0, 0.0, 0.0)  # m/min, world
         self._biases: dict[tuple[int, int], Array] = {}
@@ -82,7 +82,7 @@ class EmulatedHeadset:
     # --- tracking frame -----------------------------------------------------------------------------------------------
 
     def get_T_world_tracking(self, now_ns: int) -> PoseTuple:
-        """The truth, drift included; only judges of the alignment may look at it."""
+        """Return the true pose, drift included. Only for measuring alignment errors."""
         minutes = (now_ns - self._epoch_ns) / 60e9
         (x, y, z), q = self._T_world_tracking0
         dx, dy, dz = self._drift
@@ -90,14 +90,15 @@ class EmulatedHeadset:
         return ((x + dx * minutes, y + dy * minutes, z + dz * minutes), quat_mul(yaw, q))
 
     def recentre_frame(self, now_ns: int) -> None:
-        """The user recentred, or tracking was lost and found: another tracking frame, a new tracking epoch."""
+        """Start another tracking frame and epoch, as after recentring or after tracking was lost."""
         self.tracking_epoch += 1
         self._biases.clear()
         self._start_frame(now_ns)
 
     def bump_frame(self, shift_m: Vec3, yaw_rad: float, p_world: Vec3, now_ns: int) -> PoseTuple:
-        """The tracking frame jumps, and the headset does not notice: by `shift_m` (world), turned about the vertical
-        through `p_world`. Returns `T_new_old`: what was tracked at x is tracked at `T_new_old * x` from now on."""
+        """Move the tracking frame without a new epoch, as the headset does not detect it: by `shift_m` (world), turned
+        about the vertical
+        through `p_world`. Returns `T_new_old`: a pose x in the old frame is `T_new_old * x` in the new one."""
         old = self.get_T_world_tracking(now_ns)
         turn = quat_from_yaw(yaw_rad)
         arm = quat_rotate(turn, (old[0][0] - p_world[0], old[0][1] - p_world[1], old[0][2] - p_world[2]))
@@ -107,18 +108,18 @@ class EmulatedHeadset:
         return compose(inverse(self._T_world_tracking0), old)
 
     def start_drift(self, m_per_min: float, now_ns: int) -> None:
-        """From now on the tracking frame drifts at this speed, in the direction that is its own."""
+        """Let the tracking frame drift at this speed from now on, in its own direction."""
         self._T_world_tracking0 = self.get_T_world_tracking(now_ns)
         self._epoch_ns = now_ns
         x, y, z = self._way
         self._drift = (m_per_min * x, m_per_min * y, m_per_min * z)
 
     def track(self, T_world_device: PoseTuple, now_ns: int) -> PoseTuple:
-        """`T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
+        """Return `T_tracking_device` as the headset reports a device that truly is at `T_world_device`."""
         return self.add_noise(compose(inverse(self.get_T_world_tracking(now_ns)), T_world_device))
 
     def add_noise(self, T_tracking_device: PoseTuple) -> PoseTuple:
-        """A tracked pose with the noise of one reading."""
+        """Return a tracked pose with the noise of one reading."""
         p, q = T_tracking_device
         noise = self._draw_normals(6)
         s, r = self.model.position_sigma_m, self.model.rotation_sigma_rad
@@ -128,7 +129,7 @@ class EmulatedHeadset:
     # --- sampling -----------------------------------------------------------------------------------------------------
 
     def is_sample_due(self, now_ns: int) -> bool:
-        """True once for every sampling instant that has passed; those missed are counted, not made up for."""
+        """Return True once per passed sampling instant. Missed ones are counted, not made up for."""
         if now_ns < self._next_sample_ns:
             return False
         missed = (now_ns - self._next_sample_ns) // self._period_ns
@@ -141,7 +142,7 @@ class EmulatedHeadset:
         return self._next_sample_ns
 
     def is_detection_due(self, now_ns: int) -> bool:
-        """True when the detector has a new camera image to look at."""
+        """Return True when the detector has a new camera image."""
         if now_ns < self._next_detection_ns:
             return False
         self._next_detection_ns = max(self._next_detection_ns + self._detect_ns, now_ns)
@@ -150,7 +151,7 @@ class EmulatedHeadset:
     # --- the sheet ----------------------------------------------------------------------------------------------------
 
     def can_see(self, T_world_head: PoseTuple, T_world_anchor: PoseTuple) -> bool:
-        """Whether the sheet is in the field of view, near enough, and not seen too much from the side."""
+        """Return True if the sheet is in the field of view, near enough, and not too oblique."""
         d = distance(T_world_head[0], T_world_anchor[0])
         if not 0.05 < d <= self.model.max_distance_m:
             return False
@@ -163,7 +164,7 @@ class EmulatedHeadset:
     def observe(
         self, T_world_head: PoseTuple, T_world_anchor: PoseTuple, now_ns: int, viewpoint_id: int
     ) -> PoseTuple | None:
-        """`T_tracking_anchor` as detected from here, `None` when the sheet is not seen."""
+        """Return `T_tracking_anchor` as detected from here, `None` when the sheet is not visible."""
         if not self.can_see(T_world_head, T_world_anchor):
             return None
         noise, view = self.model.sheet, _direction(T_world_head[0], T_world_anchor[0])
@@ -180,12 +181,12 @@ class EmulatedHeadset:
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _start_frame(self, now_ns: int) -> None:
-        """A tracking frame somewhere within 3 m, any yaw, a little tilted, drifting in its own direction."""
+        """Start a random tracking frame: within 3 m, any yaw, slightly tilted, drifting in a random direction."""
         tilt = self._draw_normals(2)
         level = quat_from_yaw(self.rng.uniform(-math.pi, math.pi))
         tilted = quat_from_rotvec((self.model.tilt_sigma_rad * tilt[0], self.model.tilt_sigma_rad * tilt[1], 0.0))
         x, y = self.rng.uniform(-3.0, 3.0, 2).tolist()
-        z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, as the run time likes
+        z = float(self.rng.uniform(-1.0, 0.2))  # floor or eye level, which differs between runtimes
         self._T_world_tracking0 = ((x, y, z), quat_mul(tilted, level))
         way = self._draw_normals(3)
         length = max(1e-9, math.hypot(*way))
@@ -195,7 +196,8 @@ class EmulatedHeadset:
         self.start_drift(self.model.drift_m_per_min, now_ns)
 
     def _draw_sheet_units(self, viewpoint_id: int) -> tuple[Array, float]:
-        """Six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of scale."""
+        """Return six unit normals, half of whose variance is that of the viewpoint, and the viewpoint's error of
+        scale."""
         key = (self.tracking_epoch, viewpoint_id)
         if key not in self._biases:
             if len(self._biases) >= MAX_VIEWPOINTS:
@@ -209,7 +211,7 @@ class EmulatedHeadset:
 
 
 def compute_look_at(eye: Vec3, target: Vec3) -> PoseTuple:
-    """Head pose at `eye` with X towards `target` and no roll. They must not be one above the other."""
+    """Return the head pose at `eye` with X towards `target` and no roll. They must not be one above the other."""
     x = _direction(eye, target)
     yaw = math.atan2(x[1], x[0])
     pitch = math.atan2(-x[2], math.hypot(x[0], x[1]))
@@ -231,7 +233,7 @@ def _cross(a: Vec3, b: Vec3) -> Vec3:
 
 
 def _compute_perpendiculars(e1: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors across `e1`."""
+    """Return two unit vectors perpendicular to `e1`."""
     helper: Vec3 = (0.0, 0.0, 1.0) if abs(e1[2]) < 0.9 else (1.0, 0.0, 0.0)
     c = _cross(e1, helper)
     n = math.sqrt(_dot(c, c))

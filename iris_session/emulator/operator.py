@@ -1,4 +1,4 @@
-"""One emulated person: a client, a headset, and a behaviour. Joins, looks at the sheet, takes a robot, works.
+"""An emulated operator or observer: a client, a headset and a behaviour. Joins, aligns, acquires robots, works.
 
     join --> look --> acquire --> work --> done          any --> failed (`report.failed` says why)
              ^-- the alignment is void or in doubt --'
@@ -43,25 +43,25 @@ from iris_session.protocol.server_messages import AlignmentAlarmed, AlignmentRun
 
 #: Hand at rest, in a frame at the eye that is level and looks where the head looks [m]: right, low, in front.
 HAND_AT_REST: Final[Vec3] = (0.40, -0.15, -0.30)
-REACT_S: Final = 0.5  # a hand that is suddenly shown elsewhere is brought back to where it should be
-ROUNDS: Final = 2  # about the sheet after an alarm; then what is in force evidently stands
+REACT_S: Final = 0.5  # time to correct a hand that is suddenly shown elsewhere
+ROUNDS: Final = 2  # around the sheet after an alarm; then the alignment in force is accepted
 SETTLE_S: Final = 0.6  # after the last observation, for the estimate to arrive
 AGES_KEPT: Final = 4_000  # a minute of frames
 RETRY_S: Final = 1.0
 
-#: Denials that no waiting mends.
+#: Denials that waiting does not change.
 FOR_GOOD: Final = frozenset({DenialReason.UNKNOWN_TARGET, DenialReason.ROLE, DenialReason.UNKNOWN_VALUE})
 
 
 class EmulatedOperator:
-    """See the module docstring. `report` is kept up to date."""
+    """One emulated operator or observer; see the module docstring. `report` is kept up to date."""
 
     def __init__(self, address: str, spec: HeadsetSpec, start_ns: int) -> None:
         self.spec = spec
         self.report = HeadsetReport(name=spec.name, rejected={}, phases={})
         self.headset = EmulatedHeadset(spec.model, spec.seed, start_ns)
         self.observer = spec.observer
-        #: What this person drives; empty until the session's policy has chosen, when the spec names none.
+        #: The robots to drive; empty until the session's policy has chosen, when the spec names none.
         self.robots = tuple(task.robot for task in spec.tasks if task.robot)
         self.behaviour = make_spec_behaviour(spec, spec.robot)
         hands = tuple(task.device for task in spec.tasks)
@@ -78,7 +78,7 @@ class EmulatedOperator:
         )
         self.display = HeadsetDisplay(self.client, spec.display_delay_s)
         self._deformables = Deformables(self.client)
-        #: What is on its way, and what was sampled and seen in the frame that is being taken: they travel together.
+        #: Samples and observations in flight, and those of the present frame, which are sent together.
         self._uplink: DelayLine[tuple[tuple[Sample, ...], Observation | None]]
         self._uplink = DelayLine(spec.model.link, self.headset.rng)
         self._frame: list[Sample] = []
@@ -91,9 +91,9 @@ class EmulatedOperator:
         self._detections_here = 0
         self._observed_ns = 0
         self._rounds = 0
-        self._must_realign = False  # somebody said so
-        self._doubted_version = -1  # version of the alignment that is to be measured anew
-        self._slip: tuple[PoseTuple, int] = (IDENTITY_POSE, 0)  # what a bump did to tracked hands, and when
+        self._must_realign = False
+        self._doubted_version = -1  # version of the alignment that must be measured again
+        self._slip: tuple[PoseTuple, int] = (IDENTITY_POSE, 0)  # displacement of tracked hands by a bump, and its time
         self._request: tuple[int, int] | None = None
         self._retry_ns = 0
         self._refused_because = ""
@@ -114,12 +114,12 @@ class EmulatedOperator:
 
     @property
     def next_step_ns(self) -> int:
-        """When `step` has something to do at the latest."""
+        """Latest time of the next call of `step`."""
         arrival = self._uplink.next_arrival_ns
         return self.headset.next_sample_ns if arrival is None else min(arrival, self.headset.next_sample_ns)
 
     def step(self, now_ns: int) -> None:
-        """One round of the loop, after `client.poll`."""
+        """Run one round of the loop, after `client.poll`."""
         self._now_ns = now_ns
         if self.display.wants_vertices:
             for name in self._deformables.update():
@@ -143,13 +143,12 @@ class EmulatedOperator:
             self.fail(f"{self.report.phase} took too long: {self._refused_because or 'no answer'}", now_ns)
 
     def fail(self, why: str, now_ns: int) -> None:
-        """Gives up."""
+        """End with a failure."""
         self.report.failed = why
         self._enter("failed", now_ns)
 
     def disturb_tracking(self, kind: str, now_ns: int) -> None:
-        """The tracking frame jumps: `recentre`, or `bump`, which the headset does not notice. Or it begins to `drift`,
-        until `steady`."""
+        """Disturb the tracking frame: `recentre`, `bump` (undetected by the headset), or `drift` until `steady`."""
         if kind == "recentre":
             self.headset.recentre_frame(now_ns)
             self.client.new_tracking_frame()
@@ -163,7 +162,7 @@ class EmulatedOperator:
         self.report.disturbed_ns[kind] = self.client.session_now_ns()
 
     def finish_report(self) -> HeadsetReport:
-        """Fills in what is computed at the end."""
+        """Fill in the fields that are computed at the end, and return the report."""
         report, client = self.report, self.client
         self._update_errors(self._now_ns)
         ages = sorted(self._ages_ms)
@@ -200,7 +199,7 @@ class EmulatedOperator:
         self._frame.clear()
 
     def _detect(self, now_ns: int) -> Observation | None:
-        """What the cameras make of the sheet, when it is in view."""
+        """Return a detection of the sheet when it is visible."""
         spec, headset = self.spec, self.headset
         if not (headset.worn and self.gaze.is_still(now_ns) and headset.is_detection_due(now_ns)):
             return None
@@ -244,7 +243,8 @@ class EmulatedOperator:
             self._send_hand(rest, alignment, now_ns)
 
     def _send_hand(self, hand: HandInput, alignment: Alignment, now_ns: int) -> None:
-        """The person puts the hand where the display shows it, so the displayed world decides what is tracked."""
+        """Sample a hand. The operator positions it in the displayed world, so the alignment decides the tracked
+        pose."""
         T_world_tracking: PoseTuple = (alignment.T_world_tracking.p, alignment.T_world_tracking.q)
         pose = self.headset.add_noise(self._apply_slip(compose(inverse(T_world_tracking), hand.pose_world), now_ns))
         self._append_sample(
@@ -256,7 +256,7 @@ class EmulatedOperator:
         )
 
     def _apply_slip(self, T_tracking_hand: PoseTuple, now_ns: int) -> PoseTuple:
-        """After a bump the hand is tracked, and shown, elsewhere, until the person has brought it back."""
+        """Displace the hand after a bump, decreasing until the operator has corrected it."""
         T_new_old, since_ns = self._slip
         left = 1.0 - (now_ns - since_ns) / (REACT_S * 1e9)
         return (
@@ -266,7 +266,7 @@ class EmulatedOperator:
         )
 
     def _append_sample(self, device: str, pose: PoseTuple, **fields: Any) -> None:
-        """A sample of one device, for the frame that is being taken."""
+        """Append a sample of one device to the present frame."""
         sample = self.client.make_sample(
             device, pose, tracking_epoch=self.headset.tracking_epoch, worn=self.headset.worn, **fields
         )
@@ -275,7 +275,7 @@ class EmulatedOperator:
     # --- phases -------------------------------------------------------------------------------------------------------
 
     def _observe_sheet(self, now_ns: int) -> None:
-        """Walks the head around the sheet; goes on when the session has accepted an alignment after the last look."""
+        """Move the head around the sheet, until the session has accepted an alignment after the last viewpoint."""
         spec = self.spec
         if self._viewpoint < spec.viewpoints and self._detections_here >= spec.observations_per_viewpoint:
             self._detections_here = 0
@@ -287,7 +287,7 @@ class EmulatedOperator:
             self._rounds += 1
             alignment = self._get_alignment()
             if alignment is None or (alignment.version == self._doubted_version and self._rounds < ROUNDS):
-                self._viewpoint = self._detections_here = 0  # look again
+                self._viewpoint = self._detections_here = 0  # another round
                 return
             self._must_realign = False
             self.report.aligned_s = (now_ns - self.started_ns) / 1e9
@@ -305,13 +305,13 @@ class EmulatedOperator:
             generation, number = self._request
             reply = self.client.answer(number)
             if reply is not None or generation != self.client.connection.generation:
-                self._request = None  # answered, or asked on a connection that is gone
+                self._request = None  # answered, or the connection has ended
                 self._retry_ns = now_ns + int(RETRY_S * 1e9)
             if reply is not None:
                 self._process_reply(reply, now_ns)
 
     def _process_reply(self, reply: Reply, now_ns: int) -> None:
-        """A robot of the policy's choice, or a no: for good, or until the next try."""
+        """Process a grant, which may name a robot of the policy's choice, or a denial."""
         if reply.denial is not None:
             self._refused_because = f"{reply.denial.reason}: {reply.denial.message}; {reply.denial.advice}"
             if reply.denial.reason in FOR_GOOD:
@@ -324,7 +324,7 @@ class EmulatedOperator:
         return all(self.client.lease_version(robot) is not None for robot in self.robots)
 
     def _check_losses(self, now_ns: int) -> None:
-        """What was won can be lost: the alignment by a jump, an alarm or a new session, the robot to somebody else."""
+        """Return to an earlier phase after the loss of the alignment or of a robot."""
         if (self._get_alignment() is None or self._must_realign) and self.report.phase in ("watch", "acquire", "work"):
             self._viewpoint = self._detections_here = self._rounds = 0
             self._must_realign = False
@@ -333,7 +333,7 @@ class EmulatedOperator:
             self._enter("acquire", now_ns)
 
     def _run_schedule(self, now_ns: int) -> None:
-        """What was planned for this moment: the tracking frame jumps, the headset comes off and on."""
+        """Run scheduled events: jumps of the tracking frame, taking the headset off and putting it on."""
         elapsed = (now_ns - self._joined_ns) / 1e9
         if self._planned and elapsed >= self._planned[0][0]:
             self.disturb_tracking(self._planned.pop(0)[1], now_ns)
@@ -348,20 +348,20 @@ class EmulatedOperator:
         self._note_phase(phase, now_ns)
 
     def _note_phase(self, phase: str, now_ns: int) -> None:
-        """Remembers when a phase began first, in seconds since the start."""
+        """Record when a phase began first, in seconds since the start."""
         self.report.phases.setdefault(phase, round((now_ns - self.started_ns) / 1e9, 3))
 
     # --- knowledge ----------------------------------------------------------------------------------------------------
 
     def _get_alignment(self) -> Alignment | None:
-        """Our alignment, if it is one and of the present tracking frame."""
+        """Return the own alignment, if it is valid for the present tracking frame."""
         alignment = self.client.alignment
         if alignment is None or alignment.kind not in (AlignmentKind.MEASURED, AlignmentKind.PLACED):
             return None
         return alignment if alignment.tracking_epoch == self.headset.tracking_epoch else None
 
     def _update_errors(self, now_ns: int) -> None:
-        """Compares the alignment in force with the truth."""
+        """Compare the alignment in force with the true pose."""
         update_alignment_errors(
             self.report, self._get_alignment(), self.headset.get_T_world_tracking(now_ns), self.spec.T_world_anchor[0]
         )
@@ -387,7 +387,7 @@ class EmulatedOperator:
             self._on_alignment_doubt(event.body)
 
     def _on_alignment_doubt(self, event: AlignmentAlarmed | AlignmentRun) -> None:
-        """A jump voids the alignment, which is seen by itself. A sheet that was moved is for others to put right."""
+        """Plan another alignment after an alarm or at the start of a run. A jump voids the alignment by itself."""
         alignment = self.client.alignment
         if event.participant != self.client.participant_id or alignment is None:
             return
@@ -398,21 +398,21 @@ class EmulatedOperator:
 
 
 class HeadsetDisplay:
-    """What the person sees, world frame: `OperatorView` of the behaviours. The picture is late on purpose."""
+    """The displayed state in the world frame: `OperatorView` of the behaviours. Its delay is deliberate."""
 
     def __init__(self, client: Client, delay_s: float) -> None:
         self._client = client
         self.buffer = PoseBuffer(int(delay_s * 1e9))
         self.hands: dict[str, PoseTuple] = {}
         self._vertices: dict[str, tuple[NDArray[np.floating], int]] = {}
-        #: A behaviour has asked for a vertex: somebody must tell where they are.
+        #: Set when a behaviour has asked for a vertex: the caller must then add vertices.
         self.wants_vertices = False
         self._epoch = 0
         self._shown: ShownPoses | None = None
         self._now_ns = 0
 
     def add_state(self, state: SceneState) -> None:
-        """A new state came."""
+        """Add a new state."""
         if state.header.scene_epoch != self._epoch:
             self._epoch = state.header.scene_epoch
             self.buffer.clear()
@@ -420,12 +420,11 @@ class HeadsetDisplay:
         self.buffer.add(state.header.session_time, state.poses)
 
     def add_vertices(self, deformable: str, p_world: NDArray[np.floating], capture_ns: int) -> None:
-        """New positions of all vertices of a deformable came [m], in the order of the model, and of which session time
-        they are."""
+        """Add positions of all vertices of a deformable [m], in the order of the model, and their session time."""
         self._vertices[deformable] = p_world, capture_ns
 
     def refresh(self, session_ns: int) -> None:
-        """The next picture."""
+        """Advance to the frame displayed at `session_ns`."""
         self._now_ns = max(self._now_ns, session_ns)
         self._shown = self.buffer.poses_at(self._now_ns)
 
@@ -476,7 +475,7 @@ class HeadsetDisplay:
 RECLUTCH_AFTER_S: Final = 0.25  # clutch closed but the robot holds: open it ...
 RECLUTCH_SAMPLES: Final = 3  # ... for this many samples
 
-#: Reasons of a hold that end by clutching again.
+#: Reasons of a hold that end after the clutch was opened and closed.
 CLUTCH_AGAIN: Final = frozenset(
     {HoldReason.REARM, HoldReason.REJECTED, HoldReason.STALE, HoldReason.GAP, HoldReason.SCENE_CHANGED,
      HoldReason.NO_SAMPLE, HoldReason.DISCONNECTED, HoldReason.ESTOP, HoldReason.UNTRACKED, HoldReason.NOT_WORN,
@@ -485,7 +484,8 @@ CLUTCH_AGAIN: Final = frozenset(
 
 
 class HandClutch:
-    """The clutch of one hand on one robot. `reclutches` counts how often it had to be worked again."""
+    """Clutch of one hand: opened and closed again when the robot holds although it is closed. `reclutches`: how
+    often."""
 
     def __init__(self) -> None:
         self.reclutches = 0
@@ -494,13 +494,13 @@ class HandClutch:
         self._lease_version: int | None = None
 
     def open_briefly(self) -> None:
-        """Opens it for a moment."""
+        """Open the clutch for `RECLUTCH_SAMPLES` samples."""
         self._open = RECLUTCH_SAMPLES
 
     def update(self, hand: HandInput, client: Client, estop: bool, now_ns: int) -> bool:
-        """Whether it is closed in the sample that is made now [local ns]."""
+        """Return True if the clutch is closed in the sample taken now [local ns]."""
         lease_version = client.lease_version(hand.robot)
-        if lease_version != self._lease_version:  # a new lease arms only after it has seen the clutch open
+        if lease_version != self._lease_version:  # a new lease arms only after a sample with an open clutch
             self._lease_version = lease_version
             self.open_briefly()
         if self._open > 0:
@@ -522,7 +522,7 @@ class HandClutch:
 def update_alignment_errors(
     report: HeadsetReport, alignment: Alignment | None, T_world_tracking_true: PoseTuple, p_world_sheet: Vec3
 ) -> None:
-    """Fills in the errors of `alignment`. Without one, those of the last stay; `T_true_shown` tells."""
+    """Fill in the errors of `alignment`. Without one, the last values stay and `T_true_shown` is `None`."""
     if alignment is None:
         report.T_true_shown = None
         return
@@ -539,7 +539,7 @@ def update_alignment_errors(
 
 
 def make_spec_behaviour(spec: HeadsetSpec, robot: str) -> Behaviour | None:
-    """The behaviour of one person, `None` for an observer. Raises `ValueError` naming what is available."""
+    """Return the behaviour of a spec, `None` for an observer. Raises `ValueError` listing the available ones."""
     hands = [
         make_behaviour(
             task.behaviour, task.robot or robot, task.object, task.partner, task.device, spec.seed, task.arm, task.place
@@ -550,7 +550,7 @@ def make_spec_behaviour(spec: HeadsetSpec, robot: str) -> Behaviour | None:
 
 
 def load_curve_keys(spec: HeadsetSpec) -> CurveKeys | None:
-    """The CURVE keys of one person. Raises `IdentityError` for files that are no keys, `ValueError` for half a pair."""
+    """Return the CURVE keys of a spec. Raises `IdentityError` for invalid files, `ValueError` for half a pair."""
     if bool(spec.curve_server) != bool(spec.curve_key):
-        raise ValueError("the session's public key and our own secret key (curve_server, curve_key) go together")
+        raise ValueError("curve_server (public key of the session) and curve_key (own secret key) go together")
     return CurveKeys.from_files(spec.curve_server, spec.curve_key) if spec.curve_key else None

@@ -1,4 +1,4 @@
-"""Runs emulated people against a session: k headsets in one process and one polling loop.
+"""Run emulated headsets against a session: many in one process and one polling loop.
 
     python -m iris_session.emulator --address 127.0.0.1:7721 \
         --headset name=ann,behaviour=giver,robot=left --headset name=bob,behaviour=receiver,robot=right
@@ -32,91 +32,94 @@ def run_headsets(
     join_timeout_s: float = JOIN_TIMEOUT_S,
     orders: Callable[[], Iterable[tuple[str, str]]] = tuple,
 ) -> list[HeadsetReport]:
-    """Runs all `specs` until everyone with a task has finished, `seconds` have passed, or `stop()` is true.
+    """Run all `specs` until every task has finished, `seconds` have passed, or `stop()` is true.
 
-    `report`: called with each person's report at every change of phase and once a second. `orders`: asked in every
-    round for what is done to whom (of `Person.disturb`, name). Returns the final reports, in the order of `specs`.
-    Raises nothing for a person who fails (whom no session let in within `join_timeout_s`, for example):
-    `HeadsetReport.failed` says why.
+    `report`: called with each headset's report at every change of phase and once a second. `orders`: polled for
+    disturbances (kind for `EmulatedOperator.disturb_tracking`, name). Returns the final reports, in the order of
+    `specs`.
+    A headset that fails (for example cannot join within `join_timeout_s`) raises nothing: `HeadsetReport.failed` gives
+    the reason.
     """
     start = time.monotonic_ns()
     end = None if seconds is None else start + int(seconds * 1e9)
-    people = [EmulatedOperator(address, spec, start) for spec in specs]
-    told: dict[str, tuple[str, int]] = {}
-    ready = [person.client for person in people]
+    operators = [EmulatedOperator(address, spec, start) for spec in specs]
+    reported: dict[str, tuple[str, int]] = {}
+    ready = [operator.client for operator in operators]
     try:
         while not stop():
             now = time.monotonic_ns()
-            if (end is not None and now >= end) or _are_all_finished(people):
-                _fail_late_joins(people, 0.0, now)
+            if (end is not None and now >= end) or _are_all_finished(operators):
+                _fail_late_joins(operators, 0.0, now)
                 break
-            for person in people:
-                _step_operator(person, person.client in ready)
+            for operator in operators:
+                _step_operator(operator, operator.client in ready)
             for kind, name in orders():
-                for person in people:
-                    if person.spec.name == name and person.client.ready:
-                        person.disturb_tracking(kind, now)
-            _fail_late_joins(people, join_timeout_s, now)
-            for person in people:
+                for operator in operators:
+                    if operator.spec.name == name and operator.client.ready:
+                        operator.disturb_tracking(kind, now)
+            _fail_late_joins(operators, join_timeout_s, now)
+            for operator in operators:
                 if report is not None:
-                    _report_changes(person, told, report, now)
-            wake = min(person.next_step_ns for person in people)
+                    _report_changes(operator, reported, report, now)
+            wake = min(operator.next_step_ns for operator in operators)
             if end is not None:
                 wake = min(wake, end)
-            ready = wait_any([person.client for person in people], max(0.0, (wake - time.monotonic_ns()) / 1e9))
-        return [person.finish_report() for person in people]
+            ready = wait_any([operator.client for operator in operators], max(0.0, (wake - time.monotonic_ns()) / 1e9))
+        return [operator.finish_report() for operator in operators]
     finally:
-        for person in people:
-            person.client.close()
+        for operator in operators:
+            operator.client.close()
 
 
-def _step_operator(person: EmulatedOperator, ready: bool) -> None:
+def _step_operator(operator: EmulatedOperator, ready: bool) -> None:
     try:
         if ready:
-            person.client.poll(0.0)
+            operator.client.poll(0.0)
     except ClientError as error:
-        if not person.finished:
-            person.fail(str(error), time.monotonic_ns())
+        if not operator.finished:
+            operator.fail(str(error), time.monotonic_ns())
         return
-    person.step(time.monotonic_ns())
-    mirror = person.client.mirror
-    if person.report.phase == "acquire" and mirror.synced and not mirror.robots:
-        person.fail("this session has no robots to drive: behaviour=observer looks only", time.monotonic_ns())
+    operator.step(time.monotonic_ns())
+    mirror = operator.client.mirror
+    if operator.report.phase == "acquire" and mirror.synced and not mirror.robots:
+        operator.fail("this session has no robots to drive: use behaviour=observer", time.monotonic_ns())
 
 
-def _fail_late_joins(people: Sequence[EmulatedOperator], timeout_s: float, now_ns: int) -> None:
-    for person in people:
-        waited_s = (now_ns - person.started_ns) * 1e-9
-        if person.report.phase == "join" and waited_s >= timeout_s:
-            text = person.client.describe_failure(f"within {waited_s:.1f} s")
-            person.fail(f"no session let us in at {text}", now_ns)
+def _fail_late_joins(operators: Sequence[EmulatedOperator], timeout_s: float, now_ns: int) -> None:
+    for operator in operators:
+        waited_s = (now_ns - operator.started_ns) * 1e-9
+        if operator.report.phase == "join" and waited_s >= timeout_s:
+            text = operator.client.describe_failure(f"within {waited_s:.1f} s")
+            operator.fail(f"no session let us in at {text}", now_ns)
 
 
-def _are_all_finished(people: Sequence[EmulatedOperator]) -> bool:
-    """Everyone with a task has finished; observers have none, and only observers go on for ever."""
-    working = [person for person in people if not person.observer]
-    return all(person.finished for person in (working or people))
+def _are_all_finished(operators: Sequence[EmulatedOperator]) -> bool:
+    """Return True when every task has finished. Observers have none; only observers run for ever."""
+    working = [operator for operator in operators if not operator.observer]
+    return all(operator.finished for operator in (working or operators))
 
 
-def _report_changes(person: EmulatedOperator, told: dict[str, tuple[str, int]], report: Report, now_ns: int) -> None:
-    phase, at = told.get(person.spec.name, ("", 0))
-    now_phase = next(reversed(person.report.phases), "join")
+def _report_changes(
+    operator: EmulatedOperator, reported: dict[str, tuple[str, int]], report: Report, now_ns: int
+) -> None:
+    phase, at = reported.get(operator.spec.name, ("", 0))
+    now_phase = next(reversed(operator.report.phases), "join")
     if now_phase != phase or now_ns - at >= REPORT_PERIOD_NS:
-        told[person.spec.name] = (now_phase, now_ns)
-        report(person.finish_report())
+        reported[operator.spec.name] = (now_phase, now_ns)
+        report(operator.finish_report())
 
 
-#: What can be done to the tracking frame of a headset: `Person.disturb`.
+#: Disturbances of a tracking frame: see `EmulatedOperator.disturb_tracking`.
 KINDS: Final = ("bump", "drift", "recentre", "steady")
-MAX_LINE: Final = 256  # bytes; a longer line is no order
+MAX_LINE: Final = 256  # bytes; a longer line is rejected
 
 
 class DisturbanceReader:
-    """Calling it gives the orders that have come since, as (kind, name); it never waits. `names`: of the people."""
+    """Reads lines `KIND NAME` from a file descriptor. A call returns the new ones as (kind, name) and never waits."""
 
     def __init__(self, fd: int, names: Sequence[str]) -> None:
         self._fd = fd
-        self._ready = select.poll()  # takes files as well as pipes, and descriptors above 1023
+        self._ready = select.poll()  # works with files and pipes, and with descriptors above 1023
         self._ready.register(fd, select.POLLIN)
         self._names = tuple(names)
         self._rest = b""
@@ -133,10 +136,10 @@ class DisturbanceReader:
         return [order for line in lines if line.strip() for order in self._parse_line(line)]
 
     def _parse_line(self, line: bytes) -> list[tuple[str, str]]:
-        """One order, or a word on standard error about what is none."""
+        """Parse one line. An invalid one is reported on standard error."""
         kind, _, name = line[:MAX_LINE].decode(errors="replace").strip().partition(" ")
         if kind in KINDS and name in self._names:
             return [(kind, name)]
         known = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}, then one of {', '.join(self._names)}"
-        print(f"no order: {kind} {name}".rstrip() + f"; it is {known}", file=sys.stderr, flush=True)
+        print(f"invalid order: {kind} {name}".rstrip() + f"; expected {known}", file=sys.stderr, flush=True)
         return []

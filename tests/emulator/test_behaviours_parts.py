@@ -338,5 +338,5 @@ def test_grasps_come_from_above_whichever_face_is_up(yaw: float, flipped: bool, 
 def test_known_things() -> None:
     assert set(COMMON_OBJECTS) >= {"hammer", "board", "object1"}
     assert find_object("object3") is find_object("hammer")
-    with pytest.raises(ValueError, match="Known things"):
+    with pytest.raises(ValueError, match="Known objects"):
         find_object("objective")

@@ -1,4 +1,4 @@
-"""Two arms and something that bends on the table between them: the scenes of `iris-session demo cloth` and `demo soft`.
+"""Two arms and deformables on the table between them: the scenes of `iris-session demo cloth` and `demo soft`.
 
 The files hold table and flexes, which only MJCF text can describe; the arms of `arm.xml` are put there here.
 """
@@ -24,19 +24,23 @@ _OPTIONS: Final = ("timestep", "integrator", "cone", "impratio", "solver", "iter
 
 
 def cloth_scene() -> Any:
-    """An `mujoco.MjSpec`: arms `left` and `right`, a `cloth` of 17 x 17 vertices, a sheet, keyframe `home`."""
+    """Return an `mujoco.MjSpec`: arms `left` and `right`, a `cloth` of 17 x 17 vertices, a sheet, keyframe `home`."""
     return _with_two_arms("cloth", _round_tips)
 
 
 def soft_scene() -> Any:
-    """An `mujoco.MjSpec`: arms `left` and `right`, soft bodies `rose` and `mint`, a body `box`, a sheet, keyframe
+    """Return an `mujoco.MjSpec`: arms `left` and `right`, soft bodies `rose` and `mint`, a body `box`, a sheet,
+    keyframe
     `home`."""
     return _with_two_arms("soft")
 
 
 def _round_tips(arm: Any) -> None:
-    """Finger tips that end in a rubber rod as thick as the pad above it: square ones pierce cloth with their edges, and
-    from under a thicker rod a low wrinkle slips. Faces and ends are where those of the pads were."""
+    """Replace the finger tips by rubber rods as thick as the pad above them.
+
+    Square tips pierce cloth with their edges, and a low wrinkle slips from under a thicker rod. Faces and ends stay
+    where those of the pads were.
+    """
     import mujoco
 
     for side in ("left", "right"):
@@ -49,7 +53,7 @@ def _round_tips(arm: Any) -> None:
 
 
 def _with_two_arms(file: str, change: Callable[[Any], None] | None = None) -> Any:
-    """The packaged `file` with an arm on either side of its table. `change`: what is done to the arm before."""
+    """Return the packaged `file` with an arm on either side of its table. `change`: applied to each arm before."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(ARM_FILE.parent / f"{file}.xml"))

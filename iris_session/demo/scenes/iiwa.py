@@ -28,19 +28,19 @@ from iris_session.protocol.common import Vec3
 #: Joint positions with the gripper pointing down, 0.50 m in front of the base and 0.35 m above it [rad].
 IIWA_HOME: Final = (0.0, 0.3225, 0.0, -1.658, 0.0, 1.1611, 0.0)
 MAX_ARMS: Final = 8
-#: Two arms stand so far from the middle [m]; more of them farther, and so far from their neighbours.
+#: Distance of two arms from the middle [m]; of more arms, the least distance, and the spacing between adjacent arms.
 _TWO: Final = 0.75
 _LEAST_RADIUS, _APART = 1.0, 1.1
 _REACH: Final = 0.62  # from a base to the object in front of it [m]
 
 
 def compute_iiwa_radius(n: int) -> float:
-    """Radius [m] of the circle on which `n` arms stand."""
+    """Return the radius [m] of the circle on which `n` arms stand."""
     return _TWO if n <= 2 else compute_circle_radius(n, _LEAST_RADIUS, _APART)
 
 
 def iiwa_scene(n: int = 2) -> Any:
-    """An `mujoco.MjSpec` with `n` (1 to 8) arms, a hammer or board for every two, a sheet, keyframe `home`.
+    """Return an `mujoco.MjSpec` with `n` (1 to 8) arms, a hammer or board for every two, a sheet, keyframe `home`.
 
     Raises `ValueError` when `n` is out of range, `ModelNotFoundError` when `IRIS_DATA` lacks the model.
     """
@@ -67,7 +67,7 @@ def iiwa_scene(n: int = 2) -> Any:
 
 
 def _arm(path: Path) -> Any:
-    """One arm. Its controller compensates gravity, as the real one does."""
+    """Return one arm. Its controller compensates gravity, as the real one does."""
     arm = load_model_spec(path)
     for light in list(arm.lights):
         arm.delete(light)
@@ -78,7 +78,7 @@ def _arm(path: Path) -> Any:
 
 
 def _gripper(rgb: Vec3) -> Any:
-    """The arm of `arm.xml`, of which only what is about its hand is left to be attached."""
+    """Return the arm of `arm.xml` reduced to its hand, to be attached."""
     import mujoco
 
     gripper = mujoco.MjSpec.from_file(str(ARM_FILE))

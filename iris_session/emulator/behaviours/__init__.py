@@ -1,7 +1,9 @@
 """Scripted operators: closed loops from what a headset shows to what the hands do. No MuJoCo, no network, no clock.
 
-`base` (the contract), `giver` and `receiver` (hand a thing over in mid-air), `folder` (folds a cloth with a partner),
-`stower` (stows a soft body), `wander` (motion without a task).
+`base` (the interface), `phases` (task phases), `handover` (giver and receiver), `folder` (folds a cloth with a
+partner),
+`stower` (stows a soft body), `wander` (motion without a task), `hand` (clutched motion), `perception`, `objects`,
+`arms`.
 """
 
 from __future__ import annotations
@@ -42,11 +44,12 @@ def make_behaviour(
     arm: str = "arm",
     place: tuple[float, float] | None = None,
 ) -> Behaviour:
-    """The behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of left and
+    """Return the behaviour `name` for `robot`. `partner`: the other robot of a handover or fold; default the other of
+    left and
     right. `object`: a thing, or a deformable. `arm`: kind of both arms. `place`: where a receiver or stower lays it
     (x, y [m], world); default before its robot.
 
-    Raises `ValueError` naming what is available.
+    Raises `ValueError` listing the available behaviours.
     """
     if name in _WITH_PARTNER and not partner:
         if robot not in {"left", "right"}:

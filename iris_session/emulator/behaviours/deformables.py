@@ -1,6 +1,7 @@
-"""What a person sees and knows of deformables: where points of them are, and which points are the corners.
+"""Perception of deformables, and the base of tasks with them.
 
-Their picture may be later than that of the robots, even stand still for a while. Vertices are numbered as in the
+The vertices may be older than the poses of the robots, even stand still for a while: a deformable counts as held until
+newer vertices show otherwise. Vertices are numbered as in the
 model: a MuJoCo grid counts its last axis fastest.
 """
 
@@ -30,7 +31,7 @@ INNER: Final[Mapping[str, Mapping[int, tuple[int, int]]]] = {
 
 
 def list_observed_vertices(deformable: str) -> tuple[int, ...]:
-    """Vertices of `deformable` that people look at."""
+    """Return the vertices of `deformable` that operators track."""
     return (*CORNERS[deformable], *itertools.chain(*INNER.get(deformable, {}).values()))
 
 
@@ -42,7 +43,7 @@ class DeformablePerception(Perception):
         self, deformable: str, robots: tuple[str, ...], bodies: tuple[str, ...] = (), arm: ArmKind = ARM
     ) -> None:
         if deformable not in CORNERS:
-            raise ValueError(f"no operator knows the deformable '{deformable}'. Known: {', '.join(CORNERS)}")
+            raise ValueError(f"unknown deformable '{deformable}'. Known: {', '.join(CORNERS)}")
         super().__init__(bodies, robots, arm=arm)
         self.deformable = deformable
         self._indices = list_observed_vertices(deformable)
@@ -67,7 +68,7 @@ class DeformablePerception(Perception):
             self.missing = (*self.missing, self.deformable)
 
     def get_corner(self, index: int) -> Vec3:
-        """Where a corner is [m], smoothed."""
+        """Return the position of a corner [m], smoothed."""
         return self._vertices[index].pose[0]
 
     def compute_inner_point(self, corner: int, cells: float) -> Vec3:
@@ -78,7 +79,7 @@ class DeformablePerception(Perception):
 
     @property
     def corners(self) -> dict[int, Vec3]:
-        """Where all corners are [m], smoothed, by vertex."""
+        """Positions of all corners [m], smoothed, by vertex."""
         return {index: self._vertices[index].pose[0] for index in CORNERS[self.deformable]}
 
     @property
@@ -88,12 +89,12 @@ class DeformablePerception(Perception):
 
     @property
     def corners_still_s(self) -> float:
-        """For how long [s] all corners were seen to keep still: a picture that stands still tells of nothing."""
+        """Time for which all corners have been at rest [s], by the capture times of the vertices."""
         return max(0.0, self.captured_s - max(self._vertices[index].rest_since_s for index in CORNERS[self.deformable]))
 
 
 def compute_mean(points: Iterable[Vec3]) -> Vec3:
-    """The point in the middle of `points`."""
+    """Return the mean of `points`."""
     xs, ys, zs = zip(*points, strict=True)
     return (sum(xs) / len(xs), sum(ys) / len(ys), sum(zs) / len(zs))
 
@@ -118,16 +119,18 @@ class DeformableTask(PhasedTask):
         self._phase_s = self.perception.now_s
 
     def _is_shown_for(self, seconds: float) -> bool:
-        """Whether the picture shows the first `seconds` of this phase, or is too late for that."""
+        """Return True if the vertices show the first `seconds` of this phase, or are too late for that."""
         return self.perception.captured_s > self._phase_s + seconds or self._has_lasted(seconds + PICTURE_LATE_S)
 
     @abstractmethod
     def _is_holding(self) -> bool:
-        """Whether it is seen to go with the fingers."""
+        """Return True if the displayed deformable moves with the fingers."""
 
     def _check_slip(self, reason: str) -> bool:
-        """Whether it is not seen to go with the fingers. Its picture may only be late: the hand stands still until it
-        shows the same moment, then the phase begins again; or it is lost for `reason`, and another attempt begins."""
+        """Return True while the displayed deformable does not move with the fingers.
+
+        Its vertices may only be late: the hand stops until they show the same moment, then the phase starts again. If
+        the deformable was lost, another attempt starts with `reason`."""
         now_s, lost_s = self.perception.now_s, self._lost_s
         if self._is_holding():
             if lost_s is not None:

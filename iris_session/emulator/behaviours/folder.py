@@ -1,5 +1,5 @@
-"""Folds a cloth with a partner: each pinches the corner on his side that is nearer to the people, and both carry
-theirs over the corners behind at the same time."""
+"""Folds a cloth with a partner: each operator pinches the nearer corner on their side, and both carry
+these over the corners behind at the same time."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ PRESS: float = 0.0115
 DEEPER: float = 0.0015
 #: How far the trigger is pulled when the fingers come down, 60 mm apart then: both must land on the cloth.
 TRIGGER_BEFORE: float = 0.25
-#: Height of the tip above the table at which the corner is let go [m]: much lower, and cloth heaps up around the
+#: Height of the tip above the table at which the corner is released [m]: much lower, and cloth heaps up around the
 #: fingers; higher, and it swings back as it falls.
 RELEASE: float = 0.036
-#: So far towards the partner a corner falls back when it is let go, because it was pinched into a wrinkle [m].
+#: So far towards the partner a corner falls back when it is released, because it was pinched into a wrinkle [m].
 FALLS_BACK: float = 0.006
 #: So far at most the fingers are carried out from between the people [m]: a cloth that is drawn taut flies in when the
-#: first of them lets go.
+#: first of them is released.
 APART: float = 0.01
 #: So far at most the fingers go beyond the other corner [m]: the one that is tucked under them may unfold when it is
-#: let go.
+#: released.
 BEYOND: float = 0.01
-#: How far the trigger stays pulled when the corner is let go: the fingers slide off the wrinkle upwards. Fingers that
+#: How far the trigger stays pulled when the corner is released: the fingers slide off the wrinkle upwards. Fingers that
 #: open wide sweep the cloth along.
 TRIGGER_AFTER: float = 0.75
 CLEAR_ABOVE: float = 0.10
@@ -48,7 +48,7 @@ SHAKES: int = 3
 #: A hand that is so far above the table is back where it began [m]; the cloth is looked at once more after this [s].
 HOME_ABOVE: float = 0.22
 SETTLED_S: float = 1.5
-#: How long a partner is waited for [s]; and before the corners are let go at once, which succeeds alone, too.
+#: How long a partner is waited for [s]; and before the corners are released, which succeeds alone, too.
 PATIENCE_S: float = 60.0
 TOGETHER_S: float = 6.0
 
@@ -178,7 +178,7 @@ class Folder(DeformableTask):
             self._enter("together")
 
     def _wait_for_partner(self) -> None:
-        """Waits until the partner has lifted his corner too."""
+        """Wait until the partner has lifted the other corner."""
         if self._entering_now:
             self.hand.hold_still()
         if self._check_slip(self._slipped):
@@ -188,7 +188,7 @@ class Folder(DeformableTask):
             and self.perception.compute_gap(self.partner) < SHUT
         )
         if lifted or self._alone:
-            self._alone = True  # the partner may have laid his down when mine has to be taken again
+            self._alone = True  # the partner may have laid the other corner down before a new attempt
             self._enter("sight" if self._mending else "over")
         elif self._has_lasted(PATIENCE_S):
             self._fail(f"{self.partner} did not lift the other corner within {PATIENCE_S:.0f} s")
@@ -240,7 +240,7 @@ class Folder(DeformableTask):
         self._finish_carry("ready", 0.005)
 
     def _wait_for_release(self) -> None:
-        """Both let go at once: the cloth between them draws on the corner that is let go first."""
+        """Release both corners at once: the cloth between them pulls on the one that is released first."""
         if self._entering_now:
             self.hand.hold_still()
         low = self.perception.get_tip(self.partner)[0][2] < self._compute_table_height() + RELEASE + 0.008
@@ -261,7 +261,7 @@ class Folder(DeformableTask):
             self._enter("judge")
 
     def _judge(self) -> None:
-        """Whether the corner stayed where it was laid."""
+        """Check that the corner stayed where it was laid."""
         if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
             return
         if self.perception.get_corner(self._mine)[2] > self._compute_table_height() + HANGING and self._shakes < SHAKES:
@@ -271,7 +271,8 @@ class Folder(DeformableTask):
             self._enter("return")
 
     def _is_folded(self, within_m: float) -> bool:
-        """Whether the corners lie together. If not, they are brought together: the outer one is taken, which lies by
+        """Return True if the corners lie together. If not, start to bring them together: the outer one is grasped,
+        which lies by
         itself and not on the other layer."""
         mine, onto = self.perception.get_corner(self._mine), self.perception.get_corner(self._onto)
         missing = distance(mine, onto)
@@ -288,7 +289,7 @@ class Folder(DeformableTask):
         self._enter("watch")
 
     def _watch(self) -> None:
-        """Until the partner is back too: what he does may move the own corner."""
+        """Until the partner is back too: the partner may still move the own corner."""
         busy = self.perception.get_tip(self.partner)[0][2] < self._compute_table_height() + HOME_ABOVE
         if self._entering_now or busy:
             self._since_s = self.perception.now_s
@@ -318,7 +319,7 @@ class Folder(DeformableTask):
         return self.perception.get_base(self.robot)[0][2] - self.arm.above_table
 
     def _is_holding(self) -> bool:
-        """Whether the corner goes with the fingers."""
+        """Return True if the corner moves with the fingers."""
         tip = self.perception.get_tip(self.robot)[0]
         return (
             distance(self.perception.get_corner(self._mine), tip) < 0.06

@@ -1,8 +1,8 @@
-"""The hand of a scripted operator: moves a robot's tip by clutched relative motion, looking at where the tip goes.
+"""The hand of a scripted operator: moves a robot's tip by clutched relative motion with visual feedback.
 
-While the clutch is closed the tip follows the *changes* of the hand. The operator therefore moves the hand as he wants
-the tip to move, and when the movement is over he adds what is still missing, as a person does. When the robot does
-not follow (the session holds it, or the engagement was lost), he opens the clutch, waits a moment and takes hold again.
+While the clutch is closed the tip follows the *changes* of the hand. The operator therefore moves the hand as the
+tip should move, and corrects the remaining error after the movement. When the robot does not follow (the session holds
+it, or the engagement was lost), the operator opens the clutch, waits a moment and closes it again.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ClutchedHand:
     def __init__(self, device: str, robot: str, speed: float = SPEED) -> None:
         self.device, self.robot = device, robot
         self._free_speed = speed  # m/s
-        self.now_s = 0.0  # the operator's own clock: runs only while he can act
+        self.now_s = 0.0  # the operator's own clock: runs only while the operator can act
         self.reclutches = 0
         self.trigger_goal = 0.0
         self._trigger = 0.0
@@ -75,7 +75,7 @@ class ClutchedHand:
         self._still = False
 
     def update(self, view: OperatorView, tip: PoseTuple | None) -> bool:
-        """Advances the hand to the present. `tip`: where the tip is seen. Returns whether the operator can act."""
+        """Advance the hand to the present. `tip`: displayed tip pose. Returns True if the operator can act."""
         step_s = self._advance_clock(view.session_time_ns)
         if tip is None or view.estop or view.lease_version(self.robot) is None:
             self._open()
@@ -93,7 +93,7 @@ class ClutchedHand:
         return True
 
     def move_to(self, goal: PoseTuple, speed: float | None = None, turn: float = TURN, correct: bool = True) -> None:
-        """Starts a movement of the tip to `goal`. `correct`: add what is missing at the end, until told otherwise."""
+        """Start a movement of the tip to `goal`. `correct`: correct the remaining error after it."""
         speed = self._free_speed if speed is None else min(speed, self._free_speed)
         self._goal, self._speed, self._turn, self._correcting = goal, speed, turn, correct
         self._still = False
@@ -102,11 +102,11 @@ class ClutchedHand:
             self._movement = HandMovement.plan(self._compute_reference(), goal, self.now_s, speed, turn)
 
     def hold_still(self) -> None:
-        """Keeps the hand where it is: no corrections while two robots hold the same thing."""
+        """Keep the hand still: no corrections while two robots hold the same object."""
         self._correcting, self._still = False, True
 
     def has_arrived(self, within_m: float = 0.003, within_rad: float = 0.02, for_s: float = 0.12) -> bool:
-        """Whether the movement is over and the tip was seen at the goal for `for_s` seconds."""
+        """Return True if the movement is over and the tip was at the goal for `for_s` seconds."""
         if not self.has_moved():
             return False
         if self._missing_m > within_m or self._missing_rad > within_rad:
@@ -116,24 +116,24 @@ class ClutchedHand:
         return self.now_s - self._close_since_s >= for_s
 
     def has_moved(self) -> bool:
-        """Whether the movement is over, wherever the tip is."""
+        """Return True if the movement is over, independent of the tip."""
         return self._engaged and self._movement is not None and self._movement.is_finished(self.now_s)
 
     def is_trigger_done(self) -> bool:
         return self._engaged and self._trigger == self.trigger_goal
 
     def open_clutch(self, for_s: float) -> None:
-        """Opens the clutch for `for_s` seconds; the last goal stays."""
+        """Open the clutch for `for_s` seconds; the last goal stays."""
         self._open()
         self._rearm_s = self.now_s + for_s
 
     def reclutch(self) -> None:
-        """Opens the clutch and closes it again: the robot does not follow the hand."""
+        """Open the clutch and close it again, because the robot does not follow."""
         self.reclutches += 1
         self._open()
 
     def release_robot(self, view: OperatorView) -> HandInput:
-        """Opens the clutch for good; the robot holds."""
+        """Open the clutch for good; the robot holds."""
         self._open()
         self._hand = view.device_pose(self.device)
         self._goal = self._movement = None
@@ -161,7 +161,7 @@ class ClutchedHand:
         )
 
     def _compute_reference(self) -> PoseTuple:
-        """Where the tip should be now, before corrections."""
+        """Return the planned tip pose, before corrections."""
         return self._tip_at_engage if self._movement is None else self._movement.compute_pose(self.now_s)
 
     def _follow(self, tip: PoseTuple, step_s: float) -> None:
@@ -182,12 +182,13 @@ class ClutchedHand:
         self._hand = self._compute_hand(reference)
 
     def _note_trouble(self, trouble: int, present: bool) -> None:
-        """Notes since when a trouble has lasted."""
+        """Record since when a fault has lasted."""
         since = self._trouble_since_s
         since[trouble] = min(since[trouble], self.now_s) if present else math.inf
 
     def _compute_hand(self, reference: PoseTuple) -> PoseTuple:
-        """The hand pose that brings the tip to `reference` plus corrections, by the motion since the engagement."""
+        """Return the hand pose that brings the tip to `reference` plus corrections, by the motion since the
+        engagement."""
         p0, h0, c = self._tip_at_engage[0], self._hand_at_engage[0], self._correction_p
         p = reference[0]
         q_tip = quat_mul(quat_from_rotvec(self._correction_r), reference[1])
@@ -197,7 +198,7 @@ class ClutchedHand:
 
 
 def _move_correction(correction: Vec3, miss: Vec3, step_s: float, speed: float, most: float) -> Vec3:
-    """`correction` moved towards `miss`, at a limited speed and to a limited length."""
+    """Return `correction` moved towards `miss`, at a limited speed and to a limited length."""
     rate = CORRECTION_RATE * math.hypot(*miss)
     scale = CORRECTION_RATE * step_s * (min(1.0, speed / rate) if rate > 0.0 else 0.0)
     moved = (correction[0] + scale * miss[0], correction[1] + scale * miss[1], correction[2] + scale * miss[2])
@@ -214,7 +215,8 @@ SHORTEST_S = 0.3
 
 
 def compute_min_jerk(s: float) -> float:
-    """Fraction of the way after the fraction `s` of the time; 0 to 1, with zero speed and acceleration at the ends."""
+    """Return the fraction of the way after the fraction `s` of the time; 0 to 1, with zero speed and acceleration at
+    the ends."""
     s = min(max(s, 0.0), 1.0)
     return s * s * s * (10.0 + s * (6.0 * s - 15.0))
 
@@ -230,7 +232,7 @@ class HandMovement:
 
     @classmethod
     def plan(cls, start: PoseTuple, goal: PoseTuple, start_s: float, speed: float, turn: float) -> HandMovement:
-        """A movement whose peak speeds are at most `speed` [m/s] and `turn` [rad/s]."""
+        """Plan a movement whose peak speeds are at most `speed` [m/s] and `turn` [rad/s]."""
         mean_s = max(distance(start[0], goal[0]) / speed, quat_angle(start[1], goal[1]) / turn)
         return cls(start, goal, start_s, max(SHORTEST_S, PEAK_TO_MEAN * mean_s))
 

@@ -1,4 +1,4 @@
-"""What giver and receiver have in common: phases, patience, and taking a thing with the gripper from above."""
+"""Handover tasks: the giver offers an object in mid-air, the receiver takes its free end and lays it down."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class HandoverTask(PhasedTask):
             self._enter("step_back")
 
     def _step_back(self) -> None:
-        """Back to where the hand began: nothing leans on the arm there, and both people can see the thing."""
+        """Back to where the hand began: nothing leans on the arm there, and both operators can see the object."""
         if self._entering_now and self._home is not None:
             self.hand.move_to(self._home)
         if self.hand.has_arrived(0.02, 0.1) or self._has_lasted(4.0):
@@ -135,14 +135,14 @@ class HandoverTask(PhasedTask):
         )
 
     def _compute_turn(self, T_world_tip: PoseTuple, T_world_thing: PoseTuple) -> float:
-        """How far [rad] the wrist is from home when the tip takes the thing like this."""
+        """Return the turn of the wrist from home [rad] for a grasp with this tip pose."""
         return quat_angle(T_world_tip[1], (self._home or self.perception.get_tip(self.robot))[1])
 
     def _is_holding(self) -> bool:
         return self.perception.is_holding(self.robot, self.object, self.object_model.half_width)
 
     def _has_lost_object(self) -> bool:
-        """Whether the thing is no longer between the fingers."""
+        """Return True if the object is no longer between the fingers."""
         taken_at = apply(self.perception.get_body(self.object), (self._take_x, 0.0, 0.0))
         return distance(taken_at, self.perception.get_tip(self.robot)[0]) > 0.05
 
@@ -152,7 +152,7 @@ class HandoverTask(PhasedTask):
         return compose(T_world_thing, inverse(T_tip_thing))
 
     def _compute_exchange(self) -> tuple[Vec3, Vec3]:
-        """Where things change hands (world), and the horizontal direction from me to my partner."""
+        """Return the place of the handover (world), and the horizontal direction to the partner."""
         mine, other = self.perception.get_base(self.robot), self.perception.get_base(self.partner)
         (ax, ay, az), (bx, by, bz) = mine[0], other[0]
         (fx, fy, _), (gx, gy, _) = (quat_rotate(base[1], (1.0, 0.0, 0.0)) for base in (mine, other))
@@ -220,7 +220,7 @@ class Giver(HandoverTask):
         self._enter("approach")
 
     def _compute_effort(self, take_x: float) -> float:
-        """How far [rad] the wrist must turn to take the thing at this end, and then to offer the other."""
+        """Return the turn of the wrist [rad] to grasp the object at this end and to offer the other."""
         self._take_x = take_x
         return self._compute_turn(self._compute_grasp(), self.perception.get_body(self.object))
 
@@ -267,7 +267,7 @@ class Giver(HandoverTask):
         elif not self.perception.is_holding(self.partner, self.object, self.object_model.half_width):
             self._taken_since_s = math.inf
             if self._has_lasted(self._patience_s):
-                self._fail(f"nobody took the {self.object} within {self._patience_s:.0f} s")
+                self._fail(f"{self.partner} did not take the {self.object} within {self._patience_s:.0f} s")
         else:
             self._taken_since_s = min(self._taken_since_s, self.hand.now_s)
             if self.hand.now_s - self._taken_since_s >= SURE_S:
@@ -338,7 +338,7 @@ class Receiver(HandoverTask):
             self._take_x = self._find_free_end()
             self._enter("raise")
         elif self._has_lasted(self._patience_s):
-            self._fail(f"nobody offered the {self.object} within {self._patience_s:.0f} s")
+            self._fail(f"{self.partner} did not offer the {self.object} within {self._patience_s:.0f} s")
 
     def _raise_hand(self) -> None:
         """Straight up to where the thing will be approached from: on a slant, the fingers could push it away."""
@@ -350,7 +350,8 @@ class Receiver(HandoverTask):
             self._enter("approach")
 
     def _find_free_end(self) -> float:
-        """Where to take the thing [m along its x]: for a symmetric thing the end away from the giver's fingers."""
+        """Return where to grasp the object [m along its x]: for a symmetric thing the end away from the giver's
+        fingers."""
         x = self.object_model.receiver_x
         if not self.object_model.symmetric:
             return x
@@ -368,7 +369,7 @@ class Receiver(HandoverTask):
         elif self._has_lasted(1.0) and not self._is_holding():
             self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
         elif self._has_lasted(15.0):
-            self._retry(f"{self.partner} did not let go of the {self.object}")
+            self._retry(f"{self.partner} did not release the {self.object}")
 
     def _carry(self) -> None:
         if self._entering_now:

@@ -1,4 +1,4 @@
-"""What a person makes of the picture: poses smoothed over a few frames, and whether a thing keeps still."""
+"""Perception of a scripted operator: poses smoothed over a few frames, and how long a body has been at rest."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from iris_session.emulator.behaviours.base import OperatorView
 
 #: Smoothing time of vision [s]: averages 1 mm of noise at 60-90 Hz to about 0.4 mm.
 SMOOTHING_S = 0.07
-#: A thing that stays within this distance [m] keeps still.
+#: A body that stays within this distance [m] is at rest.
 STILL_M = 0.005
 
 
 class TrackedPose:
-    """A pose smoothed over `SMOOTHING_S`, and since when it stays where it is."""
+    """A pose smoothed over `SMOOTHING_S`, and the time since which it is at rest."""
 
     def __init__(self, pose: PoseTuple, now_s: float) -> None:
         self.pose = pose
@@ -35,14 +35,14 @@ class TrackedPose:
 
     @property
     def still_s(self) -> float:
-        """For how long [s] it has kept still."""
+        """Time for which it has been at rest [s]."""
         return self._now_s - self.rest_since_s
 
 
 class Perception:
-    """Watches bodies and robot tips by name. `missing`: which of them were never seen so far.
+    """Tracks bodies and robot tips by name. `missing`: those that have not been in the scene so far.
 
-    `arm`: the kind of the robots. `perhaps`: bodies that need not be there.
+    `arm`: the kind of the robots. `perhaps`: bodies that may be absent.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Perception:
         self.missing: tuple[str, ...] = self._bodies
 
     def observe(self, view: OperatorView) -> None:
-        """Takes in the present picture. What is not in it stays as it was last seen."""
+        """Process the present frame. Bodies that it lacks keep their last pose."""
         now_s = view.session_time_ns * 1e-9
         poses = [(name, view.body_pose(name)) for name in self._bodies]
         poses += [(f"tip {robot}", view.tip_pose(robot)) for robot in self._robots]
@@ -74,11 +74,11 @@ class Perception:
 
     @property
     def is_complete(self) -> bool:
-        """Whether everything was seen."""
+        """True when every required body has been in the scene."""
         return not self.missing
 
     def list_obstacles(self) -> list[Vec3]:
-        """Where those of `perhaps` are [m] that are there."""
+        """Return the positions [m] of the optional bodies in the scene."""
         return self._others
 
     def get_body(self, name: str) -> PoseTuple:
@@ -91,11 +91,11 @@ class Perception:
         return self._tracked[f"{robot}/{self._arm.base}"].pose
 
     def get_still_s(self, name: str) -> float:
-        """For how long [s] the body `name` has kept still."""
+        """Return how long [s] the body `name` has been at rest."""
         return self._tracked[name].still_s
 
     def compute_pads(self, robot: str) -> tuple[Vec3, Vec3]:
-        """Where the faces of the two finger pads are [m], world frame."""
+        """Return the positions of the two finger pads [m], world frame."""
         one, other = (self._tracked[f"{robot}/{finger}"].pose for finger in self._arm.fingers)
         return apply(one, self._arm.pads[0]), apply(other, self._arm.pads[1])
 
@@ -104,7 +104,8 @@ class Perception:
         return distance(*self.compute_pads(robot))
 
     def is_holding(self, robot: str, name: str, half_width: float) -> bool:
-        """Whether the pads of `robot` lie on the two sides of `name` (half width [m] along its y), closed on it."""
+        """Return True if the pads of `robot` lie on the two sides of `name` (half width [m] along its y), closed on
+        it."""
         (px, py, pz), q = self.get_body(name)
         inverse_q = quat_conj(q)
         local = [

@@ -1,4 +1,4 @@
-"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and lets go."""
+"""Stows a soft body: takes it from the table, lifts it clear, lays it into an open box and releases it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BOX: str = "box"
 BOX_INSIDE: Vec3 = (0.240, 0.095, 0.070)
 #: So far its lowest corner is lifted above the table [m]: over the walls of the box, and more than 10 cm.
 LIFTED: float = 0.12
-#: The body is let go so far above the floor of the box [m].
+#: The body is released so far above the floor of the box [m].
 DROP: float = 0.006
 #: A body that is squeezed is narrower than this between the pads [m], one that is not there lets them close.
 SQUEEZED: float = 0.050
@@ -129,7 +129,7 @@ class Stower(DeformableTask):
             self._enter("judge")
 
     def _judge(self) -> None:
-        """Whether it lies in the box."""
+        """Check that it lies in the box."""
         if self.perception.corners_still_s < 0.3 and not self._is_shown_for(5.0):
             return
         if all(self._is_inside_box(corner) for corner in self.perception.corners.values()):
@@ -156,7 +156,7 @@ class Stower(DeformableTask):
         return min(turns, key=lambda turn: quat_angle(turn, home))
 
     def _compute_goal(self) -> tuple[float, float]:
-        """Where to lay it: the given place, else the half of the box on this side."""
+        """Return where to lay it: the given place, else the half of the box on this side."""
         if self._place is not None:
             return self._place
         T_world_box = self.perception.get_body(BOX)
@@ -165,7 +165,7 @@ class Stower(DeformableTask):
         return (x, y)
 
     def _is_holding(self) -> bool:
-        """Whether it is between the pads and goes with them."""
+        """Return True if it is between the pads and moves with them."""
         near = distance(self.perception.middle, self.perception.get_tip(self.robot)[0]) < 0.04
         return near and EMPTY < self.perception.compute_gap(self.robot) < SQUEEZED
 

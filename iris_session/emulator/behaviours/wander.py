@@ -16,7 +16,7 @@ ROAM_TURN = 0.25
 
 
 class Wander:
-    """Moves the tip about its first pose: a new goal, a short rest, now and then the clutch opened and closed again."""
+    """Moves the tip about its first pose: a new goal, a short rest, and at times a reclutch."""
 
     def __init__(self, robot: str, device: str = Device.CONTROLLER_RIGHT, seed: int = 0) -> None:
         self.phase = "wait"
@@ -61,7 +61,7 @@ class Wander:
 
 
 class Idle:
-    """A person who holds the device and does nothing."""
+    """An operator who holds the device and does nothing."""
 
     def __init__(self, robot: str = "", device: str = Device.CONTROLLER_RIGHT) -> None:
         self.phase = "idle"
