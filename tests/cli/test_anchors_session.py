@@ -38,7 +38,7 @@ from iris_session.protocol.status import (
     StatusReport,
 )
 from iris_session.recording import Frame, Recording, read_looks
-from iris_session.session.anchors_file import load_anchors
+from iris_session.session.config import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.client.harness import LiveSession
 from tests.recording.headsets import Played
