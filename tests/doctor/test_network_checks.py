@@ -185,7 +185,7 @@ def test_names() -> None:
 
 
 class Listener:
-    """Hears what it is given."""
+    """Beacon listener that hears the given sessions."""
 
     sessions_heard: tuple[FoundSession, ...] = ()
     ignored: ClassVar[dict[str, int]] = {}
@@ -197,7 +197,7 @@ class Listener:
 
     def wait(self, timeout_s: float) -> None: ...
 
-    def sessions(self) -> list[FoundSession]:
+    def poll_sessions(self) -> list[FoundSession]:
         return list(self.sessions_heard)
 
 
