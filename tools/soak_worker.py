@@ -1,10 +1,10 @@
-"""People of `tools/soak.py`: emulated headsets in one process, each of which notes every event it is handed.
+"""Operators of `tools/soak.py`: emulated headsets in one process, each of which logs every event it receives.
 
     python tools/soak_worker.py < job.json        {"address": ..., "specs": [HeadsetSpec, ...], "log": "folder/worker3"}
 
-One log per person: `<log>-<name>.events`, records of (connection generation, how often it was told so far that it
-missed events, event_seq, CRC-32 of the event), and one `<log>-<name>.json` with the person's report, written every
-second. Ends at SIGTERM.
+One log per operator: `<log>-<name>.events`, records of (connection generation, notifications of missed events so far,
+event_seq, CRC-32 of the event), and one `<log>-<name>.json` with the operator's report, written every second. Ends at
+SIGTERM.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Final
 import msgspec
 
 from iris_session.client import RefusedError, wait_any
-from iris_session.emulator.person import Person
+from iris_session.emulator.operator import EmulatedOperator
 from iris_session.emulator.specs import HeadsetSpec
 from iris_session.protocol.server_messages import Event
 
@@ -35,7 +35,7 @@ class Job(msgspec.Struct, frozen=True):
 
 
 def fingerprint(event: Event) -> int:
-    """CRC-32 of an event as it is encoded: the same for everybody who got the same one."""
+    """Return the CRC-32 of an encoded event: equal for all clients that received the same event."""
     return zlib.crc32(msgspec.msgpack.encode(event))
 
 
@@ -43,7 +43,7 @@ class Witness:
     """One person whose events go to a file as they come."""
 
     def __init__(self, job: Job, spec: HeadsetSpec, start_ns: int) -> None:
-        self.person = Person(job.address, spec, start_ns)
+        self.person = EmulatedOperator(job.address, spec, start_ns)
         self._prefix = f"{job.log}-{spec.name}"
         self._file = os.open(f"{self._prefix}.events", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         self._next_report_ns = 0
@@ -53,7 +53,7 @@ class Witness:
         self.person.client.on_missed = self._miss
 
     def step(self, ready: bool) -> None:
-        """One round of the loop."""
+        """Run one iteration of the loop."""
         now_ns = time.monotonic_ns()
         if ready:
             try:
@@ -68,7 +68,7 @@ class Witness:
             self.report()
 
     def report(self) -> None:
-        """The report as a file, replaced at once."""
+        """Write the report to a file, replaced atomically."""
         path = f"{self._prefix}.json"
         with open(f"{path}.new", "wb") as file:
             file.write(msgspec.json.encode(self.person.finish_report()))
@@ -96,7 +96,7 @@ def main() -> int:
     while not stopped:
         for witness in witnesses:
             witness.step(witness.person.client in ready)
-        wake_ns = min(witness.person.next_ns for witness in witnesses)
+        wake_ns = min(witness.person.next_step_ns for witness in witnesses)
         ready = wait_any(clients, max(0.0, (wake_ns - time.monotonic_ns()) * 1e-9))
     for witness in witnesses:
         witness.report()

@@ -1,4 +1,4 @@
-"""What bends in the session's scene, as a client sees it: the newest vertices of every deformable, and its triangles.
+"""Deformables of the scene: newest vertices of every cloth, rope and soft body, with their triangles and looks.
 
 shapes = Deformables(client)
 while True:
@@ -24,7 +24,7 @@ from iris_session.client.media import MediaFeed
 from iris_session.protocol.assets import is_address
 from iris_session.protocol.names import ArrayKind, ArrayName, MediaEncoding
 from iris_session.protocol.scene import Deformable, decode_scene
-from iris_session.scene.arrays import decode_arrays, require
+from iris_session.scene.arrays import decode_arrays, require_array
 from iris_session.scene.errors import AssetDecodeError
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import MAX_FACES, MAX_VERTICES, DeformableTopology
@@ -70,11 +70,11 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     corners = 2 if spec.dim == ROPE else 3
     rows = np.arange(n_vertices, dtype=np.int32)
     if ArrayName.VERTEX in arrays:
-        numbers = require(arrays, ArrayName.VERTEX, "u2 u4", (n_vertices,))
+        numbers = require_array(arrays, ArrayName.VERTEX, "u2 u4", (n_vertices,))
         if int(numbers.max(initial=0)) >= MAX_VERTICES:
             raise ValueError(f"deformable {spec.name!r} numbers its vertices beyond {MAX_VERTICES}")
         rows = numbers.astype(np.int32)
-    places = require(arrays, ArrayName.ELEMENTS, "u2 u4", (None, corners))
+    places = require_array(arrays, ArrayName.ELEMENTS, "u2 u4", (None, corners))
     if len(places) > MAX_FACES or int(places.max(initial=0)) >= n_vertices:
         raise ValueError(
             f"deformable {spec.name!r} has {len(places)} elements up to vertex {int(places.max(initial=0))}: "
@@ -84,7 +84,7 @@ def read_mesh(spec: Deformable, arrays: Mapping[str, NDArray[Any]], n_vertices: 
     uv = None
     if ArrayName.UV in arrays:
         # A copy: no view of the asset.
-        uv = require(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
+        uv = require_array(arrays, ArrayName.UV, "f4", (len(places), corners, 2)).astype(np.float32)
     faces, edges = (none, elements) if corners == 2 else (elements, none)
     for array in (faces, edges, rows, uv):
         if array is not None:
@@ -118,14 +118,14 @@ class _Mesh:
 
 class Deformables:
     """`vertices`: positions (n, 3) [m], world frame, by name of the deformable; numbered as in the model. Those inside
-    of a soft body, which nobody sees, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
+    of a soft body, which are not seen, do not travel: their rows are not a number (NaN), `meshes[name].rows` are the
     others. One without a name, or with that of another, goes by its stream (`keys`). `capture_ns`: the session time at
     which they were there, by the same names. What is at rest comes once a second: older than that is not known, but
     what was there then. `meshes`: triangles, lines and looks, by the same names, each there before its first vertices.
 
     `scene_hash`: of the scene they are of. After a patch they go on as they are until the new specification is here,
     and what is the same in both goes on after it. `fault`: why something cannot be seen, empty while all is well.
-    Everything happens in `tend`, which never waits.
+    Everything happens in `update`, which never waits.
     """
 
     def __init__(self, client: Client) -> None:
@@ -151,7 +151,11 @@ class Deformables:
         return self._fault or next((mesh.fault for mesh in self._meshes if mesh.fault), "")
 
     def update(self) -> list[str]:
-        """Follows the scene and takes the newest frames. Names of those that have moved since the last call."""
+        """Follow the scene and take the newest frames, without waiting.
+
+        Returns:
+            Names of the deformables that have moved since the last call.
+        """
         now = self._client.scene.version  # the thread of `start` may be about to hear of another
         if now is None:  # it has heard of one, and not yet of which
             return []
@@ -239,7 +243,7 @@ class Deformables:
         self._parked, self._fault = False, ""
 
     def _failed(self, error: Exception) -> None:
-        """What is shown goes on, unless it is of another scene."""
+        """Keep what is shown, unless it is of another scene."""
         if self._client.mirror.scene_hash != self._asked:  # the newest is asked for at the next call
             return
         if self._parked:
@@ -252,7 +256,7 @@ class Deformables:
         frame = mesh.feed.newest
         if frame is None or frame.header.seq == mesh.seq or frame.header.encoding != MediaEncoding.DEFORMABLE:
             return False
-        if frame.header.scene_epoch != self._client.mirror.scene_epoch:  # or events tell of its scene in a moment
+        if frame.header.scene_epoch != self._client.mirror.scene_epoch:  # or the event of its scene is on its way
             return False
         mesh.seq = frame.header.seq
         try:
@@ -266,17 +270,17 @@ class Deformables:
 
 
 def _identity(key: str, part: Deformable | _Mesh) -> tuple[str, str, str]:
-    """What is equal for the same deformable in two specifications."""
+    """Return the key that is equal for the same deformable in two specifications."""
     return key, part.stream, part.address
 
 
 def deformable_keys(parts: Sequence[Deformable]) -> list[str]:
-    """What tells deformables apart: the name of each, where it has one that no other has; else its stream."""
+    """Return unique keys of deformables: the name of each if no other has it, else its stream."""
     names = [part.name for part in parts]
     found: list[str] = []
     for part in parts:
         key = part.name if part.name and names.count(part.name) == 1 else part.stream
-        while key in found or (key != part.name and key in names):  # somebody is called like a stream
+        while key in found or (key != part.name and key in names):  # a deformable is named like a stream
             key += "'"
         found.append(key)
     return found

@@ -11,11 +11,11 @@ from typing import Final
 import psutil
 
 from iris_session.client.address import Address
-from iris_session.client.discovery import BeaconListener, FoundSession, request_introduction
-from iris_session.client.errors import ClientError
+from iris_session.client.discovery import request_introduction
 from iris_session.doctor.findings import Finding, failed, ok, warning
+from iris_session.link.discovery import BeaconListener, DiscoveryError, FoundSession
 from iris_session.protocol.discovery import DISCOVERY_PORT, Introduction
-from iris_session.protocol.errors import ProtocolError, VersionError
+from iris_session.protocol.errors import ProtocolError, ProtocolVersionError
 from iris_session.protocol.names import PROTOCOL_VERSION
 
 #: The system needs 3 s to find that no machine of the network has an address; a firewall is silent for longer.
@@ -44,7 +44,7 @@ def check_beacon(session: str, address: Address | None) -> tuple[Finding, list[F
                 if str(address) in {one.address for one in listener.poll_sessions()}:
                     break  # the wanted session is heard; a search by name goes on, as two may have the name
             found, ignored = listener.poll_sessions(), dict(listener.ignored)
-    except ClientError as error:
+    except DiscoveryError as error:
         return warning("beacon", str(error)), []
     heard = ", ".join(f"{one.name} ({one.address})" for one in found) or "none"
     if session:
@@ -190,7 +190,7 @@ def check_introduction(address: Address) -> tuple[Finding, Finding, Introduction
     unknown = Finding("version", "skipped", "not known: there was no introduction")
     try:
         said = _request_introduction(address, CONNECT_S)
-    except VersionError as error:
+    except ProtocolVersionError as error:
         return ok("introduction", f"a session of protocol version {error.version}"), check_version(error.version), None
     except ProtocolError as error:
         text = f"the program at port {address.port - 1} is not a session: {error}"

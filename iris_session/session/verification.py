@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from iris_session.physics import model_from_bytes
+from iris_session.physics import decode_model
 from iris_session.protocol.entries import Entry
 from iris_session.recording import Keyframe, SessionHeader, VerifyReport, blas, unpack_model, verify
 from iris_session.recording.verify import Models
@@ -20,22 +20,32 @@ class ReplayCore:
     def __init__(self, header: SessionHeader, models: Models) -> None:
         blas.use_one_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
-        model = model_from_bytes(unpack_model(header.model))
-        self.core = SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
+        model = decode_model(unpack_model(header.model))
+        self.core = SessionCore(model, config, lambda model_hash: decode_model(models(model_hash)))
 
     def step(self, now_ns: int, entries: Sequence[Entry], n_ticks: int, plant: bytes = b"") -> bytes:
-        """Digest of one step."""
+        """Take one step and return its digest."""
         return self.core.step(now_ns, entries, n_ticks, plant).digest
 
     def restore(self, keyframe: Keyframe) -> None:
+        """Restore the state after the step of a keyframe."""
         self.core.restore(CoreState(keyframe.plant, keyframe.authority, keyframe.controller, keyframe.status))
 
     def keyframe(self, step: int) -> Keyframe:
+        """Return a keyframe of the present state, which is after `step`."""
         state = self.core.snapshot()
         return Keyframe(step, state.plant, state.authority, state.controller, state.status)
 
 
 def verify_recording(path: Path, progress: Callable[[int, int], None] | None = None) -> VerifyReport:
-    """Re-simulates every step of the recording at `path`. Raises `RecordingError` when it cannot be read at all."""
+    """Re-simulate every step of a recording.
+
+    Args:
+        path: First file of the recording.
+        progress: Called with the number of steps done and of all steps.
+
+    Raises:
+        RecordingError: The recording cannot be read at all.
+    """
     blas.use_one_thread()  # before versions are compared: threads that are not used here are no difference
     return verify(path, ReplayCore, progress)

@@ -1,4 +1,4 @@
-"""Streams, subscriptions and what is due, without sockets."""
+"""Streams, subscriptions and due frames, without sockets."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import pytest
 
-from iris_session.front.media.budget import NOTHING, SECOND
+from iris_session.front.media.budget import NONE_LEVEL, SECOND
 from iris_session.front.media.scheduler import DeliveryCounters, MediaScheduler, MediaSubscriber
 from iris_session.protocol.codec import decode_media_header
-from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, media_topic, parse_topic
+from iris_session.protocol.media import MAX_STREAMS, MediaHeader, MediaPush, make_topic, parse_topic
 
 MS = 1_000_000
 ANN, BOB = 7, 8
@@ -33,7 +33,7 @@ class Wire:
         if number in self.full:
             return False
         head = decode_media_header(header)
-        assert topic == media_topic(number, head.stream) + head.budget_class.encode()
+        assert topic == make_topic(number, head.stream) + head.budget_class.encode()
         self.got[number].append((head, frame))
         return True
 
@@ -59,7 +59,7 @@ def test_subscribers_get_what_their_level_says() -> None:
     header, frame = wire.got[BOB][-1]
     assert (header.stream, header.budget_class, header.scene_epoch, header.seq % 4) == ("cloud", "quarter", 3, 0)
     assert (header.published_ns - header.capture_ns, header.dropped, frame) == (MS, 0, b"x" * 100)
-    wire.allow(ann=NOTHING, bob=1)
+    wire.allow(ann=NONE_LEVEL, bob=1)
     wire.push(8)
     assert [len(wire.got[who]) for who in (ANN, BOB)] == [8, 6]
 
@@ -121,7 +121,7 @@ def test_one_of_two_readers_of_a_client_leaves() -> None:
     wire.hub.unsubscribe(ANN, "cloud", 3)
     wire.push()
     assert len(wire.got[ANN]) == 1
-    assert wire.hub.read_counters(ANN).taken == 1
+    assert wire.hub.read_counters(ANN).delivered == 1
 
 
 def test_nobody_takes_back_a_subscription_of_another() -> None:
@@ -236,6 +236,6 @@ def test_a_restarted_front_numbers_above_its_predecessor() -> None:
 
 
 def test_topics() -> None:
-    assert parse_topic(media_topic(12, "cloud.1")) == (12, "cloud.1")
+    assert parse_topic(make_topic(12, "cloud.1")) == (12, "cloud.1")
     for bad in (b"", b"media/", b"media/0/x/", b"media/1/x", b"media/1/a/b/", b"media/1//", b"media/-1/x/", b"\xff"):
         assert parse_topic(bad) is None

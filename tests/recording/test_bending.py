@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from iris_session.physics.load import model_bytes, scene_hash
+from iris_session.physics.load import compute_scene_hash, encode_model
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
 from iris_session.recording.bending import Bending
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import WAITING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
-from iris_session.scene.mujoco_assets import flex_mesh
+from iris_session.scene.mujoco_assets import read_flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import column, read
@@ -35,12 +35,12 @@ class World:
         self.model = flexes()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self.meshes = [flex_mesh(self.model, i) for i in range(self.model.nflex)]
+        self.meshes = [read_flex_mesh(self.model, i) for i in range(self.model.nflex)]
         self.encoders = [DeformableEncoder(mesh.topology, BOUND_M) for mesh in self.meshes]
         self.store = AssetStore(folder / "assets")
         self.parsed = parse_mujoco(self.model, self.store)
         self.assets = SceneAssets(-1, 0, str(self.store.root), self.parsed.scene_hash)
-        self.packed = pack_model(bytes(model_bytes(self.model)))
+        self.packed = pack_model(bytes(encode_model(self.model)))
         self.path, self.closed = folder / "w.rrd", False
         self.writer = RrdWriter(self.path, "id")
         self.writer.header(SessionHeader("s", "n", "closed", 2_000_000, model=self.packed))
@@ -170,7 +170,7 @@ def test_vertices_of_the_scene_before_are_refused(world: World) -> None:
     """They may come late; and what is for the next scene waits for its states."""
     vertices = world.vertices(0)
     world.state(0)
-    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
     scene = SceneModel(8, 16_000_007, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))
     world.publish(16, 0, vertices + 0.2)
     world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
@@ -187,7 +187,7 @@ def test_vertices_of_the_last_state_before_a_scene_are_refused(world: World) -> 
     vertices = world.vertices(0)
     world.state(0)
     world.state(8)
-    hash_ = scene_hash(bytes(model_bytes(world.model)))
+    hash_ = compute_scene_hash(bytes(encode_model(world.model)))
     scene = SceneModel(8, 16_000_000, hash_, world.packed, (BodyInfo(1, "cup", moving=True),))  # 7 ns before the state
     world.writer.add(Batch(scenes=[scene], assets=[world.assets]))
     world.publish(8, 0, vertices + 0.1)
