@@ -66,7 +66,7 @@ class Appearance:
 
     @property
     def is_plain_color(self) -> bool:
-        """Whether all other values are defaults."""
+        """True if all values but the colour are defaults."""
         defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
         return not self.images and defaults == (
             self.emission,

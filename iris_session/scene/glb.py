@@ -66,7 +66,7 @@ def write_glb(spec: SceneSpec, store: AssetStore, path: Path) -> int:
     of the scene, `SceneBuildError` for a scene that is too large, and `OSError`."""
     data = _GlbWriter(spec, store).encode()
     target = Path(os.path.realpath(path))  # a link stays one
-    if target.exists() and not target.is_file():  # a pipe or a device, or a folder, which says so
+    if target.exists() and not target.is_file():  # a pipe or a device; opening a folder raises
         target.write_bytes(data)
         return len(data)
     write_atomic(target, data, permissions=None)

@@ -18,7 +18,7 @@ Pixels = NDArray[np.uint8]
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 #: Rows of a large image that decide which filter suits it.
 _SAMPLE_ROWS: Final = 128
-#: As Pillow calls them. Not all that it reads: it hands EPS to Ghostscript, whatever the file is called.
+#: As Pillow calls them. Not all that it reads: it hands EPS to Ghostscript, by any file name.
 FORMATS: Final = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "GIF", "TIFF", "PPM", "DDS")
 _JPEGS: Final = "MPO"  # JPEG with further pictures: cameras make them
 #: Most pixels of one image: larger ones are no texture, or a bomb.

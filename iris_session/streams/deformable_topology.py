@@ -8,7 +8,7 @@ docs/deformables.md) are sent once; a client needs no algorithm but to follow th
 - `TREE`: a vertex is predicted from three that come before it, a + b - c, the parallelogram over a neighbouring
   triangle. Any other mesh. Undone level by level; the number of levels grows with the radius of the mesh.
 
-A plan only makes frames smaller: whatever it is, they decode to the same vertices.
+A plan only makes frames smaller: with any plan they decode to the same vertices.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _plan(n_vertices: int, faces: Ints, edges: Ints) -> _Plan:
 
 
 def _columns(n_vertices: int, links: Edges) -> int:
-    """Length of the rows when every link joins neighbours (also across a corner) of a grid; 0 when it is none."""
+    """Length of the rows when every link joins adjacent vertices of a grid (also diagonally); 0 for other meshes."""
     strides = np.unique(np.abs(links[:, 0] - links[:, 1]))
     if len(strides) == 0 or len(strides) > 4:
         return 0
@@ -175,7 +175,7 @@ def _walk(n_vertices: int, links: Edges) -> Ints | None:
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     degrees = np.bincount(both[:, 0], minlength=n_vertices)
     starts = np.concatenate([[0], np.cumsum(degrees)]).tolist()
-    neighbours = both[:, 1].tolist()
+    adjacent = both[:, 1].tolist()
     seen = bytearray(n_vertices)
     order: list[int] = []
     for begin in np.argsort(degrees, kind="stable").tolist():
@@ -186,7 +186,7 @@ def _walk(n_vertices: int, links: Edges) -> Ints | None:
                 continue
             seen[vertex] = 1
             order.append(vertex)
-            stack += [v for v in neighbours[starts[vertex] : starts[vertex + 1]] if not seen[v]]
+            stack += [v for v in adjacent[starts[vertex] : starts[vertex + 1]] if not seen[v]]
     return None if order == list(range(n_vertices)) else np.array(order, np.int32)
 
 

@@ -77,7 +77,7 @@ def off(name: str, data: bytes) -> bytes:
         listed = rows[1 + vertices : 1 + vertices + faces]
         whole = len(listed) == faces and (not faces or len(listed[-1]) > int(listed[-1][0]))
     except (ValueError, IndexError):
-        return data  # whoever reads it says what is wrong
+        return data  # the reader raises the error
     if not whole:
         raise SceneBuildError(
             f"{name} is cut: its head says {faces:,} faces, and it ends in number {len(listed):,}; "

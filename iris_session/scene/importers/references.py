@@ -148,7 +148,7 @@ class References:
                 f"{_similar(within[0])}"
             )
         hint = f"looked in {', '.join(map(str, tried))}" if tried else "no such package above the file"
-        if closed is not None:  # any folder has a name: of somebody's pictures, of keys
+        if closed is not None:  # any folder has a name: also one of private images or keys
             hint = f"{closed} has no {_PACKAGE}, so it is no package"
         raise SceneBuildError(
             f"{self.path.name} refers to {reference}: {hint}; name the package's folder in package_dirs"

@@ -76,7 +76,7 @@ def _checked(name: str, kind: str, data: bytes) -> bytes:
 
 
 def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
-    """Materials that no MTL file has, if there is one: without any, whoever shows the OBJ says how it looks."""
+    """Materials that no MTL file has, if there is one: without any, the viewer chooses the appearance of an OBJ."""
     libraries = {found.strip() for found in _LIBRARIES.findall(data)}
     several = (f"{name}: its MTL files but for the first of {len(libraries)}",) if len(libraries) > 1 else ()
     if not resolver.materials:
@@ -285,6 +285,6 @@ def _trimesh() -> Any:
     except ImportError:
         raise SceneBuildError("mesh files need trimesh: pip install 'iris-session[files]'") from None
     logger = logging.getLogger("trimesh")
-    if not logger.handlers:  # else Python prints its tracebacks where nobody has asked for a log
+    if not logger.handlers:  # else Python prints its tracebacks although no log was configured
         logger.addHandler(logging.NullHandler())
     return trimesh

@@ -103,7 +103,7 @@ def read_urdf(
     references = References(path, package_dirs)
     data = read_bounded(path)
 
-    def read() -> Robot:  # yourdfpy raises whatever the missing attribute leads to
+    def read() -> Robot:  # yourdfpy raises arbitrary errors for missing attributes
         robot, skipped = parsed(path, data)
         return _Reader(path, name, robot, references, package_dirs, skipped, collisions).robot(T_world_root, scale)
 
@@ -472,7 +472,7 @@ def parsed(path: Path, data: bytes) -> tuple[Any, dict[str, None]]:
     if any("xacro" in str(space) for space in root.nsmap.values()) and b"<xacro:" in data:
         raise SceneBuildError(f"{path}: {xacro_advice(path)}")
     if not root.get("name"):
-        root.set("name", path.stem)  # yourdfpy wants one, and nobody reads it
+        root.set("name", path.stem)  # yourdfpy needs a name; it is not used
     skipped = _without_other_shapes(path, root)
     _check(path, root)
     made = yourdfpy.URDF.load(

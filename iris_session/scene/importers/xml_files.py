@@ -24,7 +24,7 @@ _BOM: Final = b"\xef\xbb\xbf"
 _MAX_DEPTH: Final = 64
 #: Characters of a DAE that a triangle takes at least: three numbers of one digit, and what is between them.
 _TRIANGLE_CHARACTERS: Final = 6
-#: One of a 3MF, whatever the prefix of its name.
+#: One of a 3MF, with any prefix of its name.
 _TRIANGLE: Final = re.compile(rb"<(?:[\w.-]+:)?triangle[\s/>]")
 
 
@@ -165,7 +165,7 @@ def _check_places(name: str, links: dict[str, list[str]], weights: dict[str, flo
     try:
         order = [*graphlib.TopologicalSorter(links).static_order()]
     except graphlib.CycleError:
-        raise SceneBuildError(f"{name} places something within itself: nobody can draw that") from None
+        raise SceneBuildError(f"{name} contains an instance of itself: remove it") from None
     drawn: dict[str, float] = {}
     depth: dict[str, int] = {}
     for thing in order:  # what is within something comes before it

@@ -95,10 +95,10 @@ def test_a_long_chain_is_refused(tmp_path: Path) -> None:
 def test_what_is_within_itself_is_refused(tmp_path: Path) -> None:
     node = '<node id="n"><instance_geometry url="#g"/><instance_node url="#n"/></node>'
     (tmp_path / "a.dae").write_text(dae("", node))
-    with pytest.raises(SceneBuildError, match="within itself"):
+    with pytest.raises(SceneBuildError, match="instance of itself"):
         load_file(tmp_path / "a.dae")
     objects = f'<object id="1">{components(2)}</object><object id="2">{components(1)}</object>'
-    with pytest.raises(SceneBuildError, match="within itself"):
+    with pytest.raises(SceneBuildError, match="instance of itself"):
         load_file(archive(tmp_path / "a.3mf", objects, '<item objectid="1"/>'))
 
 
