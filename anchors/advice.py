@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from anchors.groups import Group, Key
+from anchors.groups import ViewpointGroup, GroupKey
 from anchors.pose import Vec3, distance
 
 LOOK: Final = "look at the anchor sheet for a few seconds, from about half a metre"
@@ -16,21 +16,21 @@ CONTRADICT: Final = (
 )
 
 
-def disagreement(anchor_ids: Sequence[str]) -> str:
+def disagreement_advice(anchor_ids: Sequence[str]) -> str:
     """Why nothing can be said, with the names when several sheets take part in it."""
     if len(anchor_ids) < 2:
         return CONTRADICT
     return f"{CONTRADICT}; one of these was moved: {', '.join(anchor_ids)}"
 
 
-def upright(against_gravity: int, taken: int) -> str:
+def gravity_advice(against_gravity: int, taken: int) -> str:
     """Where nearly everything that was seen contradicts gravity."""
     if against_gravity <= 2 * taken or against_gravity < 5:
         return ""
     return "the sheet is not mounted as configured (lying, or on a wall): its pose contradicts the vertical"
 
 
-def tilted(tilt_rad: float) -> str:
+def tilt_advice(tilt_rad: float) -> str:
     """What was seen agrees with itself, but not with gravity."""
     return (
         f"the sheet is tilted by {math.degrees(tilt_rad):.0f} deg against the headset's vertical: lay it level, or "
@@ -38,7 +38,7 @@ def tilted(tilt_rad: float) -> str:
     )
 
 
-def size_advice(groups: Mapping[Key, Group], tolerance: float) -> str:
+def size_advice(groups: Mapping[GroupKey, ViewpointGroup], tolerance: float) -> str:
     """Warns about a sheet that is seen in several sizes; single measurements that are off do not count."""
     extremes: dict[str, tuple[float, float]] = {}
     for (anchor_id, _), group in groups.items():
@@ -48,7 +48,7 @@ def size_advice(groups: Mapping[Key, Group], tolerance: float) -> str:
     for anchor_id, (least, most) in extremes.items():
         if most - least <= tolerance * least:
             continue  # then no quantiles are further apart
-        seen = sorted(size for (name, _), group in groups.items() if name == anchor_id for size in group.sizes_seen())
+        seen = sorted(size for (name, _), group in groups.items() if name == anchor_id for size in group.list_sizes())
         low, high = seen[len(seen) // 10], seen[(9 * len(seen)) // 10 if len(seen) > 1 else 0]
         if high - low > tolerance * low:
             return f"sheet '{anchor_id}' is seen in different sizes: is there a second one, printed at another scale?"

@@ -19,31 +19,31 @@ from typing import Final
 
 import numpy as np
 
-from anchors.advice import CONTRADICT, LOOK, disagreement, size_advice, tilted, upright
-from anchors.groups import Group, Key, Memory, Sighting
+from anchors.advice import CONTRADICT, LOOK, disagreement_advice, size_advice, tilt_advice, gravity_advice
+from anchors.groups import ViewpointGroup, GroupKey, ObservationBuffer, AnchorObservation
 from anchors.lie import Array
-from anchors.noise import NoiseModel, isotropic, stated
+from anchors.noise import NoiseModel, isotropic_covariance, validate_covariance
 from anchors.pose import (
     PoseTuple,
     Quat,
     Vec3,
     compose,
     inverse,
-    is_place,
+    is_valid_point,
     is_rigid,
     quat_mul,
     quat_normalize,
     quat_rotate,
 )
-from anchors.robust import Merged
-from anchors.solve import Prior, Problem, Solution, agreeing_anchors, common_tilt, in_world, inverted, problem, solve
-from anchors.uncertainty import Z99, at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
+from anchors.robust import MergedObservation
+from anchors.solve import AlignmentPrior, AlignmentProblem, AlignmentSolution, count_agreeing_anchors, median_tilt, to_world_covariance, to_inverse_pose, build_problem, solve_alignment
+from anchors.uncertainty import Z99, covariance_at_point, chi2_quantile, length_p95, position_error_p95, rotation_error_p95
 
 __all__ = [
     "AlignmentConfig",
     "AlignmentEstimate",
     "AlignmentEstimator",
-    "mirrored",
+    "mirror_pose",
     "position_error_p95",
 ]
 
@@ -85,9 +85,9 @@ class AlignmentConfig:
     size_tolerance: float = 0.03
 
     @property
-    def prior(self) -> Prior:
+    def prior(self) -> AlignmentPrior:
         tilt = self.tilt_sigma_rad if self.dof == 4 else math.inf
-        return Prior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
+        return AlignmentPrior(tilt, self.drift_m_per_s, self.walk_m_per_sqrt_s)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class AlignmentEstimate:
 
     def covariance_at(self, point_world: Vec3) -> Array:
         """Covariance (3, 3) [m^2] of the position error at a point of the world."""
-        return at_point(self.covariance, self.pivot_world, point_world)
+        return covariance_at_point(self.covariance, self.pivot_world, point_world)
 
     def error_at(self, point_world: Vec3) -> float:
         """Stated p95 [m] at a point of the world, infinite when refused."""
@@ -145,13 +145,13 @@ class AlignmentEstimator:
     _against_gravity: int = 0  # in this epoch
     _misprints: dict[str, str] = field(default_factory=dict)  # by sheet: what its last measured size says
     _near: tuple[Array, Array] | None = None  # where the last solution was: the next one is not far
-    _memory: Memory = field(init=False)
+    _memory: ObservationBuffer = field(init=False)
 
     def __post_init__(self) -> None:
         if self.config.dof not in (4, 6):
             raise ValueError(f"dof {self.config.dof}: it is 4 (level headset) or 6 (tilt is measured)")
         c = self.config
-        self._memory = Memory(c.max_observations, c.max_in_group, c.max_groups, c.max_age_ns)
+        self._memory = ObservationBuffer(c.max_observations, c.max_in_group, c.max_groups, c.max_age_ns)
 
     @property
     def forgotten(self) -> int:
@@ -188,12 +188,12 @@ class AlignmentEstimator:
         if tracking_epoch < self.tracking_epoch:
             self.stale_epochs += 1
             return False
-        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not is_place(p_tracking_head):
+        if not is_rigid(T_tracking_anchor) or not math.isfinite(quality) or not is_valid_point(p_tracking_head):
             self.invalid += 1
             return False
         if tracking_epoch > self.tracking_epoch:
             self.tracking_epoch = tracking_epoch
-            self.start_anew()
+            self.reset()
         if not self._is_of_size(anchor_id, size_m):
             return False
         pose = self._upright(T_world_anchor, T_tracking_anchor, p_tracking_head, alternative)
@@ -203,11 +203,11 @@ class AlignmentEstimator:
             return False
         self._memory.add(
             (anchor_id, viewpoint_id),
-            Sighting(capture_ns, pose[0], pose[1], p_tracking_head, stated(covariance), quality, size_m),
+            AnchorObservation(capture_ns, pose[0], pose[1], p_tracking_head, validate_covariance(covariance), quality, size_m),
         )
         return True
 
-    def start_anew(self) -> None:
+    def reset(self) -> None:
         """What was observed holds no more: the tracking frame is another one."""
         self._memory.clear()
         self._against_gravity, self._misprints, self._near = 0, {}, None
@@ -222,7 +222,7 @@ class AlignmentEstimator:
         if alternative is not None:
             other = (alternative[0], quat_normalize(alternative[1])) if is_rigid(alternative) else None
         else:
-            other = mirrored(pose, p_head) if p_head is not None else None
+            other = mirror_pose(pose, p_head) if p_head is not None else None
         if other is None or _tilt(T_world_anchor, other) > self.config.max_tilt_rad:
             return None
         self.unmirrored += 1
@@ -248,48 +248,48 @@ class AlignmentEstimator:
     def estimate(self) -> AlignmentEstimate:
         """Solves what was observed in the current epoch. Groups that did not change are not merged again."""
         if len(self._memory) < self.config.min_observations:
-            return self._refusal(self._misprint() or upright(self._against_gravity, len(self._memory)) or LOOK)
-        groups = self._memory.with_a_say(self.config.min_observations)
+            return self._refusal(self._misprint() or gravity_advice(self._against_gravity, len(self._memory)) or LOOK)
+        groups = self._memory.select_mature_groups(self.config.min_observations)
         keys, merged = self._merge(groups)
         if not merged:
             return self._refusal(CONTRADICT)
         prior = self.config.prior
         b = self._problem(keys, merged, prior)
-        s = solve(b, prior, self._near)
+        s = solve_alignment(b, prior, self._near)
         against = prior.gravity and not self._is_majority(b, s, len(groups))
-        if against and common_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
-            free = solve(b, replace(prior, tilt_sigma_rad=math.inf))
+        if against and median_tilt(b) > self.config.tilt_warning_rad:  # do they contradict each other, or gravity?
+            free = solve_alignment(b, replace(prior, tilt_sigma_rad=math.inf))
             s = free if self._is_majority(b, free, len(groups)) else s
         if not s.inside.any():
-            return self._refusal(disagreement(sorted(set(b.anchor))))
-        tilt = s.tilt_seen(b)
+            return self._refusal(disagreement_advice(sorted(set(b.anchor))))
+        tilt = s.observed_tilt(b)
         if prior.gravity and tilt > self.config.follow_tilt_rad:
-            return self._refusal(tilted(tilt))
+            return self._refusal(tilt_advice(tilt))
         if prior.gravity and tilt > self.config.tilt_warning_rad:  # all see the same sheet: follow it, and warn
-            s = solve(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
+            s = solve_alignment(b, replace(prior, tilt_sigma_rad=tilt), (s.q, s.t))
         self._near = (s.q, s.t)
         agreeing = sum(m.n for m, ok in zip(merged, s.inside.tolist(), strict=True) if ok)
-        moved = outvoted(b.anchor, s)
+        moved = find_outvoted(b.anchor, s)
         if agreeing < self.config.min_observations or not self._is_majority(b, s, len(groups)):
-            return self._refusal(disagreement(sorted(set(b.anchor))))
+            return self._refusal(disagreement_advice(sorted(set(b.anchor))))
         return self._result(b, s, tilt, moved)
 
-    def _merge(self, groups: Mapping[Key, Group]) -> tuple[list[Key], list[Merged]]:
+    def _merge(self, groups: Mapping[GroupKey, ViewpointGroup]) -> tuple[list[GroupKey], list[MergedObservation]]:
         """One merged observation per anchor and viewpoint, of those whose observations agree."""
-        fallback = isotropic(self.config.position_sigma_m, self.config.rotation_sigma_rad)
+        fallback = isotropic_covariance(self.config.position_sigma_m, self.config.rotation_sigma_rad)
         keys, merged = [], []
         for key, group in groups.items():
-            one = group.solve(self.config.noise, fallback, self.config.min_agreeing)
+            one = group.merge(self.config.noise, fallback, self.config.min_agreeing)
             if one is not None:
                 keys.append(key)
                 merged.append(one)
         return keys, merged
 
-    def _problem(self, keys: list[Key], merged: list[Merged], prior: Prior) -> Problem:
+    def _problem(self, keys: list[GroupKey], merged: list[MergedObservation], prior: AlignmentPrior) -> AlignmentProblem:
         times = [self._memory.groups[key].capture_ns for key in keys]
-        newest = max(group.sightings[-1].capture_ns for group in self._memory.groups.values())
+        newest = max(group.observations[-1].capture_ns for group in self._memory.groups.values())
         poses = [self.anchors[anchor_id] for anchor_id, _ in keys]
-        return problem(
+        return build_problem(
             [anchor_id for anchor_id, _ in keys],
             np.array([p for p, _ in poses]),
             np.array([q for _, q in poses]),
@@ -298,20 +298,20 @@ class AlignmentEstimator:
             prior,
         )
 
-    def _is_majority(self, b: Problem, s: Solution, n_groups: int) -> bool:
+    def _is_majority(self, b: AlignmentProblem, s: AlignmentSolution, n_groups: int) -> bool:
         """Of three or more anchors most must agree (one that was moved may have been looked at most often), else of the
         viewpoints; those whose own observations do not agree count against it."""
         anchors = set(b.anchor)
         if len(anchors) > 2:
-            return 2 * agreeing_anchors(b.anchor, s.inside) > len(anchors)
+            return 2 * count_agreeing_anchors(b.anchor, s.inside) > len(anchors)
         return 2 * int(np.count_nonzero(s.inside)) > n_groups
 
-    def _result(self, b: Problem, s: Solution, tilt: float, moved: tuple[str, ...]) -> AlignmentEstimate:
+    def _result(self, b: AlignmentProblem, s: AlignmentSolution, tilt: float, moved: tuple[str, ...]) -> AlignmentEstimate:
         wider = s.chi2 / s.freedom if s.freedom > 0.0 and s.chi2 > chi2_quantile(s.freedom, Z99) else 1.0
         pivot = s.inside @ b.p_world / float(s.inside.sum())
         x, y, z = pivot.tolist()
         pivot_world = (x, y, z)
-        in_the_world = in_world(s.q, s.covariance, pivot) * wider
+        in_the_world = to_world_covariance(s.q, s.covariance, pivot) * wider
         covariance = tuple(in_the_world.ravel().tolist())
         error = length_p95(in_the_world[:3, :3])
         refused = not error <= self.config.max_error_m
@@ -324,7 +324,7 @@ class AlignmentEstimator:
         else:
             advice = size_advice(self._memory.groups, self.config.size_tolerance) or self._misprint()
         return AlignmentEstimate(
-            inverted(s.t, s.q),
+            to_inverse_pose(s.t, s.q),
             self.tracking_epoch,
             covariance,
             pivot_world,
@@ -368,13 +368,13 @@ _COUNTERS: Final = (
 )
 
 
-def outvoted(anchor: tuple[str, ...], s: Solution) -> tuple[str, ...]:
+def find_outvoted(anchor: tuple[str, ...], s: AlignmentSolution) -> tuple[str, ...]:
     """Anchors of which no viewpoint agrees with the rest."""
     agreeing = {name for name, ok in zip(anchor, s.inside.tolist(), strict=True) if ok}
     return tuple(sorted(set(anchor) - agreeing))
 
 
-def mirrored(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
+def mirror_pose(T_tracking_anchor: PoseTuple, p_tracking_head: Vec3) -> PoseTuple:
     """The other pose of a flat sheet that gives nearly the same image: its plane reflected along the line of sight.
 
     Under weak perspective an image does not change when depth is negated: R' = (I - 2 v v^T) R diag(1, 1, -1)

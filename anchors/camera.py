@@ -25,7 +25,7 @@ class CameraError(ValueError):
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraModel:
     """Image size [px], focal lengths and principal point [px], distortion coefficients."""
 
     width: int
@@ -51,11 +51,11 @@ class Camera:
     def coefficients(self) -> Array:
         return np.array(self.distortion if self.distortion else (0.0,) * 4)
 
-    def scaled(self, width: int, height: int) -> Camera:
+    def scaled(self, width: int, height: int) -> CameraModel:
         """The same camera read out at another resolution of the same field of view."""
         sx, sy = width / self.width, height / self.height
         # Pixel centres are whole numbers: the image's left edge is at -0.5.
-        return Camera(
+        return CameraModel(
             width,
             height,
             self.fx * sx,
@@ -68,7 +68,7 @@ class Camera:
     def project(self, points: Array, T_camera_points: PoseTuple | None = None) -> Array:
         """Pixels, shape (n, 2), of points, shape (n, 3) [m]."""
         pose = T_camera_points if T_camera_points is not None else ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        return self.project_with_jacobian(points, *rvec_tvec(pose))[0]
+        return self.project_with_jacobian(points, *to_rvec_tvec(pose))[0]
 
     def project_with_jacobian(self, points: Array, rvec: Array, tvec: Array) -> tuple[Array, Array]:
         """Pixels, shape (n, 2), and their derivatives by rotation vector and translation, shape (2 n, 6)."""
@@ -79,7 +79,7 @@ class Camera:
         )
         return np.asarray(found[0]).reshape(-1, 2), np.asarray(found[1])[:, :6]
 
-    def normalise(self, pixels: Array) -> Array:
+    def undistort(self, pixels: Array) -> Array:
         """Undistorted coordinates (x / z, y / z), shape (n, 2), of pixels."""
         import cv2
 
@@ -91,12 +91,12 @@ class Camera:
         return np.asarray(found).reshape(-1, 2)
 
 
-def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
+def parse_camera(text: str, width: int = 0, height: int = 0) -> CameraModel:
     """Intrinsics from a file: TOML (`width, height, fx, fy, cx, cy`, optional `distortion`), or a bare 3x3 matrix, for
     which the size of the images is needed."""
     matrix = _matrix_of(text)
     if matrix is not None:
-        return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+        return CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     wanted = "width, height, fx, fy, cx, cy [pixels], and if known distortion = [k1, k2, p1, p2, k3]"
     try:
         table = tomllib.loads(text)
@@ -105,7 +105,7 @@ def parse_camera(text: str, width: int = 0, height: int = 0) -> Camera:
     try:
         fx, fy, cx, cy = (float(table[key]) for key in ("fx", "fy", "cx", "cy"))
         width, height = int(table.get("width", width)), int(table.get("height", height))
-        return Camera(width, height, fx, fy, cx, cy, tuple(float(k) for k in table.get("distortion", ())))
+        return CameraModel(width, height, fx, fy, cx, cy, tuple(float(k) for k in table.get("distortion", ())))
     except KeyError as error:
         raise CameraError(f"{error.args[0]} is missing; wanted: {wanted}") from error
     except (TypeError, ValueError) as error:
@@ -122,18 +122,18 @@ def _matrix_of(text: str) -> Array | None:
     return values.reshape(3, 3) if values.size == 9 else None
 
 
-def rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
+def to_rvec_tvec(pose: PoseTuple) -> tuple[Array, Array]:
     """Rotation vector and translation of a pose, as OpenCV takes them."""
     return np.array(quat_to_rotvec(pose[1])), np.array(pose[0])
 
 
-def pose_of(rvec: Array, tvec: Array) -> PoseTuple:
+def pose_from_rvec_tvec(rvec: Array, tvec: Array) -> PoseTuple:
     """The pose of a rotation vector and translation."""
     r, t = np.asarray(rvec).ravel(), np.asarray(tvec).ravel()
     return (float(t[0]), float(t[1]), float(t[2])), quat_from_rotvec((float(r[0]), float(r[1]), float(r[2])))
 
 
-def matrix_of(pose: PoseTuple) -> Array:
+def pose_to_matrix(pose: PoseTuple) -> Array:
     """4x4 matrix of a pose."""
     (x, y, z), (w, i, j, k) = pose
     return np.array(
@@ -146,10 +146,10 @@ def matrix_of(pose: PoseTuple) -> Array:
     )
 
 
-def pose_of_matrix(matrix: Array) -> PoseTuple:
+def pose_from_matrix(matrix: Array) -> PoseTuple:
     """The pose of a 4x4 matrix; its rotation is made orthonormal (nearest in the least-squares sense)."""
     from scipy.spatial.transform import Rotation
 
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return pose_of(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])
+    return pose_from_rvec_tvec(Rotation.from_matrix(turn).as_rotvec(), matrix[:3, 3])

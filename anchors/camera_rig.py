@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import matrix_of, pose_of_matrix
+from anchors.camera import pose_to_matrix, pose_from_matrix
 from anchors.pose import PoseTuple, compose, inverse
 from anchors.robot_world import CalibrationError
 
@@ -24,7 +24,7 @@ _FLOOR: Final = (0.0003, math.radians(0.05))
 
 
 @dataclass(frozen=True)
-class View:
+class SheetView:
     """One camera saw one sheet: `T_camera_sheet` with its covariance (36 values, camera frame)."""
 
     camera: str
@@ -34,7 +34,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraRig:
     """Poses in the common frame, covariances (36 values, common frame) beside them. `residuals`: per view, distance
     [m] and angle [rad] between what was seen and what follows from the result."""
 
@@ -44,7 +44,7 @@ class Rig:
     residuals: tuple[tuple[float, float], ...]
 
 
-def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> Rig:
+def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple]) -> CameraRig:
     """Cameras and unknown sheets in the frame in which the known ones stand. Raises `CalibrationError` for what
     nothing connects with a known sheet."""
     if not views:
@@ -60,9 +60,9 @@ def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> R
         if name[0] == "camera"
     }
     differences = [_difference(view, poses) for view in views]
-    return Rig(
-        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
-        {name: pose_of_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
+    return CameraRig(
+        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
+        {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
         blocks,
         tuple((float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))) for d in differences),
     )
@@ -71,7 +71,7 @@ def solve_rig(views: Sequence[View], T_base_sheet: Mapping[str, PoseTuple]) -> R
 _Name = tuple[str, str]
 
 
-def _first_guess(views: Sequence[View], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
+def _first_guess(views: Sequence[SheetView], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
     """From known sheets outwards, one view for each."""
     poses: dict[_Name, PoseTuple] = {("sheet", name): T for name, T in known.items()}
     waiting = list(views)
@@ -92,11 +92,11 @@ def _first_guess(views: Sequence[View], known: Mapping[str, PoseTuple]) -> dict[
                 "let it see one of those, or a sheet that another camera sees too"
             )
         waiting = left
-    return {name: matrix_of(T) for name, T in poses.items()}
+    return {name: pose_to_matrix(T) for name, T in poses.items()}
 
 
 def _least_squares(
-    views: Sequence[View], poses: dict[_Name, Array], free: list[_Name]
+    views: Sequence[SheetView], poses: dict[_Name, Array], free: list[_Name]
 ) -> tuple[dict[_Name, Array], Array, float]:
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
@@ -122,11 +122,11 @@ def _least_squares(
     return moved(solved.x), np.asarray(solved.jac.T @ solved.jac), max(1.0, 2.0 * float(solved.cost) / freedom)
 
 
-def _difference(view: View, poses: Mapping[_Name, Array]) -> Array:
+def _difference(view: SheetView, poses: Mapping[_Name, Array]) -> Array:
     """Position and rotation of the sheet as it follows from the poses against what was seen, camera frame."""
     from scipy.spatial.transform import Rotation
 
-    seen = matrix_of(view.T_camera_sheet)
+    seen = pose_to_matrix(view.T_camera_sheet)
     P = np.linalg.inv(poses["camera", view.camera]) @ poses["sheet", view.sheet]
     turn = Rotation.from_matrix(P[:3, :3] @ seen[:3, :3].T).as_rotvec()
     return np.concatenate([P[:3, 3] - seen[:3, 3], turn])

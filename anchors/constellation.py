@@ -17,9 +17,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from anchors.graph import Graph, merge_edges, reachable, start
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, swing
-from anchors.noise import NoiseModel, isotropic
+from anchors.graph import ObservationGraph, merge_edges, find_reachable, initial_guess
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_to_matrix, quat_multiply, swing
+from anchors.noise import NoiseModel, isotropic_covariance
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, apply, compose, inverse, quat_angle, quat_normalize
 from anchors.uncertainty import length_p95
 
@@ -32,7 +32,7 @@ class ConstellationError(ValueError):
 
 
 @dataclass(frozen=True)
-class Seen:
+class SheetObservation:
     """One observation `T_tracking_anchor` by a headset (any name) in one of its tracking epochs."""
 
     headset: str
@@ -123,7 +123,7 @@ def _numbers(name: str, table: Any, key: str, n: int) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Solved:
+class ConstellationSolution:
     """A constellation, the headsets' alignments (by name and epoch) and how well each look fits.
 
     `residuals_m`: per sheet, the root mean square of how far looks put it off. `rejected`: looks that fit nowhere, as
@@ -137,28 +137,28 @@ class Solved:
 
 
 def solve_constellation(
-    observations: Sequence[Seen],
+    observations: Sequence[SheetObservation],
     reference: str,
     T_world_reference: PoseTuple = IDENTITY_POSE,
     noise: NoiseModel | None = None,
     sizes: Mapping[str, float] | None = None,
     tilt_sigma_rad: float = math.radians(0.2),
-) -> Solved:
+) -> ConstellationSolution:
     """All sheets that were seen, relative to `reference`. Raises `ConstellationError` where sheets hang together by no
     look: two sheets are tied by a headset that saw both without losing its tracking in between."""
-    edges = merge_edges(observations, noise or NoiseModel(), isotropic(0.005, math.radians(0.6)))
+    edges = merge_edges(observations, noise or NoiseModel(), isotropic_covariance(0.005, math.radians(0.6)))
     names = sorted({e.anchor_id for e in edges})
     if reference not in names:
         raise ConstellationError(f"sheet '{reference}' was not seen; seen: {', '.join(names) or 'none'}")
-    lost = sorted(set(names) - reachable(edges, reference))
+    lost = sorted(set(names) - find_reachable(edges, reference))
     if lost:
         raise ConstellationError(
             f"sheets not tied to '{reference}': {', '.join(lost)}; look at one of them and at one that is tied, one "
             "after the other, with the same headset"
         )
-    graph = Graph(edges, [n for n in names if n != reference], reference, T_world_reference)
+    graph = ObservationGraph(edges, [n for n in names if n != reference], reference, T_world_reference)
     weights = np.ones(len(edges))
-    x = start(graph)
+    x = initial_guess(graph)
     covariance = np.zeros((0, 0))
     for _ in range(3):  # what fits nowhere is left out for good, else it would still pull
         x, covariance, distance2 = _least_squares(graph, x, weights, tilt_sigma_rad)
@@ -167,7 +167,7 @@ def solve_constellation(
             break
         weights = now
     kept = [e for e, weight in zip(edges, weights.tolist(), strict=True) if weight > 0.0]
-    adrift = sorted(set(names) - reachable(kept, reference))
+    adrift = sorted(set(names) - find_reachable(kept, reference))
     if adrift:  # nothing holds them in place any more, so no error could be stated
         raise ConstellationError(
             f"what was seen of {', '.join(adrift)} contradicts itself or the other sheets: were sheets moved "
@@ -177,7 +177,7 @@ def solve_constellation(
 
 
 def _least_squares(
-    graph: Graph, x0: tuple[Array, Array], weights: Array, tilt_sigma_rad: float
+    graph: ObservationGraph, x0: tuple[Array, Array], weights: Array, tilt_sigma_rad: float
 ) -> tuple[tuple[Array, Array], Array, Array]:
     """Robust least squares over increments of all poses; returns poses, covariance of the increments, and distances."""
     from scipy.optimize import least_squares
@@ -205,19 +205,19 @@ def _least_squares(
     return (p, q), covariance, np.sum(_whitened(graph, p, q) ** 2, axis=1)
 
 
-def _whitened(graph: Graph, p: Array, q: Array) -> Array:
+def _whitened(graph: ObservationGraph, p: Array, q: Array) -> Array:
     """(edges, 6): seen minus predicted `T_tracking_anchor`, in units of their noise."""
     pa, qa = graph.anchor_poses(p, q)
     ph, qh = p[graph.headset_index], q[graph.headset_index]
-    R = quat_matrix(quat_conjugate(qh))
+    R = quat_to_matrix(quat_conjugate(qh))
     r_p = graph.p - np.einsum("eij,ej->ei", R, pa - ph)
     r_q = quat_log(quat_multiply(graph.q, quat_conjugate(quat_multiply(quat_conjugate(qh), qa))))
     return np.asarray(np.einsum("eij,ej->ei", graph.whitening, np.concatenate([r_p, r_q], axis=1)))
 
 
 def _solved(
-    graph: Graph, x: tuple[Array, Array], covariance: Array, weights: Array, sizes: Mapping[str, float]
-) -> Solved:
+    graph: ObservationGraph, x: tuple[Array, Array], covariance: Array, weights: Array, sizes: Mapping[str, float]
+) -> ConstellationSolution:
     p, q = x
     anchors = {graph.reference: graph.T_world_reference}
     error = {graph.reference: 0.0}
@@ -235,7 +235,7 @@ def _solved(
         off.setdefault(e.anchor_id, []).append(math.dist(seen, anchors[e.anchor_id][0]))
     rms = {name: math.sqrt(sum(d * d for d in ds) / len(ds)) for name, ds in off.items()}
     known = {name: size for name, size in sizes.items() if name in anchors}
-    return Solved(Constellation(graph.reference, anchors, error, known), headsets, rms, tuple(rejected))
+    return ConstellationSolution(Constellation(graph.reference, anchors, error, known), headsets, rms, tuple(rejected))
 
 
 def _pose(p: Array, q: Array) -> PoseTuple:
@@ -243,7 +243,7 @@ def _pose(p: Array, q: Array) -> PoseTuple:
 
 
 @dataclass(frozen=True)
-class Moved:
+class MovedSheet:
     """A sheet that no longer lies where it did relative to the others, and by how much."""
 
     anchor_id: str
@@ -253,7 +253,7 @@ class Moved:
 
 def find_moved(
     saved: Constellation, now: Constellation, min_m: float = 0.005, min_rad: float = math.radians(1.5)
-) -> tuple[Moved, ...]:
+) -> tuple[MovedSheet, ...]:
     """Sheets that moved relative to those that stayed, which are the largest set that agrees. Raises
     `ConstellationError` when that is no majority: of two sheets nobody can say which one moved."""
     names = sorted(set(saved.anchors) & set(now.anchors))
@@ -272,7 +272,7 @@ def find_moved(
     return tuple(sorted(moved, key=lambda m: -m.distance_m))
 
 
-def _moves(saved: Constellation, now: Constellation, a: str, b: str, min_m: float, min_rad: float) -> Moved | None:
+def _moves(saved: Constellation, now: Constellation, a: str, b: str, min_m: float, min_rad: float) -> MovedSheet | None:
     """How far `b` moved as seen from `a`; what the stated errors and the turn of `a` explain is no move."""
     p0, q0 = _relative(saved, a, b)
     p1, q1 = _relative(now, a, b)
@@ -280,7 +280,7 @@ def _moves(saved: Constellation, now: Constellation, a: str, b: str, min_m: floa
     far, turn = math.dist(p0, p1), quat_angle(q0, q1)
     errors = (saved.error_m.get(a, 0.0), saved.error_m.get(b, 0.0), now.error_m.get(a, 0.0), now.error_m.get(b, 0.0))
     slack = math.sqrt(sum(e * e for e in errors)) + 0.25 * min_rad * lever
-    return Moved(b, far, turn) if far > min_m + slack or turn > min_rad else None
+    return MovedSheet(b, far, turn) if far > min_m + slack or turn > min_rad else None
 
 
 def _relative(c: Constellation, a: str, b: str) -> PoseTuple:

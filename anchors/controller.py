@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
-from anchors.noise import isotropic
+from anchors.lie import Array, quat_conjugate, quat_log, quat_to_matrix, quat_multiply
+from anchors.noise import isotropic_covariance
 from anchors.pose import PoseTuple, Vec3, compose, is_rigid, quat_normalize
 
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
@@ -31,7 +31,7 @@ def controller_covariance(
     position_sigma_m: float = 0.0015, rotation_sigma_rad: float = math.radians(0.3)
 ) -> tuple[float, ...]:
     """Covariance to state with each observation of a tracked controller (36 values, the form of an observation)."""
-    return tuple(float(v) for v in isotropic(position_sigma_m, rotation_sigma_rad).ravel())
+    return tuple(float(v) for v in isotropic_covariance(position_sigma_m, rotation_sigma_rad).ravel())
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def calibrate_tip(
             f"turned by {math.degrees(weak):.0f} deg about the least used direction, {math.degrees(min_turn_rad):.0f} "
             "are needed: tilt the controller to the front and to the side while its tip stays"
         )
-    A = np.concatenate([quat_matrix(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)  # (n, 3, 6)
+    A = np.concatenate([quat_to_matrix(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)  # (n, 3, 6)
     keep = np.ones(len(q), dtype=bool)
     x, errors, sigma = np.zeros(6), np.zeros(len(q)), 0.0
     for _ in range(5):

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply
-from anchors.noise import NoiseModel, isotropic
-from anchors.pose import PoseTuple, Vec3, compose, is_place, is_rigid
+from anchors.lie import Array, quat_conjugate, quat_log, quat_to_matrix, quat_multiply
+from anchors.noise import NoiseModel, isotropic_covariance
+from anchors.pose import PoseTuple, Vec3, compose, is_valid_point, is_rigid
 from anchors.uncertainty import length_p95
 
 
@@ -30,7 +30,7 @@ class Disagreement(NamedTuple):
 
     a: str
     b: str
-    thing: str
+    target: str
     error_m: float
     error_rad: float
     expected_p95_m: float
@@ -38,7 +38,7 @@ class Disagreement(NamedTuple):
     n: int
 
     @property
-    def as_expected(self) -> bool:
+    def is_expected(self) -> bool:
         """Twice the p95 is beyond chance (about one pair in 10^4 for errors along one axis, fewer for others)."""
         return self.error_m <= 2.0 * self.expected_p95_m
 
@@ -50,9 +50,9 @@ class CrossCheckConfig:
 
     max_age_ns: int = 60 * 1_000_000_000
     max_gap_ns: int = 50_000_000
-    min_seen: int = 5
-    max_seen: int = 100
-    max_things: int = 64
+    min_observations: int = 5
+    max_observations: int = 100
+    max_targets: int = 64
 
 
 class _Look(NamedTuple):
@@ -70,58 +70,58 @@ class CrossCheck:
 
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
-    unseen_sigma_m: float = 0.005
+    unknown_viewpoint_sigma_m: float = 0.005
     dropped: int = 0
-    _looks: dict[tuple[str, str], deque[_Look]] = field(default_factory=dict)
+    _observations: dict[tuple[str, str], deque[_Look]] = field(default_factory=dict)
     _epochs: dict[str, int] = field(default_factory=dict)
 
-    def see(
+    def add_observation(
         self,
         headset: str,
-        thing: str,
-        T_tracking_thing: PoseTuple,
+        target: str,
+        T_tracking_target: PoseTuple,
         p_tracking_head: Vec3 | None,
         capture_ns: int,
         tracking_epoch: int,
         viewpoint_id: int = 0,
     ) -> None:
         """One detection of a sheet, or one tracked pose of a controller, on the session's clock."""
-        key = (headset, thing)
+        key = (headset, target)
         epoch = self._epochs.get(headset, tracking_epoch)
-        if not is_rigid(T_tracking_thing) or not is_place(p_tracking_head) or tracking_epoch < epoch:
+        if not is_rigid(T_tracking_target) or not is_valid_point(p_tracking_head) or tracking_epoch < epoch:
             self.dropped += 1
             return
         if tracking_epoch > epoch:
-            self.forget(headset)
-        if key not in self._looks and not self._room(capture_ns):
+            self.discard_headset(headset)
+        if key not in self._observations and not self._room(capture_ns):
             self.dropped += 1
             return
         self._epochs[headset] = tracking_epoch
-        looks = self._looks.setdefault(key, deque(maxlen=self.config.max_seen))
+        looks = self._observations.setdefault(key, deque(maxlen=self.config.max_observations))
         if looks and capture_ns <= looks[-1].capture_ns:
             self.dropped += 1  # out of order
             return
-        looks.append(_Look(capture_ns, T_tracking_thing, p_tracking_head, viewpoint_id))
+        looks.append(_Look(capture_ns, T_tracking_target, p_tracking_head, viewpoint_id))
 
     def _room(self, now_ns: int) -> bool:
         """Whether one thing more can be kept; those that nobody saw for long make room."""
-        if len(self._looks) >= self.config.max_things:
+        if len(self._observations) >= self.config.max_targets:
             fresh = {
-                k: looks for k, looks in self._looks.items() if looks[-1].capture_ns > now_ns - self.config.max_age_ns
+                k: looks for k, looks in self._observations.items() if looks[-1].capture_ns > now_ns - self.config.max_age_ns
             }
-            self._looks = fresh
-        return len(self._looks) < self.config.max_things
+            self._observations = fresh
+        return len(self._observations) < self.config.max_targets
 
-    def forget(self, headset: str) -> None:
+    def discard_headset(self, headset: str) -> None:
         """It left, or its tracking frame is a new one."""
-        for key in [key for key in self._looks if key[0] == headset]:
-            del self._looks[key]
+        for key in [key for key in self._observations if key[0] == headset]:
+            del self._observations[key]
         self._epochs.pop(headset, None)
 
-    def forget_thing(self, thing: str) -> None:
+    def discard_target(self, thing: str) -> None:
         """It was moved."""
-        for key in [key for key in self._looks if key[1] == thing]:
-            del self._looks[key]
+        for key in [key for key in self._observations if key[1] == thing]:
+            del self._observations[key]
 
     def compare(
         self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()
@@ -129,7 +129,7 @@ class CrossCheck:
         """All pairs of aligned headsets and all things that both saw. `moving`: things that do not stand still."""
         out = []
         headsets = sorted(h for h, e in alignments.items() if not e.refused and e.tracking_epoch == self._epochs.get(h))
-        for thing in sorted({thing for _, thing in self._looks}):
+        for thing in sorted({thing for _, thing in self._observations}):
             for a, b in combinations(headsets, 2):
                 looks_a, looks_b = self._fresh(a, thing, now_ns), self._fresh(b, thing, now_ns)
                 ways = self._together if thing in moving else self._apart
@@ -139,13 +139,13 @@ class CrossCheck:
         return out
 
     def _fresh(self, headset: str, thing: str, now_ns: int) -> list[_Look]:
-        looks = self._looks.get((headset, thing), ())
+        looks = self._observations.get((headset, thing), ())
         return [k for k in looks if 0 <= now_ns - k.capture_ns <= self.config.max_age_ns]
 
     def _apart(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
         """A thing at rest: every look of the one with the same number of the other; medians are taken later."""
         n = min(len(a), len(b))
-        return [(x.pose, y.pose) for x, y in zip(a[-n:], b[-n:], strict=True)] if n >= self.config.min_seen else None
+        return [(x.pose, y.pose) for x, y in zip(a[-n:], b[-n:], strict=True)] if n >= self.config.min_observations else None
 
     def _together(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
         """A thing that moves: looks of `a`, and those of `b` interpolated to the same instants."""
@@ -164,7 +164,7 @@ class CrossCheck:
                     p0[2] + share * (p1[2] - p0[2]),
                 )
                 pairs.append((look.pose, (p, q0 if share < 0.5 else q1)))
-        return pairs if len(pairs) >= self.config.min_seen else None
+        return pairs if len(pairs) >= self.config.min_observations else None
 
     def _one(
         self,
@@ -194,9 +194,9 @@ class CrossCheck:
         heads = [k.p_head for k in looks if k.p_head is not None]
         if heads:
             p = np.median([k.pose[0] for k in looks], axis=0)
-            common, each = self.noise.seen_from(np.median(heads, axis=0), p)
+            common, each = self.noise.compute_covariances(np.median(heads, axis=0), p)
         else:
-            common, each = self.noise.split(isotropic(self.unseen_sigma_m, 0.01))
+            common, each = self.noise.split_covariance(isotropic_covariance(self.unknown_viewpoint_sigma_m, 0.01))
         C = common[:3, :3] / viewpoints + each[:3, :3] * (math.pi / 2.0 / len(looks))
-        R = quat_matrix(np.array(estimate.T_world_tracking[1]))
+        R = quat_to_matrix(np.array(estimate.T_world_tracking[1]))
         return np.asarray(R @ C @ R.T)

@@ -17,10 +17,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import Camera, pose_of, rvec_tvec
+from anchors.camera import CameraModel, pose_from_rvec_tvec, to_rvec_tvec
 from anchors.pose import PoseTuple
-from anchors.registration import Registered, register
-from anchors.sheet import Sheet, dictionary
+from anchors.registration import PhotometricFit, fit_print
+from anchors.sheet import Sheet, load_dictionary
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -47,7 +47,7 @@ _MAX_RMS: Final = 0.25
 
 
 @dataclass(frozen=True)
-class Sighting:
+class SheetDetection:
     """One sheet in one picture.
 
     `covariance`: 36 values, 6x6 row-major, (x, y, z [m], rx, ry, rz [rad]), camera frame, at the sheet's origin.
@@ -81,7 +81,7 @@ class DetectionError(ValueError):
 class SheetDetector:
     """Finds known sheets in pictures of one camera."""
 
-    def __init__(self, sheets: Sequence[Sheet], camera: Camera) -> None:
+    def __init__(self, sheets: Sequence[Sheet], camera: CameraModel) -> None:
         names = [sheet.anchor_id for sheet in sheets]
         if len(set(names)) != len(names):
             raise DetectionError(f"two sheets have the same id: {', '.join(sorted(names))}")
@@ -90,9 +90,9 @@ class SheetDetector:
         longer = max(camera.width, camera.height)
         self._detectors = {scale: _marker_detector(longer * scale) for scale in (1, _ENLARGE)}
 
-    def detect(self, image: NDArray[Any]) -> list[Sighting]:
+    def detect(self, image: NDArray[Any]) -> list[SheetDetection]:
         """Sheets in one picture, shape (height, width) or (height, width, 3) uint8, by id."""
-        grey = grey_of(image, self.camera)
+        grey = to_grey(image, self.camera)
         found = self._find(grey, 1)
         wanted = [sheet for sheet in self.sheets if sum(k in found for k in sheet.marker_ids) < len(sheet.marker_ids)]
         if wanted and grey.size * _ENLARGE**2 <= _MAX_ENLARGED_PIXELS:
@@ -114,7 +114,7 @@ class SheetDetector:
             found.setdefault(marker_id, []).append((four.reshape(4, 2).astype(np.float64) + 0.5) / scale - 0.5)
         return found
 
-    def _board(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> Sighting | None:
+    def _board(self, sheet: Sheet, found: Mapping[int, list[Array]], grey: Image) -> SheetDetection | None:
         seen = {
             number: candidates[0]
             for number, marker_id in enumerate(sheet.marker_ids)
@@ -138,11 +138,11 @@ class _Poses:
     markers: int
 
 
-def detect_codes(image: NDArray[Any], camera: Camera, edges_m: Mapping[str, float]) -> list[Sighting]:
+def detect_codes(image: NDArray[Any], camera: CameraModel, edges_m: Mapping[str, float]) -> list[SheetDetection]:
     """Bare QR codes whose text and edge [m] are known. Reaches half as far as the markers of a sheet."""
     import cv2
 
-    grey = grey_of(image, camera)
+    grey = to_grey(image, camera)
     found, texts, corners, _ = cv2.QRCodeDetectorAruco().detectAndDecodeMulti(grey)
     sightings = []
     for text, four in zip(texts if found else (), corners if found else (), strict=True):
@@ -155,7 +155,7 @@ def detect_codes(image: NDArray[Any], camera: Camera, edges_m: Mapping[str, floa
     return sightings
 
 
-def grey_of(image: NDArray[Any], camera: Camera) -> Image:
+def to_grey(image: NDArray[Any], camera: CameraModel) -> Image:
     """The picture as grey values. Raises `DetectionError` when it is not one of this camera."""
     import cv2
 
@@ -177,10 +177,10 @@ def _marker_detector(longer_side_px: int) -> Any:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_side_px
     parameters.relativeCornerRefinmentWinSize = 0.2
-    return cv2.aruco.ArucoDetector(dictionary(), parameters)
+    return cv2.aruco.ArucoDetector(load_dictionary(), parameters)
 
 
-def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -> _Poses | None:
+def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: CameraModel) -> _Poses | None:
     """Poses by as many markers as agree on one board; of equally many, those that fit best."""
     for n in range(len(seen), MIN_MARKERS - 1, -1):
         agreeing = []
@@ -195,15 +195,15 @@ def _consistent_board(sheet: Sheet, seen: Mapping[int, Array], camera: Camera) -
     return None
 
 
-def _largest_error(poses: _Poses, pose: PoseTuple, camera: Camera) -> float:
+def _largest_error(poses: _Poses, pose: PoseTuple, camera: CameraModel) -> float:
     return float(np.linalg.norm(camera.project(poses.points, pose) - poses.pixels, axis=1).max())
 
 
-def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> _Poses | None:
+def _plane_poses(points: Array, pixels: Array, camera: CameraModel, markers: int) -> _Poses | None:
     import cv2
 
     # Undistorted to the last bit first: solvePnP does so to a few hundredths of a pixel only.
-    normalised = camera.normalise(pixels)
+    normalised = camera.undistort(pixels)
     ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
         points.reshape(-1, 1, 3), normalised.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -222,7 +222,7 @@ def _plane_poses(points: Array, pixels: Array, camera: Camera, markers: int) -> 
     return _Poses(solved[0], other, points, pixels, markers)
 
 
-def _refine_corners(points: Array, pixels: Array, camera: Camera, rvec: Array, tvec: Array) -> PoseTuple | None:
+def _refine_corners(points: Array, pixels: Array, camera: CameraModel, rvec: Array, tvec: Array) -> PoseTuple | None:
     """Least squares of the reprojection from one of the two starts; `None` when it leaves the front of the camera."""
     from scipy.optimize import least_squares
 
@@ -235,20 +235,20 @@ def _refine_corners(points: Array, pixels: Array, camera: Camera, rvec: Array, t
         method="lm",
         max_nfev=50,
     )
-    return pose_of(solved.x[:3], solved.x[3:]) if solved.x[5] > 0.0 else None
+    return pose_from_rvec_tvec(solved.x[:3], solved.x[3:]) if solved.x[5] > 0.0 else None
 
 
 def _differ(a: PoseTuple, b: PoseTuple) -> bool:
     return abs(sum(p * q for p, q in zip(a[1], b[1], strict=True))) < math.cos(0.5 * math.radians(0.5))
 
 
-def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighting | None:
+def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: CameraModel) -> SheetDetection | None:
     """The better of both poses after the print was laid over the picture; by corners alone where that fails."""
     by_corners = _by_corners(sheet, poses, camera)
     starts = [poses.best[0]]
     if poses.mirrored is not None and by_corners.mirrored_ratio < _CLEAR_RATIO:
         starts.append(poses.mirrored[0])
-    tried = [register(grey, camera, sheet, start) for start in starts]
+    tried = [fit_print(grey, camera, sheet, start) for start in starts]
     right = [
         one
         for one in tried
@@ -273,7 +273,7 @@ def _refined(sheet: Sheet, poses: _Poses, grey: Image, camera: Camera) -> Sighti
 
 
 def _compared(
-    best: Registered, starts: Sequence[PoseTuple], tried: Sequence[Registered | None]
+    best: PhotometricFit, starts: Sequence[PoseTuple], tried: Sequence[PhotometricFit | None]
 ) -> tuple[PoseTuple | None, float]:
     """The pose that the other start leads to, and how much worse it fits; none where both lead to the same one."""
     for start, other in zip(starts, tried, strict=True):
@@ -284,16 +284,16 @@ def _compared(
     return None, math.inf
 
 
-def _by_corners(sheet: Sheet, poses: _Poses, camera: Camera, sigma_px: float = _CORNER_SIGMA_PX) -> Sighting:
+def _by_corners(sheet: Sheet, poses: _Poses, camera: CameraModel, sigma_px: float = _CORNER_SIGMA_PX) -> SheetDetection:
     pose, rms = poses.best
-    rvec, tvec = rvec_tvec(pose)
+    rvec, tvec = to_rvec_tvec(pose)
     J = camera.project_with_jacobian(poses.points, rvec, tvec)[1]
     per_axis = max(rms / math.sqrt(2.0), sigma_px)
     by_rvec: Array = np.asarray(np.linalg.inv(J.T @ J) * per_axis**2, dtype=np.float64)
     mirrored, ratio = None, math.inf
     if poses.mirrored is not None:
         mirrored, ratio = poses.mirrored[0], poses.mirrored[1] / max(rms, 1e-9)
-    return Sighting(
+    return SheetDetection(
         anchor_id=sheet.anchor_id,
         kind="board",
         edge_m=sheet.edge_m,

@@ -18,9 +18,9 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_matrix
-from anchors.noise import NoiseModel, isotropic
-from anchors.pose import PoseTuple, Vec3, apply, distance, is_place, is_rigid, quat_angle
+from anchors.lie import Array, quat_to_matrix
+from anchors.noise import NoiseModel, isotropic_covariance
+from anchors.pose import PoseTuple, Vec3, apply, distance, is_valid_point, is_rigid, quat_angle
 
 AlarmKind = Literal["changed", "differs", "jump", "epoch"]
 
@@ -61,12 +61,12 @@ class DriftConfig:
     min_change_m: float = 0.005
     min_difference_m: float = 0.010
     jump_m: float = 0.03
-    jump_in_a_row: int = 3
+    jump_count: int = 3
     max_speed_m_per_s: float = 6.0
     max_turn_rad_per_s: float = 20.0
     quiet_ns: int = 2_000_000_000
-    max_seen: int = 600
-    unseen_sigma_m: float = 0.005
+    max_detections: int = 600
+    unknown_viewpoint_sigma_m: float = 0.005
 
 
 class _Seen(NamedTuple):
@@ -93,13 +93,13 @@ class DriftMonitor:
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: DriftConfig = field(default_factory=DriftConfig)
     tracking_epoch: int = 0
-    _seen: dict[str, deque[_Seen]] = field(default_factory=dict)
+    _detections: dict[str, deque[_Seen]] = field(default_factory=dict)
     _quiet_until_ns: dict[str, int] = field(default_factory=dict)
     _references: dict[str, tuple[int, int, _Window | None]] = field(default_factory=dict)
     _steady_ns: dict[str, int] = field(default_factory=dict)
     _head: tuple[int, PoseTuple] | None = None
 
-    def head(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
+    def add_head_pose(self, T_tracking_head: PoseTuple, capture_ns: int, tracking_epoch: int) -> Alarm | None:
         """A head pose as tracked: a new epoch or an impossible speed is a jump."""
         if tracking_epoch < self.tracking_epoch or not is_rigid(T_tracking_head):
             return None  # of a frame that is void, or no pose: nothing to compare with
@@ -115,7 +115,7 @@ class DriftMonitor:
             return Alarm("jump", "", moved, capture_ns)
         return None
 
-    def observe(
+    def add_observation(
         self,
         anchor_id: str,
         p_tracking_anchor: Vec3,
@@ -126,12 +126,12 @@ class DriftMonitor:
         alignment: AlignmentEstimate | None = None,
     ) -> Alarm | None:
         """One detection, and the alignment in force (`None`: none). Says at most one thing at a time."""
-        if not is_place(p_tracking_anchor) or not is_place(p_tracking_head):
+        if not is_valid_point(p_tracking_anchor) or not is_valid_point(p_tracking_head):
             return None
         alarm = self._epoch(capture_ns, tracking_epoch)
         if alarm is not None or tracking_epoch < self.tracking_epoch or anchor_id not in self.anchors:
             return alarm
-        seen = self._seen.setdefault(anchor_id, deque(maxlen=self.config.max_seen))
+        seen = self._detections.setdefault(anchor_id, deque(maxlen=self.config.max_detections))
         while seen and not 0 <= capture_ns - seen[0].capture_ns <= self.config.window_ns + self.config.reference_ns:
             seen.popleft()
         seen.append(_Seen(capture_ns, p_tracking_anchor, p_tracking_head, viewpoint_id))
@@ -140,12 +140,12 @@ class DriftMonitor:
         return self._judge(anchor_id, capture_ns, alignment)
 
     def _judge(self, anchor_id: str, now_ns: int, alignment: AlignmentEstimate | None) -> Alarm | None:
-        seen = self._seen[anchor_id]
+        seen = self._detections[anchor_id]
         new = self._newest(seen, now_ns)
         reference = self._before(anchor_id, now_ns, new[-1].viewpoint_id)
         jumped = self._jump(new, reference)
         if jumped:
-            since_ns = new[-self.config.jump_in_a_row].capture_ns
+            since_ns = new[-self.config.jump_count].capture_ns
             beside = self._stayed_beside(anchor_id, since_ns, jumped)
             if beside:
                 return self._alarm("changed", anchor_id, jumped, now_ns, beside)
@@ -179,15 +179,15 @@ class DriftMonitor:
         self._quiet_until_ns[anchor_id] = now_ns + self.config.quiet_ns
         self._references.pop(anchor_id, None)
         self._steady_ns.pop(anchor_id, None)
-        self._seen[anchor_id].clear()
+        self._detections[anchor_id].clear()
         return Alarm(kind, anchor_id, size_m, now_ns, beside)
 
     def _stayed_beside(self, anchor_id: str, since_ns: int, size_m: float) -> tuple[str, ...]:
         """Other anchors that are seen where they were, after this one was seen to be off by `size_m`."""
         stayed = []
-        for other in sorted(self._seen):
+        for other in sorted(self._detections):
             kept = self._references.get(other)
-            later = [s.p for s in self._seen[other] if s.capture_ns >= since_ns]
+            later = [s.p for s in self._detections[other] if s.capture_ns >= since_ns]
             if other == anchor_id or kept is None or kept[2] is None or len(later) < _ENOUGH_BESIDE:
                 continue
             if float(np.linalg.norm(_median(later) - kept[2].p)) < 0.5 * size_m:
@@ -203,7 +203,7 @@ class DriftMonitor:
         kept = self._references.get(anchor_id)
         if kept is not None and 0 < kept[0] - now_ns <= self.config.reference_every_ns and kept[1] == viewpoint_id:
             return kept[2]
-        old = [s for s in self._seen[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
+        old = [s for s in self._detections[anchor_id] if now_ns - s.capture_ns >= self.config.window_ns]
         reference = self._window(old, viewpoint_id)
         self._references[anchor_id] = (now_ns + self.config.reference_every_ns, viewpoint_id, reference)
         return reference
@@ -224,9 +224,9 @@ class DriftMonitor:
         p = _median([s.p for s in rows])
         p_head = rows[len(rows) // 2].p_head
         if p_head is None:
-            common, each = self.noise.split(isotropic(self.config.unseen_sigma_m, 0.0))
+            common, each = self.noise.split_covariance(isotropic_covariance(self.config.unknown_viewpoint_sigma_m, 0.0))
         else:
-            common, each = self.noise.seen_from(np.array(p_head), p)
+            common, each = self.noise.compute_covariances(np.array(p_head), p)
         return _Window(p, each[:3, :3] * (_MEDIAN_VARIANCE / len(rows)), common[:3, :3], rows[-1].viewpoint_id)
 
     def _change(self, now: _Window, before: _Window | None, least_m: float = 0.0) -> float:
@@ -244,14 +244,14 @@ class DriftMonitor:
             return 0.0
         p_world = self.anchors[anchor_id][0]
         placed = apply(alignment.T_world_tracking, (float(now.p[0]), float(now.p[1]), float(now.p[2])))
-        R = quat_matrix(np.array(alignment.T_world_tracking[1]))
+        R = quat_to_matrix(np.array(alignment.T_world_tracking[1]))
         C = alignment.covariance_at(p_world) + R @ (now.own + now.common) @ R.T
         return _significant(np.array(placed) - p_world, C, self.config.min_difference_m)
 
     def _jump(self, new: list[_Seen], reference: _Window | None) -> float:
         """The last few detections, far from the reference and near to each other: one alone is a wrong detection."""
-        last = new[-self.config.jump_in_a_row :]
-        if reference is None or len(last) < self.config.jump_in_a_row:
+        last = new[-self.config.jump_count :]
+        if reference is None or len(last) < self.config.jump_count:
             return 0.0
         before = reference.p.tolist()
         if not min(math.dist(s.p, before) for s in last) > self.config.jump_m:
@@ -270,7 +270,7 @@ class DriftMonitor:
         return Alarm("epoch", "", math.inf, capture_ns)
 
     def _forget(self) -> None:
-        self._seen.clear()
+        self._detections.clear()
         self._references.clear()
         self._quiet_until_ns.clear()
         self._steady_ns.clear()

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anchors.groups import Group, Sighting
-from anchors.lie import Array, quat_conjugate, quat_matrix, quat_multiply
+from anchors.groups import ViewpointGroup, AnchorObservation
+from anchors.lie import Array, quat_conjugate, quat_to_matrix, quat_multiply
 from anchors.noise import NoiseModel
 from anchors.pose import PoseTuple, is_rigid, quat_normalize
 
 if TYPE_CHECKING:
-    from anchors.constellation import Seen
+    from anchors.constellation import SheetObservation
 
 HeadsetKey = tuple[str, int]
 
@@ -34,27 +34,27 @@ class Edge:
     covariance: Array
 
 
-def merge_edges(observations: Sequence[Seen], noise: NoiseModel, fallback: Array) -> list[Edge]:
+def merge_edges(observations: Sequence[SheetObservation], noise: NoiseModel, fallback: Array) -> list[Edge]:
     """One edge per viewpoint and sheet; what is no pose, and viewpoints whose observations do not agree, are left
     out."""
-    groups: dict[tuple[str, int, int, str], Group] = {}
+    groups: dict[tuple[str, int, int, str], ViewpointGroup] = {}
     for o in observations:
         if not is_rigid(o.T_tracking_anchor):
             continue
         p, q = o.T_tracking_anchor
-        sighting = Sighting(0, p, quat_normalize(q), o.p_tracking_head, (), 1.0, 0.0)
-        groups.setdefault((o.headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id), Group()).sightings.append(
+        sighting = AnchorObservation(0, p, quat_normalize(q), o.p_tracking_head, (), 1.0, 0.0)
+        groups.setdefault((o.headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id), ViewpointGroup()).observations.append(
             sighting
         )
     edges = []
     for (headset, epoch, viewpoint, anchor_id), group in sorted(groups.items()):
-        merged = group.solve(noise, fallback, 0.6)
+        merged = group.merge(noise, fallback, 0.6)
         if merged is not None:
             edges.append(Edge(headset, epoch, viewpoint, anchor_id, merged.p, merged.q, merged.covariance))
     return edges
 
 
-def reachable(edges: Sequence[Edge], reference: str) -> set[str]:
+def find_reachable(edges: Sequence[Edge], reference: str) -> set[str]:
     """Sheets that looks tie to the reference."""
     by_headset: dict[HeadsetKey, set[str]] = {}
     for e in edges:
@@ -70,7 +70,7 @@ def reachable(edges: Sequence[Edge], reference: str) -> set[str]:
 
 
 @dataclass(frozen=True)
-class Graph:
+class ObservationGraph:
     """Poses are ordered: sheets other than the reference, then headsets."""
 
     edges: list[Edge]
@@ -133,7 +133,7 @@ class Graph:
         return S
 
 
-def start(graph: Graph) -> tuple[Array, Array]:
+def initial_guess(graph: ObservationGraph) -> tuple[Array, Array]:
     """First guess: outwards from the reference, each sheet and headset by the most certain look that ties it."""
     p_ref, q_ref = (np.array(part) for part in graph.T_world_reference)
     sheets: dict[str, tuple[Array, Array]] = {graph.reference: (p_ref, q_ref)}
@@ -145,11 +145,11 @@ def start(graph: Graph) -> tuple[Array, Array]:
             if e.anchor_id in sheets and key not in headsets:
                 p, q = sheets[e.anchor_id]
                 q_h = quat_multiply(q, quat_conjugate(e.q))
-                headsets[key] = (p - quat_matrix(q_h) @ e.p, q_h)
+                headsets[key] = (p - quat_to_matrix(q_h) @ e.p, q_h)
                 break
             if key in headsets and e.anchor_id not in sheets:
                 p, q = headsets[key]
-                sheets[e.anchor_id] = (p + quat_matrix(q) @ e.p, quat_multiply(q, e.q))
+                sheets[e.anchor_id] = (p + quat_to_matrix(q) @ e.p, quat_multiply(q, e.q))
                 break
         else:
             break

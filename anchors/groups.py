@@ -15,13 +15,13 @@ import numpy as np
 from anchors.lie import Array
 from anchors.noise import NoiseModel
 from anchors.pose import Quat, Vec3
-from anchors.robust import Merged, merge, middle
+from anchors.robust import MergedObservation, merge_poses, fast_median
 
-Key = tuple[str, int]
+GroupKey = tuple[str, int]
 _JUST_BEGUN: Final = 3  # fewer sightings cannot outvote one wrong detection among them
 
 
-class Sighting(NamedTuple):
+class AnchorObservation(NamedTuple):
     """One observation `T_tracking_anchor` (`p`, unit `q`). `p_head`: where the observer was, tracking frame.
     `covariance`: as stated by the observer and found valid (36 values), else empty."""
 
@@ -35,49 +35,49 @@ class Sighting(NamedTuple):
 
 
 @dataclass
-class Group:
+class ViewpointGroup:
     """Sightings of one anchor from one viewpoint, oldest first. `sizes`: the smallest and the largest [m] that was
     measured, as of the last `solve`."""
 
-    sightings: deque[Sighting] = field(default_factory=deque)
-    merged: Merged | None = None
+    observations: deque[AnchorObservation] = field(default_factory=deque)
+    merged: MergedObservation | None = None
     sizes: tuple[float, float] | None = None
     dirty: bool = True
 
-    def solve(self, noise: NoiseModel, fallback: Array, min_agreeing: float) -> Merged | None:
+    def merge(self, noise: NoiseModel, fallback: Array, min_agreeing: float) -> MergedObservation | None:
         """The robust mean; computed again only after a change."""
         if self.dirty:
-            p = np.array([s.p for s in self.sightings])
-            q = np.array([s.q for s in self.sightings])
+            p = np.array([s.p for s in self.observations])
+            q = np.array([s.q for s in self.observations])
             common, each = self._noise(p, noise, fallback)
-            self.merged, self.dirty = merge(p, q, common, each, min_agreeing), False
-            sizes = self.sizes_seen()
+            self.merged, self.dirty = merge_poses(p, q, common, each, min_agreeing), False
+            sizes = self.list_sizes()
             self.sizes = (min(sizes), max(sizes)) if sizes else None
         return self.merged
 
-    def sizes_seen(self) -> list[float]:
+    def list_sizes(self) -> list[float]:
         """Measured sizes [m]; 0 and what is no size stands for none."""
-        return [s.size_m for s in self.sightings if 0.0 < s.size_m < math.inf]
+        return [s.size_m for s in self.observations if 0.0 < s.size_m < math.inf]
 
     def _noise(self, p: Array, noise: NoiseModel, fallback: Array) -> tuple[Array, Array]:
         """What the observers state comes first, then the model from where they stood, then the configured default."""
-        given = [s.covariance for s in self.sightings if s.covariance]
+        given = [s.covariance for s in self.observations if s.covariance]
         if given:
-            return noise.split(np.mean(np.array(given), axis=0).reshape(6, 6))
-        heads = [s.p_head for s in self.sightings if s.p_head is not None]
+            return noise.split_covariance(np.mean(np.array(given), axis=0).reshape(6, 6))
+        heads = [s.p_head for s in self.observations if s.p_head is not None]
         if heads:
-            return noise.seen_from(middle(np.array(heads)), middle(p))
-        quality = float(np.mean([min(max(s.quality, 0.05), 1.0) for s in self.sightings]))
-        return noise.split(fallback / quality)
+            return noise.compute_covariances(fast_median(np.array(heads)), fast_median(p))
+        quality = float(np.mean([min(max(s.quality, 0.05), 1.0) for s in self.observations]))
+        return noise.split_covariance(fallback / quality)
 
     @property
     def capture_ns(self) -> int:
         """Middle of the time in which it was seen."""
-        return (self.sightings[0].capture_ns + self.sightings[-1].capture_ns) // 2
+        return (self.observations[0].capture_ns + self.observations[-1].capture_ns) // 2
 
 
 @dataclass
-class Memory:
+class ObservationBuffer:
     """Groups of one tracking epoch; the oldest observations go first."""
 
     max_observations: int
@@ -86,25 +86,25 @@ class Memory:
     max_age_ns: int
     forgotten: int = 0
     outdated: int = 0
-    groups: dict[Key, Group] = field(default_factory=dict)
-    _order: deque[Key] = field(default_factory=deque)
+    groups: dict[GroupKey, ViewpointGroup] = field(default_factory=dict)
+    _order: deque[GroupKey] = field(default_factory=deque)
     _last_ns: int = 0
 
     def __len__(self) -> int:
         return len(self._order)
 
-    def add(self, key: Key, sighting: Sighting) -> None:
+    def add(self, key: GroupKey, sighting: AnchorObservation) -> None:
         """Takes one more and forgets what is too old or too much."""
         self._forget_outdated(sighting.capture_ns)
         while len(self._order) >= self.max_observations:
             self._pop()
             self.forgotten += 1
-        group = self.groups.setdefault(key, Group())
-        if len(group.sightings) >= self.max_in_group:  # a long look pushes out itself, not the other viewpoints
-            group.sightings.popleft()
+        group = self.groups.setdefault(key, ViewpointGroup())
+        if len(group.observations) >= self.max_in_group:  # a long look pushes out itself, not the other viewpoints
+            group.observations.popleft()
             self._order.remove(key)
             self.forgotten += 1
-        group.sightings.append(sighting)
+        group.observations.append(sighting)
         group.dirty = True
         self._order.append(key)
         while len(self.groups) > self.max_groups:
@@ -115,19 +115,19 @@ class Memory:
         self.groups.clear()
         self._order.clear()
 
-    def with_a_say(self, enough: int) -> dict[Key, Group]:
+    def select_mature_groups(self, enough: int) -> dict[GroupKey, ViewpointGroup]:
         """Groups that count: one just begun does not outvote or contradict one that has `enough` sightings, for its
         first detection may be a wrong one."""
-        if all(len(group.sightings) < enough for group in self.groups.values()):
+        if all(len(group.observations) < enough for group in self.groups.values()):
             return self.groups
-        return {key: group for key, group in self.groups.items() if len(group.sightings) >= _JUST_BEGUN}
+        return {key: group for key, group in self.groups.items() if len(group.observations) >= _JUST_BEGUN}
 
     def _pop(self) -> None:
         key = self._order.popleft()
         group = self.groups[key]
-        group.sightings.popleft()
+        group.observations.popleft()
         group.dirty = True
-        if not group.sightings:
+        if not group.observations:
             del self.groups[key]
 
     def _forget_outdated(self, now_ns: int) -> None:
@@ -136,14 +136,14 @@ class Memory:
         self._last_ns = now_ns
         if jumped:
             self._keep_only(now_ns)
-        while self._order and abs(now_ns - self.groups[self._order[0]].sightings[0].capture_ns) > self.max_age_ns:
+        while self._order and abs(now_ns - self.groups[self._order[0]].observations[0].capture_ns) > self.max_age_ns:
             self._pop()
             self.outdated += 1
 
     def _keep_only(self, now_ns: int) -> None:
-        kept = Memory(self.max_observations, self.max_in_group, self.max_groups, self.max_age_ns)
+        kept = ObservationBuffer(self.max_observations, self.max_in_group, self.max_groups, self.max_age_ns)
         kept._last_ns = now_ns
-        old = {key: deque(group.sightings) for key, group in self.groups.items()}
+        old = {key: deque(group.observations) for key, group in self.groups.items()}
         for key in self._order:
             sighting = old[key].popleft()
             if abs(now_ns - sighting.capture_ns) <= self.max_age_ns:
@@ -158,7 +158,7 @@ class Memory:
         return {
             "counts": [self.forgotten, self.outdated, self._last_ns],
             "order": [list(key) for key in self._order],
-            "groups": [[*key, [list(s) for s in group.sightings]] for key, group in self.groups.items()],
+            "groups": [[*key, [list(s) for s in group.observations]] for key, group in self.groups.items()],
         }
 
     def restore(self, data: dict[str, Any]) -> None:
@@ -166,10 +166,10 @@ class Memory:
         self._order = deque((str(a), int(v)) for a, v in data["order"])
         self.groups = {}
         for anchor_id, viewpoint_id, rows in data["groups"]:
-            group = Group()
+            group = ViewpointGroup()
             for capture_ns, p, q, p_head, covariance, quality, size_m in rows:
                 head = None if p_head is None else (p_head[0], p_head[1], p_head[2])
-                group.sightings.append(
-                    Sighting(capture_ns, tuple(p), tuple(q), head, tuple(covariance), quality, size_m)
+                group.observations.append(
+                    AnchorObservation(capture_ns, tuple(p), tuple(q), head, tuple(covariance), quality, size_m)
                 )
             self.groups[anchor_id, viewpoint_id] = group

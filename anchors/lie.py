@@ -47,7 +47,7 @@ def quat_exp(r: Array) -> Array:
     return np.concatenate((np.cos(0.5 * angle), scale * r), axis=-1)
 
 
-def turned(q: Array, r: Array) -> Array:
+def quat_perturb(q: Array, r: Array) -> Array:
     """One quaternion (4,) turned by a rotation vector (3,), `exp(r) * q`: in plain floats, which are faster."""
     x, y, z = r.tolist()
     w, i, j, k = q.tolist()
@@ -62,7 +62,7 @@ def quat_log(q: Array) -> Array:
     return np.asarray(np.copysign(2.0, w) * half * v)
 
 
-def quat_matrix(q: Array) -> Array:
+def quat_to_matrix(q: Array) -> Array:
     """Rotation matrices `(..., 3, 3)` of unit quaternions `(..., 4)`."""
     w, x, y, z = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
     rows = (
@@ -75,7 +75,7 @@ def quat_matrix(q: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def matrix_quat(R: Array) -> Array:
+def quat_from_matrix(R: Array) -> Array:
     """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3): the greatest of four forms (Shepperd 1978)."""
     t = float(np.trace(R))
     candidates = (t, float(R[0, 0]), float(R[1, 1]), float(R[2, 2]))

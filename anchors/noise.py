@@ -34,7 +34,7 @@ class NoiseModel:
     scale: float = 0.003
     viewpoint_share: float = 0.5
 
-    def seen_from(self, p_head: Array, p_anchor: Array) -> tuple[Array, Array]:
+    def compute_covariances(self, p_head: Array, p_anchor: Array) -> tuple[Array, Array]:
         """Covariances (common to the viewpoint, new in each observation) of an anchor seen from `p_head`."""
         ray = p_anchor - p_head
         d2 = float(ray @ ray)
@@ -45,23 +45,23 @@ class NoiseModel:
         noise[:3, :3] = along**2 * (1.0 - self.across**2) * view
         noise.flat[:21:7] += (along * self.across) ** 2
         noise.flat[21::7] = (self.rotation_rad_per_m * d) ** 2
-        common, each = self.split(noise)
+        common, each = self.split_covariance(noise)
         common[:3, :3] += (self.scale * d) ** 2 * view
         return common, each
 
-    def split(self, noise: Array) -> tuple[Array, Array]:
+    def split_covariance(self, noise: Array) -> tuple[Array, Array]:
         """A whole covariance as (common to the viewpoint, new in each observation)."""
         whole = noise + FLOOR
         common = self.viewpoint_share * whole
         return common, whole - common
 
 
-def isotropic(position_sigma_m: float, rotation_sigma_rad: float) -> Array:
+def isotropic_covariance(position_sigma_m: float, rotation_sigma_rad: float) -> Array:
     """Covariance with the same uncertainty along every axis."""
     return np.diag([position_sigma_m**2] * 3 + [rotation_sigma_rad**2] * 3)
 
 
-def stated(covariance: Sequence[float]) -> tuple[float, ...]:
+def validate_covariance(covariance: Sequence[float]) -> tuple[float, ...]:
     """The covariance that an observer sent with its observation, made symmetric; empty when it is none (not finite,
     not symmetric and positive)."""
     if len(covariance) != 36 or not all(map(math.isfinite, covariance)) or max(map(abs, covariance)) > 1e3:

@@ -117,6 +117,6 @@ def is_rigid(T: PoseTuple, reach_m: float = 1e3) -> bool:
     return all(map(math.isfinite, (*p, *q))) and abs(norm - 1.0) <= 1e-2 and max(map(abs, p)) <= reach_m
 
 
-def is_place(p: Vec3 | None, reach_m: float = 1e3) -> bool:
+def is_valid_point(p: Vec3 | None, reach_m: float = 1e3) -> bool:
     """Whether numbers from elsewhere are a point within `reach_m`, or `None`: not known."""
     return p is None or (all(map(math.isfinite, p)) and max(map(abs, p)) <= reach_m)

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import Camera, matrix_of, pose_of_matrix
+from anchors.camera import CameraModel, pose_to_matrix, pose_from_matrix
 from anchors.pose import PoseTuple
 from anchors.sheet import HALF_HEIGHT, HALF_WIDTH, MARKER_EDGE, Sheet
 
@@ -42,7 +42,7 @@ _FLOOR_PX: Final = 0.02
 
 
 @dataclass(frozen=True)
-class Registered:
+class PhotometricFit:
     """`covariance`: 6x6 of position of the sheet's origin [m] and rotation [rad], camera frame. `rms`: what is left
     over, as a share of the contrast between paper and ink."""
 
@@ -60,15 +60,15 @@ class _View:
     rays: tuple[Array, Array]
     fine_rays: tuple[Array, Array]
     finer: int
-    camera: Camera
+    camera: CameraModel
 
 
-def register(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, T_camera_sheet: PoseTuple) -> Registered | None:
+def fit_print(grey: NDArray[np.uint8], camera: CameraModel, sheet: Sheet, T_camera_sheet: PoseTuple) -> PhotometricFit | None:
     """Refines a pose that is right to about a pixel; `None` where it does not converge or too little is visible."""
     view = _view(grey, camera, sheet, T_camera_sheet)
     if view is None:
         return None
-    M = matrix_of(T_camera_sheet)
+    M = pose_to_matrix(T_camera_sheet)
     first = _fit(view, sheet, M, _BLURS[1], _ITERATIONS)
     if first is None:
         return None
@@ -82,10 +82,10 @@ def register(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, T_camera_she
     # From the camera's origin, about which the increments turn, to that of the sheet.
     shift = np.eye(6)
     shift[:3, 3:] = -_cross(M[:3, 3])
-    return Registered(pose_of_matrix(M), shift @ covariance @ shift.T, rms)
+    return PhotometricFit(pose_from_matrix(M), shift @ covariance @ shift.T, rms)
 
 
-def _view(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, pose: PoseTuple) -> _View | None:
+def _view(grey: NDArray[np.uint8], camera: CameraModel, sheet: Sheet, pose: PoseTuple) -> _View | None:
     import cv2
 
     w, h = (HALF_WIDTH + _BORDER) * sheet.edge_m, (HALF_HEIGHT + _BORDER) * sheet.edge_m
@@ -110,11 +110,11 @@ def _view(grey: NDArray[np.uint8], camera: Camera, sheet: Sheet, pose: PoseTuple
     )
 
 
-def _rays(camera: Camera, low: NDArray[Any], n: int, shape: tuple[int, int], finer: int) -> tuple[Array, Array]:
+def _rays(camera: CameraModel, low: NDArray[Any], n: int, shape: tuple[int, int], finer: int) -> tuple[Array, Array]:
     """Normalised coordinates of a picture's part that begins at `low` and was averaged over n x n pixels."""
     v, u = ((np.arange(size * finer) + 0.5) * n / finer - 0.5 for size in shape)
     uu, vv = np.meshgrid(u + low[0], v + low[1])
-    rays = camera.normalise(np.column_stack([uu.ravel(), vv.ravel()]))
+    rays = camera.undistort(np.column_stack([uu.ravel(), vv.ravel()]))
     return rays[:, 0].reshape(uu.shape), rays[:, 1].reshape(uu.shape)
 
 
@@ -205,7 +205,7 @@ def _levels(anchor_id: str) -> tuple[Picture, ...]:
     w, h = HALF_WIDTH + _BORDER, HALF_HEIGHT + _BORDER
     columns, rows = round(2 * w * _TEXELS), round(2 * h * _TEXELS)
     ink = np.zeros((rows, columns), dtype=np.float32)
-    for rects in sheet.black().values():
+    for rects in sheet.list_black_rects().values():
         for r in rects:
             across = _coverage((r.x + w) * _TEXELS, r.width * _TEXELS, columns)
             down = _coverage((h - r.y - r.height) * _TEXELS, r.height * _TEXELS, rows)
@@ -225,7 +225,7 @@ def _coverage(start: float, length: float, n: int) -> Array:
     return covered
 
 
-def _floor(camera: Camera, sheet: Sheet, M: Array) -> Array:
+def _floor(camera: CameraModel, sheet: Sheet, M: Array) -> Array:
     """Covariance, increments about the camera's origin, if every marker corner had an error of `_FLOOR_PX`."""
     points = sheet.marker_corners.reshape(-1, 3) @ M[:3, :3].T + M[:3, 3]
     x, y, s = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1.0 / points[:, 2]

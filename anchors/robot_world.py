@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import matrix_of, pose_of_matrix
+from anchors.camera import pose_to_matrix, pose_from_matrix
 from anchors.pose import PoseTuple, compose, inverse
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class CalibrationError(ValueError):
 
 
 @dataclass(frozen=True)
-class Noise:
+class CalibrationNoise:
     """Standard deviations per axis of the robot's poses (repeatability and kinematics), and of what the camera saw
     where no covariance came with it."""
 
@@ -54,7 +54,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Solved:
+class RobotWorldCalibration:
     """`covariance`: 36 values, (x, y, z [m], rx, ry, rz [rad]) of the camera in the frame of the base; scaled up where
     residuals are larger than stated. `residuals`: per picture, distance [m] and angle [rad] between both chains.
     `left_out`: pictures that contradict the others. `spread_rad`: how much the hand turned, about its second axis."""
@@ -71,29 +71,29 @@ class Solved:
     def used(self) -> tuple[int, ...]:
         return tuple(k for k in range(len(self.residuals)) if k not in self.left_out)
 
-    def rms(self) -> tuple[float, float]:
+    def compute_rms(self) -> tuple[float, float]:
         """Root mean square of the residuals of the pictures used: [m], [rad]."""
         kept = np.array([self.residuals[k] for k in self.used])
         m, rad = np.sqrt(np.mean(kept**2, axis=0))
         return float(m), float(rad)
 
 
-def one_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
+def solve_single_pose(T_base_ee: PoseTuple, T_ee_marker: PoseTuple, T_camera_marker: PoseTuple) -> PoseTuple:
     """`T_base_camera` where the place of the marker on the hand is known."""
     return compose(compose(T_base_ee, T_ee_marker), inverse(T_camera_marker))
 
 
-def solve(
+def solve_robot_world(
     T_base_ee: Sequence[PoseTuple],
     T_camera_marker: Sequence[PoseTuple],
     covariances: Sequence[Sequence[float]] | None = None,
-    noise: Noise | None = None,
-) -> Solved:
+    noise: CalibrationNoise | None = None,
+) -> RobotWorldCalibration:
     """`T_base_camera` and `T_ee_marker` from many poses; neither needs to be known. `covariances`: of each
     `T_camera_marker`, camera frame. Raises `CalibrationError`."""
     if len(T_base_ee) != len(T_camera_marker):
         raise CalibrationError(f"{len(T_base_ee)} poses of the robot, {len(T_camera_marker)} of the marker")
-    data = _Data.of(T_base_ee, T_camera_marker, covariances, noise or Noise())
+    data = _Data.of(T_base_ee, T_camera_marker, covariances, noise or CalibrationNoise())
     kept = list(range(len(data.A)))
     while True:
         if len(kept) < max(MIN_POSES, math.ceil(_MIN_AGREEING * len(data.A))):
@@ -123,9 +123,9 @@ def solve(
         )
     birge = max(1.0, float(np.sum(whitened[kept] ** 2)) / max(6 * len(kept) - 12, 1))
     covariance = (np.linalg.inv(normal) * birge)[:6, :6]
-    return Solved(
-        pose_of_matrix(X),
-        pose_of_matrix(Y),
+    return RobotWorldCalibration(
+        pose_from_matrix(X),
+        pose_from_matrix(Y),
         tuple(float(v) for v in covariance.ravel()),
         tuple((float(m), float(rad)) for m, rad in residuals),
         tuple(k for k in range(len(data.A)) if k not in kept),
@@ -134,26 +134,26 @@ def solve(
     )
 
 
-def camera_on_hand(
+def solve_camera_on_hand(
     T_base_ee: Sequence[PoseTuple],
     T_camera_sheet: Sequence[PoseTuple],
     covariances: Sequence[Sequence[float]] | None = None,
-    noise: Noise | None = None,
-) -> Solved:
+    noise: CalibrationNoise | None = None,
+) -> RobotWorldCalibration:
     """A camera on the hand that looks at a sheet in the room: `T_base_camera` of the result is `T_base_sheet`, and
     `T_ee_marker` is `T_ee_camera`."""
     turned = None
     if covariances is not None:
         turned = [_of_inverse(T, cov) for T, cov in zip(T_camera_sheet, covariances, strict=True)]
-    return solve(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
+    return solve_robot_world(T_base_ee, [inverse(T) for T in T_camera_sheet], turned, noise)
 
 
-def T_world_base_of_twin(
-    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: Noise | None = None
-) -> tuple[PoseTuple, Solved]:
+def solve_twin_base(
+    T_base_ee: Sequence[PoseTuple], T_world_marker: Sequence[PoseTuple], noise: CalibrationNoise | None = None
+) -> tuple[PoseTuple, RobotWorldCalibration]:
     """Where the real robot stands in the world, from a marker on its hand that an aligned headset or camera saw (or a
     tracked controller held there): the virtual robot belongs there."""
-    solved = solve(T_base_ee, T_world_marker, None, noise)
+    solved = solve_robot_world(T_base_ee, T_world_marker, None, noise)
     return inverse(solved.T_base_camera), solved
 
 
@@ -169,14 +169,14 @@ class _Data:
         robot: Sequence[PoseTuple],
         camera: Sequence[PoseTuple],
         covariances: Sequence[Sequence[float]] | None,
-        noise: Noise,
+        noise: CalibrationNoise,
     ) -> _Data:
         seen = np.tile(np.diag([noise.seen_m**2] * 3 + [noise.seen_rad**2] * 3), (len(camera), 1, 1))
         if covariances is not None:
             seen = np.reshape(np.asarray(covariances, dtype=np.float64), (-1, 6, 6))
         floor = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
         whitener = np.linalg.inv(np.linalg.cholesky(seen + floor)) if len(seen) else seen
-        A, B = (np.array([matrix_of(T) for T in poses]).reshape(-1, 4, 4) for poses in (robot, camera))
+        A, B = (np.array([pose_to_matrix(T) for T in poses]).reshape(-1, 4, 4) for poses in (robot, camera))
         return cls(A, B, whitener)
 
     def differences(self, X: Array, Y: Array) -> Array:
@@ -259,7 +259,7 @@ def _too_few(agreeing: int, n: int) -> str:
 
 def _of_inverse(T: PoseTuple, covariance: Sequence[float]) -> tuple[float, ...]:
     """Covariance of the inverse of a pose."""
-    M = matrix_of(T)
+    M = pose_to_matrix(T)
     R, (x, y, z) = M[:3, :3], M[:3, 3]
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = -R.T

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, turned
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_perturb
 from anchors.uncertainty import Z999, chi2_quantile
 
 _CHI2_3_MEDIAN: Final = 2.366
@@ -22,7 +22,7 @@ _MAX_SCATTER: Final = 100.0  # variance ratio beyond which it is no longer noise
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergedObservation:
     """Observations of one anchor from one viewpoint as one: mean `T_tracking_anchor` (`p`, `q`), its covariance (6, 6)
     in tracking axes, how many agree (`n`) and how many there were (`of`)."""
 
@@ -30,10 +30,10 @@ class Merged:
     q: Array
     covariance: Array
     n: int
-    of: int
+    n_total: int
 
 
-def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -> Merged | None:
+def merge_poses(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -> MergedObservation | None:
     """Robust mean of poses `T_tracking_anchor`, positions (n, 3) and quaternions (n, 4).
 
     `common`, `each`: covariance (6, 6) of the error that all share, and of the one that is new in each. `None` when
@@ -41,18 +41,18 @@ def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -
     """
     count = len(p)
     towards = q @ q[0]
-    centre = middle(q if float(towards.min()) >= 0.0 else np.where(towards[:, None] < 0.0, -q, q))
+    centre = fast_median(q if float(towards.min()) >= 0.0 else np.where(towards[:, None] < 0.0, -q, q))
     norm = math.sqrt(float(centre @ centre))
     if norm < 0.1:
         return None  # orientations all over the sphere
     centre = centre / norm
     x = np.empty((2, count, 3))  # positions, and turns from the median
     x[0], x[1] = p, quat_log(quat_multiply(q, quat_conjugate(centre)))
-    about = middle(x)
+    about = fast_median(x)
     x -= about[:, None, :]
     information = np.linalg.inv(np.array([each[:3, :3], each[3:, 3:]]))
     d2 = np.add.reduce((x @ information) * x, axis=2)  # (2, n)
-    bounds = [_CHI2_3_999 * min(max(m / _CHI2_3_MEDIAN, 1.0), _MAX_SCATTER) for m in middle(d2.T).tolist()]
+    bounds = [_CHI2_3_999 * min(max(m / _CHI2_3_MEDIAN, 1.0), _MAX_SCATTER) for m in fast_median(d2.T).tolist()]
     keep = ((d2[0] <= bounds[0]) & (d2[1] <= bounds[1])).astype(np.float64)
     n = int(keep.sum())
     if n == 0 or n < min_agreeing * count:
@@ -65,10 +65,10 @@ def merge(p: Array, q: Array, common: Array, each: Array, min_agreeing: float) -
     if wider is not None:
         covariance = covariance * wider[:, None] * wider
     mean += about
-    return Merged(mean[0], turned(centre, mean[1]), covariance, n, count)
+    return MergedObservation(mean[0], quat_perturb(centre, mean[1]), covariance, n, count)
 
 
-def middle(x: Array) -> Array:
+def fast_median(x: Array) -> Array:
     """Median over the last but one axis (numpy's own costs more than everything else here)."""
     n = x.shape[-2]
     x = np.sort(x, axis=-2)

@@ -71,7 +71,7 @@ class Sheet:
     @cached_property
     def marker_ids(self) -> tuple[int, ...]:
         """Markers of the frame: upper left, upper right, lower right, lower left. All different."""
-        return marker_ids(self.anchor_id)
+        return compute_marker_ids(self.anchor_id)
 
     @property
     def marker_edge_m(self) -> float:
@@ -99,18 +99,18 @@ class Sheet:
     @cached_property
     def code(self) -> NDArray[np.bool_]:
         """Modules of the QR code, True where black, first row on top."""
-        return code_modules(self.anchor_id)
+        return encode_code(self.anchor_id)
 
-    def black(self) -> dict[str, list[Rect]]:
+    def list_black_rects(self) -> dict[str, list[Rect]]:
         """What is black on the paper: rectangles of the `code`, and of each marker (`marker 0` to `marker 3`)."""
         shapes = {"code": _runs(self.code, self.code_corners[0], self.edge_m)}
         for number, marker_id in enumerate(self.marker_ids):
             corner = self.marker_corners[number][0]
-            shapes[f"marker {number}"] = _runs(marker_modules(marker_id), corner, self.marker_edge_m)
+            shapes[f"marker {number}"] = _runs(encode_marker(marker_id), corner, self.marker_edge_m)
         return shapes
 
 
-def marker_ids(anchor_id: str) -> tuple[int, ...]:
+def compute_marker_ids(anchor_id: str) -> tuple[int, ...]:
     """Four different markers out of `DICTIONARY_SIZE`, by SHA-256 of the id. Two sheets have all four in common once
     in 4e10; a single one in 1.6 % of the pairs, which geometry tells apart."""
     digest = hashlib.sha256(b"iris-session sheet 1\0" + anchor_id.encode()).digest()
@@ -122,23 +122,23 @@ def marker_ids(anchor_id: str) -> tuple[int, ...]:
     return tuple(ids[:MARKERS])
 
 
-def code_modules(text: str) -> NDArray[np.bool_]:
+def encode_code(text: str) -> NDArray[np.bool_]:
     """QR code of `text`: the smallest version at error correction M, or better where it costs no module."""
     import segno
 
     return np.array(segno.make(text, micro=False, error="m").matrix, dtype=np.bool_)
 
 
-def marker_modules(marker_id: int) -> NDArray[np.bool_]:
+def encode_marker(marker_id: int) -> NDArray[np.bool_]:
     """Modules of an ArUco marker with its border, True where black, shape (6, 6)."""
     import cv2
 
-    picture: Any = cv2.aruco.generateImageMarker(dictionary(), marker_id, MARKER_MODULES)
+    picture: Any = cv2.aruco.generateImageMarker(load_dictionary(), marker_id, MARKER_MODULES)
     black: NDArray[np.bool_] = np.asarray(picture) == 0
     return black
 
 
-def dictionary() -> Any:
+def load_dictionary() -> Any:
     """The dictionary of all sheets."""
     import cv2
 

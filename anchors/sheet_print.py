@@ -129,7 +129,7 @@ def _page(sheet: Sheet, paper: str) -> _Page:
     x0, y0 = 0.5 * width, 0.5 * height
     shapes = [
         [Rect(x0 + 1e3 * r.x, y0 - 1e3 * (r.y + r.height), 1e3 * r.width, 1e3 * r.height) for r in rects]
-        for rects in sheet.black().values()
+        for rects in sheet.list_black_rects().values()
     ]
     ruler, figures = _ruler(x0, y0 + 0.80 * edge, edge)
     unit = 0.03 * edge  # height of the text; everything grows with the sheet

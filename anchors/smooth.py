@@ -26,11 +26,11 @@ from anchors.pose import (
     quat_to_rotvec,
 )
 
-Step = Literal["none", "first", "slide", "announced", "jump"]
+CorrectionStep = Literal["none", "first", "slide", "announced", "jump"]
 
 
 @dataclass(frozen=True)
-class SmoothConfig:
+class CorrectionConfig:
     """`slide_m_per_s`, `slide_rad_per_s`: slow enough not to be noticed in a headset. Corrections above `announce_m` or
     `announce_rad` are put off until they are accepted (`accept`), as a person would see them."""
 
@@ -41,20 +41,20 @@ class SmoothConfig:
 
 
 @dataclass(frozen=True)
-class InForce:
+class CorrectedAlignment:
     """The alignment to use now. `pending_m`, `pending_rad`: how far the estimate is away, at its pivot."""
 
     T_world_tracking: PoseTuple
-    step: Step
+    step: CorrectionStep
     pending_m: float
     pending_rad: float
 
 
 @dataclass
-class SmoothAlignment:
+class CorrectionFilter:
     """Follows the estimates of one headset."""
 
-    config: SmoothConfig = field(default_factory=SmoothConfig)
+    config: CorrectionConfig = field(default_factory=CorrectionConfig)
     _T_world_tracking: PoseTuple | None = None
     _epoch: int = 0
     _last_ns: int = 0
@@ -64,30 +64,30 @@ class SmoothAlignment:
         """The announced correction may come, with the next update."""
         self._accepted = True
 
-    def update(self, estimate: AlignmentEstimate, now_ns: int, engaged: bool = False) -> InForce | None:
+    def update(self, estimate: AlignmentEstimate, now_ns: int, engaged: bool = False) -> CorrectedAlignment | None:
         """`None`: there is no alignment (refused and none before, or the tracking frame is a new one)."""
         seconds, self._last_ns = max(0.0, (now_ns - self._last_ns) * 1e-9), now_ns
         if estimate.tracking_epoch != self._epoch:
             self._T_world_tracking, self._epoch, self._accepted = None, estimate.tracking_epoch, False
         if estimate.refused:
-            return None if self._T_world_tracking is None else InForce(self._T_world_tracking, "none", 0.0, 0.0)
+            return None if self._T_world_tracking is None else CorrectedAlignment(self._T_world_tracking, "none", 0.0, 0.0)
         old, new = self._T_world_tracking, estimate.T_world_tracking
         if old is None:
             self._T_world_tracking = new
-            return InForce(new, "first", 0.0, 0.0)
+            return CorrectedAlignment(new, "first", 0.0, 0.0)
         pivot_tracking = apply(inverse(new), estimate.pivot_world)
         away, turn = distance(apply(old, pivot_tracking), estimate.pivot_world), quat_angle(old[1], new[1])
         if engaged:
-            return InForce(old, "none", away, turn)
+            return CorrectedAlignment(old, "none", away, turn)
         if away > self.config.announce_m or turn > self.config.announce_rad:
             if not self._accepted:
-                return InForce(old, "announced", away, turn)
+                return CorrectedAlignment(old, "announced", away, turn)
             self._T_world_tracking, self._accepted = new, False
-            return InForce(new, "jump", 0.0, 0.0)
+            return CorrectedAlignment(new, "jump", 0.0, 0.0)
         self._accepted = False
         share = min(1.0, self._share(away, turn, seconds))
-        self._T_world_tracking = between(old, new, pivot_tracking, share)
-        return InForce(
+        self._T_world_tracking = interpolate_about_pivot(old, new, pivot_tracking, share)
+        return CorrectedAlignment(
             self._T_world_tracking, "slide" if share > 0.0 else "none", (1.0 - share) * away, (1.0 - share) * turn
         )
 
@@ -96,7 +96,7 @@ class SmoothAlignment:
         return min(seconds, 1.0) / needed  # after a pause it goes on sliding, it does not leap
 
 
-def between(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:
+def interpolate_about_pivot(old: PoseTuple, new: PoseTuple, pivot_tracking: Vec3, share: float) -> PoseTuple:
     """`T_world_tracking` at a share of the way: the pivot moves on a straight line and everything turns about it, so
     that a small turn moves nothing far at the anchor."""
     r = quat_to_rotvec(quat_mul(new[1], quat_conj(old[1])))

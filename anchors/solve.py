@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import Array, quat_conjugate, quat_log, quat_matrix, quat_multiply, skew, swing, turned
+from anchors.lie import Array, quat_conjugate, quat_log, quat_to_matrix, quat_multiply, skew, swing, quat_perturb
 from anchors.pose import PoseTuple, quat_normalize
-from anchors.robust import Merged, circular_median
+from anchors.robust import MergedObservation, circular_median
 from anchors.uncertainty import Z999, chi2_quantile
 
 _CHI2_6_999: Final = 22.458
@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Prior:
+class AlignmentPrior:
     """What is known before any observation. `tilt_sigma_rad` is infinite where the tilt is to be measured too;
     `drift_m_per_s`: speed of the tracking frame, `walk_m_per_sqrt_s`: its wandering, standard deviations per axis."""
 
@@ -48,7 +48,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Problem:
+class AlignmentProblem:
     """Groups as arrays: anchors in the world, how each was seen, how long ago [s] (at most 0)."""
 
     anchor: tuple[str, ...]
@@ -65,7 +65,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Solution:
+class AlignmentSolution:
     """`T_tracking_world` at the time of the newest observation. `covariance` (6, 6) of translation and rotation
     (tracking axes, rotation on the left), `inside` (G,): which groups agree, `chi2` of those, `freedom` of that,
     `distance2` (G,) and `turns` (G, 3): how far each group is off, squared in units of its noise, and in rotation."""
@@ -80,16 +80,16 @@ class Solution:
     distance2: Array
     turns: Array
 
-    def tilt_seen(self, b: Problem) -> float:
+    def observed_tilt(self, b: AlignmentProblem) -> float:
         """Tilt [rad] that the agreeing groups show together, gravity left out."""
         weight = self.inside / np.add.reduce(b.covariance[:, 3:, 3:].reshape(-1, 9)[:, ::4], axis=1)
         tilt = _tilt(self.q) + weight @ self.turns[:, :2] / float(weight.sum())
         return math.hypot(float(tilt[0]), float(tilt[1]))
 
 
-def problem(
-    anchor: Sequence[str], p_world: Array, q_world: Array, merged: Sequence[Merged], age_s: Array, prior: Prior
-) -> Problem:
+def build_problem(
+    anchor: Sequence[str], p_world: Array, q_world: Array, merged: Sequence[MergedObservation], age_s: Array, prior: AlignmentPrior
+) -> AlignmentProblem:
     """Groups as arrays. Older ones are less certain: the tracking frame wanders."""
     # Joined, not stacked: of small arrays that takes a third of the time.
     p = np.concatenate([m.p for m in merged]).reshape(-1, 3)
@@ -98,10 +98,10 @@ def problem(
     if float(age_s.min()) < -_STEADY_S:
         walked = prior.walk_m_per_sqrt_s**2 * np.maximum(-age_s - _STEADY_S, 0.0)
         covariance[:, [0, 1, 2], [0, 1, 2]] += walked[:, None]
-    return Problem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
+    return AlignmentProblem(tuple(anchor), p_world, p, q, covariance, np.linalg.inv(covariance), age_s)
 
 
-def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> Solution:
+def solve_alignment(b: AlignmentProblem, prior: AlignmentPrior, near: tuple[Array, Array] | None = None) -> AlignmentSolution:
     """Robust solution; `inside` is all false where two groups are all there is and they disagree. `near`: rotation and
     translation of an earlier solution, to begin with."""
     everyone = np.ones(b.size, dtype=bool)
@@ -116,13 +116,13 @@ def solve(b: Problem, prior: Prior, near: tuple[Array, Array] | None = None) -> 
     if not inside.any():  # each is tilted so far that it contradicts gravity
         return _without(solution)
     found = _settled(b, inside, start, prior)
-    if agreeing_anchors(b.anchor, found.inside) > _SURE and _is_likely(found):
+    if count_agreeing_anchors(b.anchor, found.inside) > _SURE and _is_likely(found):
         return found
     others = [one for one in _with_one_sheet_less(b, solution, prior) if _is_likely(one)]
     return max([found, *others], key=lambda one: _rank(b, one))
 
 
-def _with_one_sheet_less(b: Problem, everyone: Solution, prior: Prior) -> Iterator[Solution]:
+def _with_one_sheet_less(b: AlignmentProblem, everyone: AlignmentSolution, prior: AlignmentPrior) -> Iterator[AlignmentSolution]:
     """Of three or more sheets one may have been moved so little that each alone seems to agree with it (rotations of
     one sheet say little about the place of the others): each of those that fit worst is left out in turn."""
     off = dict.fromkeys(b.anchor, 0.0)
@@ -135,12 +135,12 @@ def _with_one_sheet_less(b: Problem, everyone: Solution, prior: Prior) -> Iterat
         yield _settled(b, np.array([name != out for name in b.anchor]), start, prior)
 
 
-def _is_likely(s: Solution) -> bool:
+def _is_likely(s: AlignmentSolution) -> bool:
     """Whether what is left over is noise: of two sheets that should agree each may be off by half of what they are."""
     return s.freedom > 0.0 and s.chi2 <= chi2_quantile(s.freedom, Z999)
 
 
-def _settled(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
+def _settled(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: AlignmentPrior) -> AlignmentSolution:
     """Fitted to some of the groups, then to those that agree with that."""
     for _ in range(3):
         solution = _fit(b, inside, start, prior)
@@ -153,18 +153,18 @@ def _settled(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior)
     return solution
 
 
-def _rank(b: Problem, s: Solution) -> tuple[int, int, float]:
+def _rank(b: AlignmentProblem, s: AlignmentSolution) -> tuple[int, int, float]:
     """The better the larger: agreeing sheets, agreeing looks, and how well they agree."""
-    return agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
+    return count_agreeing_anchors(b.anchor, s.inside), int(np.count_nonzero(s.inside)), -s.chi2
 
 
-def common_tilt(b: Problem) -> float:
+def median_tilt(b: AlignmentProblem) -> float:
     """Tilt [rad] that most groups show, each by itself and gravity left out."""
     middle = np.median(swing(b.q), axis=0)
     return math.hypot(float(middle[0]), float(middle[1]))
 
 
-def _without(s: Solution) -> Solution:
+def _without(s: AlignmentSolution) -> AlignmentSolution:
     return replace(s, inside=np.zeros(len(s.inside), dtype=bool))
 
 
@@ -174,15 +174,15 @@ def _level(q: Array) -> Array:
     return np.asarray(out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12))
 
 
-def _start(b: Problem, prior: Prior) -> tuple[Array, Array]:
+def _start(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Array, Array]:
     """First guess by medians, which a minority cannot spoil."""
     yaws = 2.0 * np.arctan2(b.q[:, 3], b.q[:, 0])
     k = int(np.argmin(np.abs(yaws - circular_median(yaws))))
     q = _level(b.q[k]) if prior.gravity else b.q[k]
-    return q, np.median(b.p - b.p_world @ quat_matrix(q).T, axis=0)
+    return q, np.median(b.p - b.p_world @ quat_to_matrix(q).T, axis=0)
 
 
-def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> Solution:
+def _fit(b: AlignmentProblem, inside: Mask, start: tuple[Array, Array], prior: AlignmentPrior) -> AlignmentSolution:
     """Gauss-Newton over (t, rotation on the left, drift); distances of all groups to the result."""
     q, t = start
     drift = np.zeros(3)
@@ -209,7 +209,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
         step = inverse @ g
         t, drift = t + step[:3], drift + step[6:]
-        q = turned(q, step[3:6])
+        q = quat_perturb(q, step[3:6])
         if float(np.abs(step[:6]).max()) < _CONVERGED:
             break
     r = r - J @ step  # the last step was small: its linear effect is all there is
@@ -220,7 +220,7 @@ def _fit(b: Problem, inside: Mask, start: tuple[Array, Array], prior: Prior) -> 
         tilt = _tilt(q)
         chi2 += tilt_information * float(tilt @ tilt)
         freedom += 2.0
-    return Solution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
+    return AlignmentSolution(t, q, inverse[:6, :6], inside, chi2, freedom, drift, distance2, r[:, 3:])
 
 
 def _tilt(q: Array) -> Array:
@@ -235,21 +235,21 @@ def _tilt(q: Array) -> Array:
     return np.array([scale * sx, scale * sy])
 
 
-def _residuals(b: Problem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
+def _residuals(b: AlignmentProblem, q: Array, t: Array, drift: Array) -> tuple[Array, Array]:
     """Observed minus predicted, positions then rotation vectors (G, 6); and the turned anchor positions (G, 3)."""
-    P = b.p_world @ quat_matrix(q).T
+    P = b.p_world @ quat_to_matrix(q).T
     r = np.empty((b.size, 6))
     r[:, :3] = b.p - P - t - b.age_s[:, None] * drift
     r[:, 3:] = quat_log(quat_multiply(b.q, quat_conjugate(q)))
     return r, P
 
 
-def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
+def _consensus(b: AlignmentProblem, prior: AlignmentPrior) -> tuple[Mask, tuple[Array, Array]]:
     """The largest set of groups that agree with one of them: first counted in anchors, then in groups. Every group is
     tried, so nothing is left to chance."""
     q = _level(b.q) if prior.gravity else b.q  # (H, 4)
-    t = b.p - np.einsum("hij,hj->hi", quat_matrix(q), b.p_world)
-    predicted = np.einsum("hij,gj->hgi", quat_matrix(q), b.p_world) + t[:, None, :]
+    t = b.p - np.einsum("hij,hj->hi", quat_to_matrix(q), b.p_world)
+    predicted = np.einsum("hij,gj->hgi", quat_to_matrix(q), b.p_world) + t[:, None, :]
     r = b.p[None, :, :] - predicted
     turn_var = np.trace(b.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0
     tilt_var = prior.tilt_sigma_rad**2 if prior.gravity else 0.0
@@ -267,11 +267,11 @@ def _consensus(b: Problem, prior: Prior) -> tuple[Mask, tuple[Array, Array]]:
     return agree[best], (q[best], t[best])
 
 
-def _votes(b: Problem, agree: Mask, misfit: float) -> tuple[int, int, float]:
-    return agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
+def _votes(b: AlignmentProblem, agree: Mask, misfit: float) -> tuple[int, int, float]:
+    return count_agreeing_anchors(b.anchor, agree), int(np.count_nonzero(agree)), -misfit
 
 
-def agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
+def count_agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
     """Of how many anchors most groups agree."""
     balance: dict[str, int] = {}
     for name, ok in zip(anchor, agree.tolist(), strict=True):
@@ -279,12 +279,12 @@ def agreeing_anchors(anchor: Sequence[str], agree: Mask) -> int:
     return sum(1 for votes in balance.values() if votes > 0)
 
 
-def in_world(q: Array, covariance: Array, pivot_world: Array) -> Array:
+def to_world_covariance(q: Array, covariance: Array, pivot_world: Array) -> Array:
     """Covariance (6, 6) of `T_world_tracking` at the pivot, world axes, from that of `T_tracking_world` (t, q).
 
     A tracking frame off by (d, w) shows the point X of the world off by R^T d + (R^T w) x X.
     """
-    R_world_tracking = quat_matrix(q).T
+    R_world_tracking = quat_to_matrix(q).T
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = R_world_tracking
     J[:3, 3:] = -skew(pivot_world) @ R_world_tracking
@@ -292,9 +292,9 @@ def in_world(q: Array, covariance: Array, pivot_world: Array) -> Array:
     return np.asarray(0.5 * (S + S.T))
 
 
-def inverted(t: Array, q: Array) -> PoseTuple:
+def to_inverse_pose(t: Array, q: Array) -> PoseTuple:
     """`T_b_a` as plain numbers from `T_a_b`."""
     q_inv = quat_conjugate(q)
-    p = -(quat_matrix(q_inv) @ t)
+    p = -(quat_to_matrix(q_inv) @ t)
     unit = quat_normalize((float(q_inv[0]), float(q_inv[1]), float(q_inv[2]), float(q_inv[3])))
     return (float(p[0]), float(p[1]), float(p[2])), unit

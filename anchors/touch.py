@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 
 from anchors.alignment import AlignmentConfig, AlignmentEstimate
-from anchors.lie import Array, quat_exp, quat_matrix, quat_multiply, skew, swing
+from anchors.lie import Array, quat_exp, quat_to_matrix, quat_multiply, skew, swing
 from anchors.pose import PoseTuple, Vec3
-from anchors.solve import in_world, inverted
+from anchors.solve import to_world_covariance, to_inverse_pose
 from anchors.uncertainty import Z99, chi2_quantile, position_error_p95
 
 _CHI2_3_999: Final = 16.266
@@ -37,7 +37,7 @@ class Touch:
 
 
 @dataclass(frozen=True)
-class Registration:
+class TouchRegistration:
     """The alignment, and by how much each touched point misses its mark [m]. `suspects`: points to blame for a
     refusal."""
 
@@ -46,13 +46,13 @@ class Registration:
     suspects: tuple[str, ...] = ()
 
 
-def register(
+def register_touches(
     points_world: Mapping[str, Vec3],
     touches: Sequence[Touch],
     tracking_epoch: int = 0,
     sigma_m: float = 0.0015,
     config: AlignmentConfig | None = None,
-) -> Registration:
+) -> TouchRegistration:
     """`T_world_tracking` from at least three touched points. `sigma_m`: noise of one touch per axis."""
     config = config or AlignmentConfig()
     wrong = [t for t in touches if t.point not in points_world or not all(abs(c) <= _REACH_M for c in t.p_tracking_tip)]
@@ -81,9 +81,9 @@ def register(
     residuals = {name: float(r) for name, r in zip(names, np.linalg.norm(fit.residuals, axis=1), strict=True)}
     if not fit.good:
         advice, suspects = _blame(names, world, tip, sigma, config)
-        return Registration(_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
+        return TouchRegistration(_refusal(tracking_epoch, advice, len(touches)), residuals, suspects)
     alike = _alike(names, world, sigma_m)
-    return Registration(_estimate(fit, world, tracking_epoch, len(touches), config, alike), residuals)
+    return TouchRegistration(_estimate(fit, world, tracking_epoch, len(touches), config, alike), residuals)
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,10 @@ def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fi
     q = _level(world, tip, sigma) if gravity else _kabsch(world, tip, sigma)
     w = 1.0 / sigma**2
     centre = w @ world / np.sum(w)
-    t = w @ tip / np.sum(w) - quat_matrix(q) @ centre
+    t = w @ tip / np.sum(w) - quat_to_matrix(q) @ centre
     H = np.eye(6)
     for _ in range(8):
-        turned = world @ quat_matrix(q).T
+        turned = world @ quat_to_matrix(q).T
         r = tip - turned - t
         J = np.concatenate([np.broadcast_to(np.eye(3), (len(world), 3, 3)), -skew(turned)], axis=2)
         H = np.einsum("nij,n,nik->jk", J, w, J)
@@ -120,7 +120,7 @@ def _fit(world: Array, tip: Array, sigma: Array, config: AlignmentConfig) -> _Fi
         q = quat_multiply(quat_exp(step[3:]), q)
         if float(np.max(np.abs(step))) < 1e-10:
             break
-    r = tip - world @ quat_matrix(q).T - t
+    r = tip - world @ quat_to_matrix(q).T - t
     d2 = np.sum(r * r, axis=1) * w
     tilt2 = float(np.sum(swing(q) ** 2)) * gravity
     freedom = 3.0 * len(world) - (4.0 if gravity else 6.0)
@@ -184,7 +184,7 @@ def _blame(
             if not _in_line([names[k] for k in rest], world[rest]):
                 fit = _fit(world[rest], tip[rest], sigma[rest], config)
                 if fit.good:
-                    off = float(np.linalg.norm(tip[i] - quat_matrix(fit.q) @ world[i] - fit.t))
+                    off = float(np.linalg.norm(tip[i] - quat_to_matrix(fit.q) @ world[i] - fit.t))
                     alone.append((fit.chi2, i, off))
         if alone:
             _, i, off = min(alone)
@@ -252,13 +252,13 @@ def _estimate(fit: _Fit, world: Array, epoch: int, n: int, config: AlignmentConf
     """The same form as the estimate by sheets."""
     pivot = world.mean(axis=0)
     wider = fit.chi2 / fit.freedom if fit.chi2 > chi2_quantile(fit.freedom, Z99) else 1.0
-    covariance = tuple(float(v) for v in (wider * in_world(fit.q, fit.covariance, pivot)).ravel())
+    covariance = tuple(float(v) for v in (wider * to_world_covariance(fit.q, fit.covariance, pivot)).ravel())
     at: Vec3 = (float(pivot[0]), float(pivot[1]), float(pivot[2]))
     error = position_error_p95(covariance, at, at)
     tilt = float(np.linalg.norm(swing(fit.q)))
     refused = not error <= config.max_error_m
     return AlignmentEstimate(
-        inverted(fit.t, fit.q),
+        to_inverse_pose(fit.t, fit.q),
         epoch,
         covariance,
         at,
@@ -275,5 +275,5 @@ def _refusal(epoch: int, advice: str, n: int = 0) -> AlignmentEstimate:
     return AlignmentEstimate(_NOWHERE, epoch, (0.0,) * 36, (0.0, 0.0, 0.0), math.inf, 0.0, n, 0, True, advice)
 
 
-def _refused(epoch: int, advice: str, suspects: Sequence[str] = ()) -> Registration:
-    return Registration(_refusal(epoch, advice), {}, tuple(suspects))
+def _refused(epoch: int, advice: str, suspects: Sequence[str] = ()) -> TouchRegistration:
+    return TouchRegistration(_refusal(epoch, advice), {}, tuple(suspects))

@@ -41,7 +41,7 @@ def length_p95(S: Array) -> float:
     return math.sqrt(mean / freedom * chi2_quantile(freedom, Z95))
 
 
-def at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> Array:
+def covariance_at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> Array:
     """Covariance (3, 3) of the position error at `point_world`: d(point) = d(pivot) + rot x (point - pivot)."""
     cov = np.asarray(covariance, dtype=np.float64).reshape(6, 6)
     rx, ry, rz = (point_world[i] - pivot_world[i] for i in range(3))
@@ -57,7 +57,7 @@ def at_point(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world
 
 def position_error_p95(covariance: Sequence[float] | Array, pivot_world: Vec3, point_world: Vec3) -> float:
     """Stated 95 % bound [m] of the position error at `point_world`, lever arm from `pivot_world` included."""
-    return length_p95(at_point(covariance, pivot_world, point_world))
+    return length_p95(covariance_at_point(covariance, pivot_world, point_world))
 
 
 def rotation_error_p95(covariance: Sequence[float] | Array) -> float:

@@ -22,8 +22,8 @@ from iris_session.protocol.client_messages import ClientMessage, Observation
 from iris_session.protocol.common import Pose
 
 if TYPE_CHECKING:
-    from anchors.camera import Camera
-    from anchors.detection import Sighting
+    from anchors.camera import CameraModel
+    from anchors.detection import SheetDetection
     from anchors.sheet import Sheet
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Looking:
     def observe_image(
         self,
         image: NDArray[Any],
-        camera: Camera,
+        camera: CameraModel,
         sheets: Sequence[Sheet],
         T_tracking_camera: PoseLike,
         *,
@@ -82,7 +82,7 @@ class Looking:
         device: str = "head",
         camera_sigma: tuple[float, float] = CAMERA_SIGMA,
         tracking_epoch: int | None = None,
-    ) -> list[Sighting]:
+    ) -> list[SheetDetection]:
         """Finds `sheets` in a picture, (height, width[, 3]) uint8, and reports them. Returns those that were reported.
 
         `T_tracking_camera`: where the camera was when it took the picture (x right, y down, z into the scene), at
@@ -118,7 +118,7 @@ class Looking:
             )
         return found
 
-    def _sightings(self, image: NDArray[Any], camera: Camera, sheets: Sequence[Sheet]) -> list[Sighting]:
+    def _sightings(self, image: NDArray[Any], camera: CameraModel, sheets: Sequence[Sheet]) -> list[SheetDetection]:
         try:
             from anchors.camera import CameraError
             from anchors.detection import DetectionError, SheetDetector

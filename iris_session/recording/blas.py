@@ -14,14 +14,14 @@ from typing import Any, Final
 _AFFIXES: Final = tuple((a, b) for a in ("scipy_", "") for b in ("64_", "", "_64"))
 
 
-def use_one_thread() -> None:
+def use_one_blas_thread() -> None:
     """From here on, in the whole process, for every OpenBLAS that is loaded now."""
     for library in _libraries():
         if (function := _function(library, "openblas_set_num_threads")) is not None:
             function(1)
 
 
-def threads() -> str:
+def count_blas_threads() -> str:
     """Threads of the loaded OpenBLAS libraries, `1` or `1,8`; `unknown` where none says."""
     found = {int(f()) for library in _libraries() if (f := _function(library, "openblas_get_num_threads")) is not None}
     return ",".join(map(str, sorted(found))) or "unknown"

@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 
-class Column:
+class ArrowColumn:
     """One component column: `values` is an Arrow list array with one list per row."""
 
     def __init__(self, name: str, values: Any) -> None:
@@ -27,37 +27,37 @@ class Column:
         return self._values
 
 
-def each(name: str, values: Any, kind: Any) -> Column:
+def scalar_column(name: str, values: Any, kind: Any) -> ArrowColumn:
     """One value of Arrow type `kind` per row."""
     array = pa.array(values, kind)
-    return Column(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array))
 
 
-def blobs(name: str, values: Iterable[bytes]) -> Column:
+def bytes_column(name: str, values: Iterable[bytes]) -> ArrowColumn:
     """One byte string per row, exactly."""
-    return each(name, list(values), pa.binary())
+    return scalar_column(name, list(values), pa.binary())
 
 
-def lists(name: str, values: Sequence[Sequence[int]], kind: Any) -> Column:
+def list_column(name: str, values: Sequence[Sequence[int]], kind: Any) -> ArrowColumn:
     """A list of integers per row."""
     flat = [item for row in values for item in row]
     offsets = np.zeros(len(values) + 1, np.int32)
     np.cumsum([len(row) for row in values], out=offsets[1:])
-    return Column(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat, kind)))
 
 
-def matrix(name: str, values: NDArray[np.float64]) -> Column:
+def matrix_column(name: str, values: NDArray[np.float64]) -> ArrowColumn:
     """A list of float64 per row of `values` (rows, items), exactly."""
     rows, items = values.shape
     offsets = np.arange(rows + 1, dtype=np.int32) * items
-    return Column(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))
+    return ArrowColumn(name, pa.ListArray.from_arrays(pa.array(offsets), pa.array(values.ravel())))
 
 
-def sequence(timeline: str, values: Any) -> Any:
+def sequence_index(timeline: str, values: Any) -> Any:
     """An integer index."""
     return rr.TimeColumn(timeline, sequence=np.asarray(values, np.int64))
 
 
-def nanoseconds(timeline: str, values: Any) -> Any:
+def duration_index(timeline: str, values: Any) -> Any:
     """An index of durations from integer nanoseconds, exactly."""
     return rr.TimeColumn(timeline, duration=np.asarray(values, np.int64).view("timedelta64[ns]"))

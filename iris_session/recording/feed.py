@@ -26,7 +26,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
 from iris_session.protocol.steps import Decision
 from iris_session.recording import messages
-from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal
+from iris_session.recording.journal import JournalRow, Keyframe, SessionHeader, seal_keyframe
 from iris_session.recording.messages import (
     Batch,
     DenialRecord,
@@ -38,7 +38,7 @@ from iris_session.recording.messages import (
     VertexFrame,
 )
 from iris_session.recording.spill import SpillFile
-from iris_session.recording.vertices import VertexPace
+from iris_session.recording.vertices import VertexRateLimit
 from iris_session.streams.deformable import read_header
 
 _T = TypeVar("_T")
@@ -110,7 +110,7 @@ class RecorderFeed:
             self._vertices.setsockopt(zmq.LINGER, 0)
             self._vertices.setsockopt(zmq.RECONNECT_IVL, 50)
             self._vertices.connect(vertices_endpoint)
-        self._pace = VertexPace()
+        self._pace = VertexRateLimit()
         self._header = b""
         self._scene = Batch()  # the newest `SceneModel`, and what the picture is drawn from
         self._next = 0
@@ -131,13 +131,13 @@ class RecorderFeed:
         """True once there is room again after a loss: verification can go on from the next keyframe."""
         return self._lost and not self._spill and 2 * self.stats.window_bytes <= self._window_limit
 
-    def header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
+    def send_header(self, header: SessionHeader, root: str = "", scene_hash: str = "") -> None:
         """Names the session: once, before the first row. `root`, `scene_hash`: see `SceneAssets`."""
         self._header = messages.encode_header(header)
         self._scene.assets = [SceneAssets(-1, 0, root, scene_hash)]
         self._exchange()
 
-    def scene(
+    def send_scene(
         self,
         model_hash: str,
         packed_model: bytes,
@@ -150,7 +150,7 @@ class RecorderFeed:
         scene = SceneModel(*self._now, model_hash, packed_model, bodies)
         self._tell(Batch(scenes=[scene], assets=[SceneAssets(*self._now, root, scene_hash)]))
 
-    def patch(self, root: str, scene_hash: str) -> None:
+    def send_patch(self, root: str, scene_hash: str) -> None:
         """The present scene is drawn in another way from now on, before the row that says so."""
         assets = [SceneAssets(*self._now, root, scene_hash)]
         self._tell(Batch(scenes=self._scene.scenes, assets=assets), Batch(assets=assets))
@@ -162,7 +162,7 @@ class RecorderFeed:
         self._batch.scenes, self._batch.assets = list(news.scenes), list(news.assets)
         self.flush()
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         """One step. Flushes after 10 rows or 20 ms of session time."""
         batch = self._batch
         if not batch.rows:
@@ -174,13 +174,13 @@ class RecorderFeed:
         if len(batch.rows) >= BATCH_ROWS or row.now_ns - self._batch_since >= BATCH_NS:
             self.flush()
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         """Snapshots after the step of the newest row, whose `chain` is given (`header_root` before the first row)."""
         self._lost = False
-        self._batch.keyframes.append(seal(keyframe, chain))
+        self._batch.keyframes.append(seal_keyframe(keyframe, chain))
         self.flush()
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,
@@ -193,7 +193,7 @@ class RecorderFeed:
         frame = StateFrame(step, tick, sim_time, session_time, poses.tobytes(), self._presence, tuple(applied))
         self._add(self._batch.states, frame)
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         """Events and denials of one step; its presence goes with the next state."""
         if decision.presence:
             self._presence = decision.presence
@@ -205,11 +205,11 @@ class RecorderFeed:
                 record = DenialRecord(step, session_time, outgoing.connection, message.denial)
                 self._add(self._batch.denials, record)
 
-    def metric(self, name: str, value: float) -> None:
+    def add_metric(self, name: str, value: float) -> None:
         """A scalar at the newest row's step and time, plotted as `/metrics/<name>`."""
         self._add(self._batch.metrics, MetricRecord(*self._now, name, float(value)))
 
-    def vertices(self, stream: str, frame: bytes, session_time: int) -> None:
+    def send_vertices(self, stream: str, frame: bytes, session_time: int) -> None:
         """`full` of a deformable's media stream, as it was published with the state of `session_time`. For the picture:
         not all of them go in (`VertexPace`), and none waits."""
         if self._vertices is None or not self._pace.take(stream, read_header(frame).n_vertices, session_time):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.common import Applied
 from iris_session.protocol.server_messages import BodyInfo, Event, PresenceItem
 from iris_session.recording import paths
-from iris_session.recording.joining import ROW_ID, entity_of
+from iris_session.recording.joining import ROW_ID, get_entity
 from iris_session.recording.journal import JournalRow, Keyframe, open_blob
 from iris_session.recording.messages import DenialRecord, EndMark, SceneModel, decode_scene
 from iris_session.recording.rrd_file import Mark
@@ -39,7 +39,7 @@ class RawSample(NamedTuple):
     data: bytes
 
 
-class State(NamedTuple):
+class RecordedState(NamedTuple):
     """`poses`: float64 (n_bodies, 7) `x y z qw qx qy qz`, world frame, exactly as the session had them. `bodies`: of
     which body each is."""
 
@@ -61,17 +61,17 @@ class Scalar(NamedTuple):
     value: float
 
 
-def rows(batch: Any) -> Iterator[JournalRow]:
+def decode_rows(batch: Any) -> Iterator[JournalRow]:
     """Rows of the journal."""
     columns = zip(
-        index(batch, paths.STEP),
-        index(batch, paths.SESSION_TIME),
-        values(batch, "n_ticks"),
-        values(batch, "entries"),
+        read_index(batch, paths.STEP),
+        read_index(batch, paths.SESSION_TIME),
+        read_values(batch, "n_ticks"),
+        read_values(batch, "entries"),
         _lists(batch, "entry_lengths"),
         _lists(batch, "entry_crcs"),
-        values(batch, "digest"),
-        values(batch, "chain"),
+        read_values(batch, "digest"),
+        read_values(batch, "chain"),
         _lists(batch, "field_crcs"),
         _plants(batch),
         strict=True,
@@ -79,47 +79,47 @@ def rows(batch: Any) -> Iterator[JournalRow]:
     return (JournalRow(*row) for row in columns)
 
 
-def states(batch: Any) -> Iterator[State]:
+def decode_states(batch: Any) -> Iterator[RecordedState]:
     """States without their `bodies`."""
     _flat(batch, "poses")
     lists = batch.column("poses")
     ends = np.cumsum(np.asarray(lists.value_lengths(), np.intp))  # another scene has other bodies
     poses = [p.reshape(-1, 7) for p in np.split(np.asarray(lists.flatten(), np.float64), ends[:-1])]
     columns = zip(
-        index(batch, paths.STEP),
-        index(batch, paths.TICK),
-        values(batch, "sim_time_s"),
-        index(batch, paths.SESSION_TIME),
+        read_index(batch, paths.STEP),
+        read_index(batch, paths.TICK),
+        read_values(batch, "sim_time_s"),
+        read_index(batch, paths.SESSION_TIME),
         poses,
-        map(_decode_presence, values(batch, "presence")),
-        map(_decode_applied, values(batch, "applied")),
+        map(_decode_presence, read_values(batch, "presence")),
+        map(_decode_applied, read_values(batch, "applied")),
         strict=True,
     )
-    return (State(*row) for row in columns)
+    return (RecordedState(*row) for row in columns)
 
 
-def models(batch: Any) -> Iterator[SceneModel]:
+def decode_models(batch: Any) -> Iterator[SceneModel]:
     """Scenes that were loaded."""
-    for sealed in values(batch, "scene"):
+    for sealed in read_values(batch, "scene"):
         blob, intact = open_blob(sealed)
         if not intact:
             raise ValueError("a model was changed (checksum)")
         yield decode_scene(blob)
 
 
-def samples(batch: Any) -> Iterator[RawSample]:
+def decode_samples(batch: Any) -> Iterator[RawSample]:
     """Raw messages."""
-    columns = (values(batch, "connection"), index(batch, paths.SESSION_TIME), values(batch, "data"))
+    columns = (read_values(batch, "connection"), read_index(batch, paths.SESSION_TIME), read_values(batch, "data"))
     return (RawSample(*row) for row in zip(*columns, strict=True))
 
 
-def scalars(batch: Any) -> Iterator[Scalar]:
+def decode_scalars(batch: Any) -> Iterator[Scalar]:
     """Values of plots."""
-    columns = (index(batch, paths.SESSION_TIME), values(batch, "Scalars:scalars"))
-    return (Scalar(entity_of(batch), *row) for row in zip(*columns, strict=True))
+    columns = (read_index(batch, paths.SESSION_TIME), read_values(batch, "Scalars:scalars"))
+    return (Scalar(get_entity(batch), *row) for row in zip(*columns, strict=True))
 
 
-def numbered_denials() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
+def numbered_denial_decoder() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
     """Reads denials, and how many of the same step come before each: two may be alike. For batches in their order.
 
     The recorder writes those of a step at once, and the first half of Rerun's row id tells of each write. So a step
@@ -129,7 +129,7 @@ def numbered_denials() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
 
     def numbered(batch: Any) -> Iterator[tuple[int, DenialRecord]]:
         nonlocal place, n
-        for record, row in zip(denials(batch), batch.column(ROW_ID).to_pylist(), strict=True):
+        for record, row in zip(decode_denials(batch), batch.column(ROW_ID).to_pylist(), strict=True):
             at = (row[:_WRITE], record.step)
             place, n = at, n + 1 if at == place else 0
             yield n, record
@@ -140,17 +140,17 @@ def numbered_denials() -> Callable[[Any], Iterator[tuple[int, DenialRecord]]]:
 def _packed(column: str, kind: type[_T]) -> Callable[[Any], Iterator[_T]]:
     """Reads a column with one MessagePack value per row."""
     decode = msgspec.msgpack.Decoder(kind).decode
-    return lambda batch: map(decode, values(batch, column))
+    return lambda batch: map(decode, read_values(batch, column))
 
 
-keyframes: Final = _packed("keyframe", Keyframe)
-events: Final = _packed("event", Event)
-denials: Final = _packed("denial", DenialRecord)
-marks: Final = _packed("mark", Mark)
-ends: Final = _packed("end", EndMark)
+decode_keyframes: Final = _packed("keyframe", Keyframe)
+decode_events: Final = _packed("event", Event)
+decode_denials: Final = _packed("denial", DenialRecord)
+decode_marks: Final = _packed("mark", Mark)
+decode_ends: Final = _packed("end", EndMark)
 
 
-def values(batch: Any, column: str) -> list[Any]:
+def read_values(batch: Any, column: str) -> list[Any]:
     """One value per row of a component column."""
     flat = _flat(batch, column)
     if len(flat) != batch.num_rows:
@@ -158,7 +158,7 @@ def values(batch: Any, column: str) -> list[Any]:
     return list(flat.to_pylist())
 
 
-def index(batch: Any, timeline: str) -> list[int]:
+def read_index(batch: Any, timeline: str) -> list[int]:
     """Integer values of a timeline (durations in nanoseconds)."""
     return [int(v) for v in np.asarray(batch.column(timeline).cast("int64"))]
 

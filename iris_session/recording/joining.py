@@ -19,7 +19,7 @@ _KIND: Final = b"rerun:kind"
 _DATA: Final = b"data"
 
 
-def spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
+def group_spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
     """Record batches, of any entities, as pieces that belong together: all there is of some rows of one entity.
 
     Mostly that is one batch, as it was written. Spans of an entity come in the order of its rows.
@@ -28,13 +28,13 @@ def spans(batches: Iterable[Any]) -> Iterator[list[Any]]:
     for batch in batches:
         if batch.num_rows:
             ordered = _in_order(batch)
-            pieces = waiting.setdefault(entity_of(batch), [])
+            pieces = waiting.setdefault(get_entity(batch), [])
             yield from _released(pieces, ordered.column(ROW_ID)[0])
             pieces.append(ordered)
     yield from filter(None, waiting.values())
 
 
-def join(pieces: list[Any]) -> Any:
+def join_pieces(pieces: list[Any]) -> Any:
     """One record batch of all rows of a span, null where a row has nothing in a column.
 
     Raises `ValueError` where pieces say different things of one row: then the file was changed.
@@ -50,12 +50,12 @@ def join(pieces: list[Any]) -> Any:
     return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
-def count(pieces: list[Any]) -> int:
+def count_joined_rows(pieces: list[Any]) -> int:
     """How many rows `join` would give."""
     return pieces[0].num_rows if _is_whole(pieces) else len(_ids(pieces))
 
 
-def entity_of(batch: Any) -> str:
+def get_entity(batch: Any) -> str:
     """Path of the entity that the rows are of."""
     return str(batch.schema.metadata[_ENTITY].decode())
 

@@ -21,7 +21,7 @@ from iris_session.recording.journal import SessionHeader
 from iris_session.recording.messages import DenialRecord
 
 
-class Line(NamedTuple):
+class LogLine(NamedTuple):
     """`level`: a Rerun log level (`INFO`, `WARN`, `CRITICAL`)."""
 
     level: str
@@ -40,15 +40,15 @@ _LEVELS: dict[type, str] = {
 }
 
 
-def describe_event(event: Event) -> Line:
+def describe_event(event: Event) -> LogLine:
     """`#12 lease_changed target=left holder=p1 ...`: the number, the kind, and every field that says something."""
     body: dict[str, Any] = msgspec.to_builtins(event.body)
     kind = body.pop("event")
     fields = " ".join(_fields(body))
-    return Line(_LEVELS.get(type(event.body), "INFO"), f"#{event.event_seq} {kind} {fields}".rstrip())
+    return LogLine(_LEVELS.get(type(event.body), "INFO"), f"#{event.event_seq} {kind} {fields}".rstrip())
 
 
-def describe_denial(record: DenialRecord) -> Line:
+def describe_denial(record: DenialRecord) -> LogLine:
     """What was refused to whom, why, and what to do."""
     denial = record.denial
     parts = [f"connection {record.connection}: {denial.reason}: {denial.message}"]
@@ -56,7 +56,7 @@ def describe_denial(record: DenialRecord) -> Line:
         parts.append(f"held by {denial.holder_name or denial.holder}")
     if denial.advice:
         parts.append(denial.advice)
-    return Line("WARN", "; ".join(parts))
+    return LogLine("WARN", "; ".join(parts))
 
 
 def describe_session(header: SessionHeader) -> str:

@@ -18,7 +18,7 @@ LIBRARIES: Final = ("iris-session", "numpy", "scipy", "mujoco", "mink", "daqp", 
 BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def environment() -> dict[str, str]:
+def describe_environment() -> dict[str, str]:
     """Versions of this process: one text per name. Libraries that are not installed are `absent`."""
     found = {"python": platform.python_version(), "implementation": sys.implementation.name}
     for name in LIBRARIES:
@@ -29,12 +29,12 @@ def environment() -> dict[str, str]:
     found["platform"] = f"{platform.system()}-{platform.machine()}-{platform.libc_ver()[1] or 'unknown'}"
     for name in BLAS_VARIABLES:
         found[name] = os.environ.get(name, "unset")
-    found["blas_threads"] = blas.threads()
-    found["cpu"] = cpu_model()
+    found["blas_threads"] = blas.count_blas_threads()
+    found["cpu"] = read_cpu_model()
     return found
 
 
-def cpu_model() -> str:
+def read_cpu_model() -> str:
     """The processor's own name: another one may take other vector instructions, which round differently."""
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
         for line in file:
@@ -43,9 +43,9 @@ def cpu_model() -> str:
     return platform.processor() or "unknown"
 
 
-def differences(recorded: dict[str, str], here: dict[str, str] | None = None) -> list[str]:
+def compare_environment(recorded: dict[str, str], here: dict[str, str] | None = None) -> list[str]:
     """One line per version that is not the recorded one: why a re-simulation may differ."""
-    now = environment() if here is None else here
+    now = describe_environment() if here is None else here
     return [
         f"{name}: recorded {value}, here {now.get(name, 'absent')}"
         for name, value in sorted(recorded.items())
@@ -53,7 +53,7 @@ def differences(recorded: dict[str, str], here: dict[str, str] | None = None) ->
     ]
 
 
-def boot_id() -> str:
+def read_boot_id() -> str:
     """Which boot of which machine this is; empty where the system does not tell. CLOCK_MONOTONIC begins with it."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

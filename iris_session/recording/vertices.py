@@ -15,7 +15,7 @@ BYTES_PER_S: Final = 1_000_000
 VERTEX_BYTES: Final = 24
 
 
-class VertexPace:
+class VertexRateLimit:
     """The frames of one scene. All its deformables have the same rate."""
 
     def __init__(self) -> None:

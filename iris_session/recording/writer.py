@@ -25,7 +25,7 @@ from iris_session.protocol.common import Applied
 from iris_session.protocol.names import Device
 from iris_session.protocol.server_messages import BodyInfo, Event
 from iris_session.recording import paths, scene
-from iris_session.recording.columns import blobs, each, lists, matrix, nanoseconds, sequence
+from iris_session.recording.columns import bytes_column, scalar_column, list_column, matrix_column, duration_index, sequence_index
 from iris_session.recording.errors import WriteError
 from iris_session.recording.journal import SessionHeader, seal_blob
 from iris_session.recording.messages import (
@@ -40,7 +40,7 @@ from iris_session.recording.messages import (
     encode_header,
     encode_scene,
 )
-from iris_session.recording.pictures import Moment, ScenePicture, Source, entity_part
+from iris_session.recording.pictures import Moment, ScenePicture, SceneSource, escape_entity_part
 from iris_session.recording.rrd_stream import RrdStream
 from iris_session.recording.text import describe_denial, describe_event, describe_session
 from iris_session.streams.errors import StreamError
@@ -84,7 +84,7 @@ class RrdWriter:
         self._people: dict[str, tuple[int, int, int]] = {}
         self._devices: dict[tuple[str, str], int] = {}  # newest capture time drawn
 
-    def header(self, header: SessionHeader) -> None:
+    def write_header(self, header: SessionHeader) -> None:
         """Writes the header and the scene. Must come before the first flush with data."""
         self._rec.send_recording_name(header.session_name)
         self._static(paths.HEADER, rr.AnyValues(blob=pa.array([seal_blob(encode_header(header))], pa.binary())))
@@ -94,7 +94,7 @@ class RrdWriter:
         self._static(paths.TRANSFORMS + "_static", root)
         self._static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if header.model:
-            self._picture.begin(Source(header.model, header.bodies))
+            self._picture.set_scene(SceneSource(header.model, header.bodies))
 
     def _use(self, bodies: tuple[BodyInfo, ...]) -> None:
         self._bodies = bodies
@@ -167,8 +167,8 @@ class RrdWriter:
         return self._stream.size
 
     def _mark(self) -> None:
-        times = [sequence(paths.STEP, [self._newest_row[0]])]
-        self._send(paths.MARKS, times, [blobs("mark", [_encode(self._stream.mark())])])
+        times = [sequence_index(paths.STEP, [self._newest_row[0]])]
+        self._send(paths.MARKS, times, [bytes_column("mark", [_encode(self._stream.mark())])])
 
     def _static(self, entity: str, *values: Any) -> None:
         self._rec.log(entity, *values, static=True, strict=True)
@@ -181,19 +181,19 @@ class RrdWriter:
         if not rows:
             return
         columns = [
-            each("n_ticks", [row.n_ticks for row in rows], pa.int64()),
-            blobs("entries", [row.entries for row in rows]),
-            lists("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
-            lists("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
-            blobs("digest", [row.digest for row in rows]),
-            blobs("chain", [row.chain for row in rows]),
-            lists("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
+            scalar_column("n_ticks", [row.n_ticks for row in rows], pa.int64()),
+            bytes_column("entries", [row.entries for row in rows]),
+            list_column("entry_lengths", [row.entry_lengths for row in rows], pa.uint32()),
+            list_column("entry_crcs", [row.entry_crcs for row in rows], pa.uint32()),
+            bytes_column("digest", [row.digest for row in rows]),
+            bytes_column("chain", [row.chain for row in rows]),
+            list_column("field_crcs", [row.field_crcs for row in rows], pa.uint32()),
         ]
         if any(row.plant for row in rows):
-            columns.append(blobs("plant", [row.plant for row in rows]))
+            columns.append(bytes_column("plant", [row.plant for row in rows]))
         times = [
-            sequence(paths.STEP, [row.step for row in rows]),
-            nanoseconds(paths.SESSION_TIME, [row.now_ns for row in rows]),
+            sequence_index(paths.STEP, [row.step for row in rows]),
+            duration_index(paths.SESSION_TIME, [row.now_ns for row in rows]),
         ]
         self._send(paths.ROWS, times, columns)
         self._newest_row = (rows[-1].step, rows[-1].chain)
@@ -201,22 +201,22 @@ class RrdWriter:
     def _scenes(self, scenes: list[SceneModel], assets: list[SceneAssets]) -> None:
         """Models for verification, and the picture from here on."""
         if scenes:
-            times = [sequence(paths.STEP, [s.step for s in scenes])]
-            self._send(paths.MODELS, times, [blobs("scene", [seal_blob(encode_scene(s)) for s in scenes])])
+            times = [sequence_index(paths.STEP, [s.step for s in scenes])]
+            self._send(paths.MODELS, times, [bytes_column("scene", [seal_blob(encode_scene(s)) for s in scenes])])
         for loaded in scenes:
             self._use(loaded.bodies)
             self._last_step = loaded.step if loaded.session_time else self._last_step
-            source = Source(loaded.model, loaded.bodies, *assets[-1:])
-            self._picture.change(source, (loaded.step, *self._clock, loaded.session_time))
+            source = SceneSource(loaded.model, loaded.bodies, *assets[-1:])
+            self._picture.replace_scene(source, (loaded.step, *self._clock, loaded.session_time))
         for patch in () if scenes else assets:
-            self._picture.patch(patch, (patch.step, *self._clock, patch.session_time))
+            self._picture.patch_scene(patch, (patch.step, *self._clock, patch.session_time))
 
     def _keyframes(self, batch: Batch) -> None:
         frames = batch.keyframes
         if not frames:
             return
-        times = [sequence(paths.STEP, [k.step for k in frames])]
-        self._send(paths.KEYFRAMES, times, [blobs("keyframe", [_encode(k) for k in frames])])
+        times = [sequence_index(paths.STEP, [k.step for k in frames])]
+        self._send(paths.KEYFRAMES, times, [bytes_column("keyframe", [_encode(k) for k in frames])])
 
     def _states(self, states: list[StateFrame]) -> None:
         if not states:
@@ -227,10 +227,10 @@ class RrdWriter:
         self._picture.draw((step, 0, min(0, sim_ns), session_ns))  # a reset begins ticks and simulated time again
         times = np.array(moments, np.int64).T
         columns = [
-            matrix("poses", poses.reshape(len(states), -1)),
-            each("sim_time_s", [s.sim_time for s in states], pa.float64()),
-            blobs("presence", [_encode(s.presence) for s in states]),
-            blobs("applied", [_encode(s.applied) for s in states]),
+            matrix_column("poses", poses.reshape(len(states), -1)),
+            scalar_column("sim_time_s", [s.sim_time for s in states], pa.float64()),
+            bytes_column("presence", [_encode(s.presence) for s in states]),
+            bytes_column("applied", [_encode(s.applied) for s in states]),
         ]
         self._send(paths.STATE, _times(times), columns)
         self._note_latencies(states)
@@ -246,22 +246,22 @@ class RrdWriter:
         while self._vertices and times and self._vertices[0].session_time <= times[-1]:
             frame = self._vertices.popleft()
             at = bisect_right(times, frame.session_time) - 1
-            bending = self._picture.bending.get(frame.stream)
+            bending = self._picture.deformables.get(frame.stream)
             if bending is None:  # hidden, or said to be not drawn
                 continue
             try:
                 # The state of that step is later than its row, by the time that the step took: times do not tell.
                 late = at < 0 or frame.session_time < self._picture.since_ns or self._known[at][0] <= self._last_step
-                vertices = None if late else bending.taken(frame.frame)
+                vertices = None if late else bending.decode_frame(frame.frame)
             except StreamError:
                 late, vertices = True, None
             self.vertices_refused += late
             if vertices is not None:
                 rows.setdefault(frame.stream, []).append(((*self._known[at][:3], frame.session_time), vertices))
         for stream, taken in rows.items():
-            bending = self._picture.bending[stream]
+            bending = self._picture.deformables[stream]
             moments = np.array([moment for moment, _ in taken], np.int64).T
-            self._send(bending.entity, _times(moments), [*bending.columns([row for _, row in taken])])
+            self._send(bending.entity, _times(moments), [*bending.build_columns([row for _, row in taken])])
 
     def _note_latencies(self, states: list[StateFrame]) -> None:
         """For the plots: from the capture of a sample to the step that it entered, per robot. Written once a second."""
@@ -322,7 +322,7 @@ class RrdWriter:
         """Static geometry of a device that appears for the first time: a box for a head, a ball for a hand."""
         color = self._people.setdefault(participant, PALETTE[len(self._people) % len(PALETTE)])
         frame = rr.CoordinateFrame(_presence_frame(participant, device))
-        entity = f"{paths.PRESENCE}/{entity_part(participant)}/{entity_part(device)}"
+        entity = f"{paths.PRESENCE}/{escape_entity_part(participant)}/{escape_entity_part(device)}"
         solid = rr.components.FillMode.Solid
         if device == Device.HEAD:
             shape = rr.Boxes3D(half_sizes=[(0.06, 0.09, 0.05)], colors=[color], labels=[participant], fill_mode=solid)
@@ -335,7 +335,7 @@ class RrdWriter:
             return
         lines = [describe_event(event) for event in events]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
-        columns = [*text, blobs("event", [_encode(event) for event in events])]
+        columns = [*text, bytes_column("event", [_encode(event) for event in events])]
         times = self._moments([e.step for e in events], [e.session_time for e in events])
         self._send(paths.EVENTS, times, columns)
 
@@ -344,7 +344,7 @@ class RrdWriter:
             return
         lines = [describe_denial(record) for record in denials]
         text = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
-        columns = [*text, blobs("denial", [_encode(record) for record in denials])]
+        columns = [*text, bytes_column("denial", [_encode(record) for record in denials])]
         times = self._moments([d.step for d in denials], [d.session_time for d in denials])
         self._send(paths.DENIALS, times, columns)
 
@@ -361,10 +361,10 @@ class RrdWriter:
         if not samples:
             return
         columns = [
-            each("connection", [s[0] for s in samples], pa.int64()),
-            blobs("data", [s[2] for s in samples]),
+            scalar_column("connection", [s[0] for s in samples], pa.int64()),
+            bytes_column("data", [s[2] for s in samples]),
         ]
-        self._send(paths.SAMPLES, [nanoseconds(paths.SESSION_TIME, [s[1] for s in samples])], columns)
+        self._send(paths.SAMPLES, [duration_index(paths.SESSION_TIME, [s[1] for s in samples])], columns)
 
     def _moments(self, steps: list[int], session_times: list[int]) -> list[Any]:
         moments = [(step, *self._clock, now_ns) for step, now_ns in zip(steps, session_times, strict=True)]
@@ -375,10 +375,10 @@ def _times(times: NDArray[np.int64]) -> list[Any]:
     """`times` (4, rows): step, tick, sim_time [ns], session_time [ns]."""
     step, tick, sim_ns, session_ns = times
     return [
-        sequence(paths.STEP, step),
-        sequence(paths.TICK, tick),
-        nanoseconds(paths.SIM_TIME, sim_ns),
-        nanoseconds(paths.SESSION_TIME, session_ns),
+        sequence_index(paths.STEP, step),
+        sequence_index(paths.TICK, tick),
+        duration_index(paths.SIM_TIME, sim_ns),
+        duration_index(paths.SESSION_TIME, session_ns),
     ]
 
 

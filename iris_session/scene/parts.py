@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.lie import matrix_quat, quat_matrix
+from anchors.lie import quat_from_matrix, quat_to_matrix
 from iris_session.protocol.common import IDENTITY, MAX_TEXT, Pose, Quat, Vec3
 from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind
 from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
@@ -154,7 +154,7 @@ def solid(matrix: Matrix) -> bool:
 
 def pose_of(R: NDArray[np.float64], p: Any) -> Pose:
     """A pose of a rotation matrix (3, 3) and a position."""
-    w, i, j, k = matrix_quat(np.asarray(R, np.float64)).tolist()
+    w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
     return Pose(vec3(p), (w, i, j, k))
 
 
@@ -167,7 +167,7 @@ def vec3(p: Any) -> Vec3:
 def matrix_of(pose: Pose) -> Matrix:
     """(4, 4) of a pose."""
     matrix = np.eye(4)
-    matrix[:3, :3] = quat_matrix(np.array(pose.q))
+    matrix[:3, :3] = quat_to_matrix(np.array(pose.q))
     matrix[:3, 3] = pose.p
     return matrix
 

@@ -50,7 +50,7 @@ from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
 from iris_session.recording.verify import Models
-from iris_session.recording.versions import boot_id
+from iris_session.recording.versions import read_boot_id
 from iris_session.security.resume_tokens import handback_above
 from iris_session.session.config import SessionConfig
 from iris_session.session.config_checks import check_arguments, check_objects, check_robots
@@ -179,7 +179,7 @@ class Continuation:
                 "was shown, or start the program that moved the world"
             )
         problems: list[str] = []
-        blas.use_one_thread()  # as in the run that is taken again
+        blas.use_one_blas_thread()  # as in the run that is taken again
         for keyframe in starts(recording):
             try:
                 self.core = core_at(header, keyframe, recording.model)
@@ -214,7 +214,7 @@ class Continuation:
         except msgspec.DecodeError:
             self.handback = handback_above(last)
         now_ns = time.monotonic_ns()
-        same_boot = bool(header.boot_id) and header.boot_id == boot_id()
+        same_boot = bool(header.boot_id) and header.boot_id == read_boot_id()
         origin_ns = header.origin_ns if same_boot else now_ns
         if now_ns - origin_ns <= self.now_ns:
             origin_ns = now_ns - self.now_ns - MARGIN_NS

@@ -137,7 +137,7 @@ class Session(Owner, SceneChanges):
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
         """
         check_timestep(self.model)
-        blas.use_one_thread()  # for the same bits in every run
+        blas.use_one_blas_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
         with self.signals(), freeze_garbage_collector(), tick_priority(self.config.realtime) as self._scheduling:
             # Counted from here: collecting garbage in a large process takes longer than a short run.

@@ -18,7 +18,7 @@ class ReplayCore:
     """A `SessionCore` as `recording.verify` drives it."""
 
     def __init__(self, header: SessionHeader, models: Models) -> None:
-        blas.use_one_thread()
+        blas.use_one_blas_thread()
         config = msgspec.msgpack.decode(header.config, type=CoreConfig)
         model = model_from_bytes(unpack_model(header.model))
         self.core = SessionCore(model, config, lambda model_hash: model_from_bytes(models(model_hash)))
@@ -37,5 +37,5 @@ class ReplayCore:
 
 def verify_recording(path: Path, progress: Callable[[int, int], None] | None = None) -> VerifyReport:
     """Re-simulates every step of the recording at `path`. Raises `RecordingError` when it cannot be read at all."""
-    blas.use_one_thread()  # before versions are compared: threads that are not used here are no difference
+    blas.use_one_blas_thread()  # before versions are compared: threads that are not used here are no difference
     return verify(path, ReplayCore, progress)

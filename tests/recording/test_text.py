@@ -35,8 +35,8 @@ def test_the_session_page_names_class_and_versions() -> None:
 
 
 def test_versions_here_equal_versions_here() -> None:
-    here = versions.environment()
+    here = versions.describe_environment()
     assert here["numpy"] != "absent"
-    assert versions.differences(here) == []
+    assert versions.compare_environment(here) == []
     other = {**here, "numpy": "1.0", "gone": "2"}
-    assert [line.split(":")[0] for line in versions.differences(other)] == ["gone", "numpy"]
+    assert [line.split(":")[0] for line in versions.compare_environment(other)] == ["gone", "numpy"]

@@ -41,9 +41,9 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
-from iris_session.recording.journal import CRASHED, seal
+from iris_session.recording.journal import CRASHED, seal_keyframe
 from iris_session.recording.messages import Batch
-from iris_session.recording.versions import boot_id
+from iris_session.recording.versions import read_boot_id
 from iris_session.security.resume_tokens import ResumeTokens, handback_above
 from iris_session.session import continuation
 from iris_session.session.config import SessionConfig
@@ -89,11 +89,11 @@ def recorded(
         core.config.objects,
         core.world.bodies,
         origin_ns=time.monotonic_ns() - LAST_NS,
-        boot_id=boot_id(),
+        boot_id=read_boot_id(),
     )
     head = msgspec.structs.replace(head, **header)
     chain = header_root(head)
-    batch = Batch(keyframes=[seal(keyframe_of(core, -1), chain)])
+    batch = Batch(keyframes=[seal_keyframe(keyframe_of(core, -1), chain)])
     for step in range(STEPS):
         now_ns = (step + 1) * TICK_NS
         came = [*entries(step), *said.get(step, ())]
@@ -101,7 +101,7 @@ def recorded(
         batch.rows.append(change(row))
         chain = batch.rows[-1].chain
         if step in KEYFRAMES:
-            batch.keyframes.append(keyframes(seal(keyframe_of(core, step), chain)))
+            batch.keyframes.append(keyframes(seal_keyframe(keyframe_of(core, step), chain)))
     return write(path, head, batch)
 
 
@@ -445,7 +445,7 @@ class Journal:
         pass
 
     def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
-        self.batch.keyframes.append(seal(keyframe, chain))
+        self.batch.keyframes.append(seal_keyframe(keyframe, chain))
 
     def state(
         self,
