@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import pose_to_matrix, pose_from_matrix
+from anchors.camera import pose_from_matrix, pose_to_matrix
 from anchors.pose import PoseTuple, compose, inverse
 from anchors.robot_world import CalibrationError
 
@@ -45,11 +45,18 @@ class CameraRig:
 
 
 def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple]) -> CameraRig:
-    """Cameras and unknown sheets in the frame in which the known ones stand. Raises `CalibrationError` for what
-    nothing connects with a known sheet."""
+    """Solve the poses of cameras and unknown sheets in the frame of the known sheets.
+
+    Args:
+        views: Observations of sheets by cameras.
+        T_base_sheet: Poses of the known sheets.
+
+    Raises:
+        CalibrationError: No view, or a camera is not connected with a known sheet.
+    """
     if not views:
         raise CalibrationError("no camera saw a sheet: step closer, light the sheet, check its size and id")
-    poses = _first_guess(views, T_base_sheet)
+    poses = _initial_guess(views, T_base_sheet)
     names = [*sorted({("camera", v.camera) for v in views}), *sorted({("sheet", v.sheet) for v in views})]
     free = [name for name in names if not (name[0] == "sheet" and name[1] in T_base_sheet)]
     poses, normal, scale = _least_squares(views, poses, free)
@@ -59,7 +66,7 @@ def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple])
         for k, name in enumerate(free)
         if name[0] == "camera"
     }
-    differences = [_difference(view, poses) for view in views]
+    differences = [_view_residual(view, poses) for view in views]
     return CameraRig(
         {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "camera"},
         {name: pose_from_matrix(poses[kind, name]) for kind, name in names if kind == "sheet"},
@@ -71,8 +78,8 @@ def solve_rig(views: Sequence[SheetView], T_base_sheet: Mapping[str, PoseTuple])
 _Name = tuple[str, str]
 
 
-def _first_guess(views: Sequence[SheetView], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
-    """From known sheets outwards, one view for each."""
+def _initial_guess(views: Sequence[SheetView], known: Mapping[str, PoseTuple]) -> dict[_Name, Array]:
+    """Return initial poses, outwards from the known sheets, by one view each."""
     poses: dict[_Name, PoseTuple] = {("sheet", name): T for name, T in known.items()}
     waiting = list(views)
     while waiting:
@@ -104,7 +111,7 @@ def _least_squares(
     floor = np.diag([_FLOOR[0] ** 2] * 3 + [_FLOOR[1] ** 2] * 3)
     whiteners = [np.linalg.inv(np.linalg.cholesky(np.reshape(view.covariance, (6, 6)) + floor)) for view in views]
 
-    def moved(p: Array) -> dict[_Name, Array]:
+    def apply_increments(p: Array) -> dict[_Name, Array]:
         out = dict(poses)
         for name, step in zip(free, p.reshape(-1, 6), strict=True):
             M = np.eye(4)
@@ -114,16 +121,20 @@ def _least_squares(
         return out
 
     def residuals(p: Array) -> Array:
-        at = moved(p)
-        return np.concatenate([W @ _difference(view, at) for W, view in zip(whiteners, views, strict=True)])
+        at = apply_increments(p)
+        return np.concatenate([W @ _view_residual(view, at) for W, view in zip(whiteners, views, strict=True)])
 
     solved = least_squares(residuals, np.zeros(6 * len(free)), loss="huber", f_scale=3.0, x_scale="jac")
     freedom = max(6 * (len(views) - len(free)), 1)
-    return moved(solved.x), np.asarray(solved.jac.T @ solved.jac), max(1.0, 2.0 * float(solved.cost) / freedom)
+    return (
+        apply_increments(solved.x),
+        np.asarray(solved.jac.T @ solved.jac),
+        max(1.0, 2.0 * float(solved.cost) / freedom),
+    )
 
 
-def _difference(view: SheetView, poses: Mapping[_Name, Array]) -> Array:
-    """Position and rotation of the sheet as it follows from the poses against what was seen, camera frame."""
+def _view_residual(view: SheetView, poses: Mapping[_Name, Array]) -> Array:
+    """Return predicted minus observed position [m] and rotation [rad] of a sheet (6,), camera frame."""
     from scipy.spatial.transform import Rotation
 
     seen = pose_to_matrix(view.T_camera_sheet)

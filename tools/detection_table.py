@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from render_sheet import Conditions, Page, photograph
 
 from anchors.camera import CameraModel
-from anchors.detection import SheetDetector, SheetDetection, detect_codes
+from anchors.detection import SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, quat_angle, quat_conj, quat_from_rotvec, quat_mul, quat_to_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf

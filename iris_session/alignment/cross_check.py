@@ -1,7 +1,7 @@
 """Schedule the cross-check of headsets: which pair is compared when, and which disagreement is reported.
 
 One pair per call, each pair at most once a second; a pair is reported at most every five seconds, and only after new
-observations. The mathematics is in `anchors.crosscheck`.
+observations. The mathematics is in `anchors.cross_check`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import combinations
 from typing import Final
 
 from anchors.alignment import AlignmentEstimate
-from anchors.crosscheck import CrossCheck, CrossCheckConfig, Disagreement
+from anchors.cross_check import CrossCheck, CrossCheckConfig, Disagreement
 from anchors.pose import PoseTuple, Vec3
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.entries import CrossChecked, Entry

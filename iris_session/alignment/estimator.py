@@ -18,7 +18,7 @@ import numpy as np
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
 from anchors.pose import IDENTITY_POSE, PoseTuple, Vec3, is_valid_point
-from anchors.touch import TouchRegistration, Touch, register_touches
+from anchors.touch import Touch, TouchRegistration, register_touches
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.common import MAX_TEXT, Pose
 from iris_session.protocol.entries import AlignmentProposal

@@ -18,18 +18,23 @@ from anchors.alignment import AlignmentConfig, AlignmentEstimate
 from anchors.constellation import (
     Constellation,
     ConstellationError,
+    ConstellationSolution,
     MovedSheet,
     SheetObservation,
-    ConstellationSolution,
     find_moved,
     solve_constellation,
 )
-from anchors.noise import NoiseModel, isotropic_covariance, validate_covariance
 from anchors.pose import IDENTITY_POSE, PoseTuple, apply, compose, distance, inverse, is_rigid, quat_angle
-from anchors.uncertainty import length_p95
-from iris_session.alignment.smoother import MAX_IN_GROUP, AnchorHistory, AlignmentSmoother, observed_covariance, observed_pose
+from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95, validate_covariance
+from iris_session.alignment.smoother import (
+    MAX_IN_GROUP,
+    AlignmentSmoother,
+    AnchorHistory,
+    observed_covariance,
+    observed_pose,
+)
 from iris_session.protocol.names import AlignmentKind, AnchorKind
-from iris_session.recording import TrackingFrame, AlignmentPeriod, RecordedObservation, AlignmentHistory
+from iris_session.recording import AlignmentHistory, AlignmentPeriod, RecordedObservation, TrackingFrame
 
 #: Beyond the stated 95 % by this factor it is not chance.
 BEYOND: Final = 2.0
@@ -108,7 +113,9 @@ def resolve_frame(
     for look in looks:
         sheets[look.observation.anchor_id] = sheets.get(look.observation.anchor_id, 0) + 1
     viewpoints = len({look.observation.viewpoint_id for look in looks})
-    result = FrameResult(frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.estimate_at(last_ns), resolver.count_unused())
+    result = FrameResult(
+        frame, len(looks), viewpoints, sheets, first_ns, last_ns, resolver.estimate_at(last_ns), resolver.count_unused()
+    )
     for live in in_force:
         result.compared.append(compare_live(live, resolver, last_ns))
         on_progress()
@@ -121,7 +128,9 @@ def compare_live(live: AlignmentPeriod, resolver: AlignmentSmoother, last_ns: in
     begin = resolver.estimate_at(live.since_ns)
     end_ns = live.until_ns if live.until_ns >= 0 else max(last_ns, live.since_ns)
     off = _measure_difference(live, begin)
-    end = _measure_difference(live, resolver.estimate_at(max(live.since_ns, end_ns - 1)))  # what ended it may have moved an anchor
+    end = _measure_difference(
+        live, resolver.estimate_at(max(live.since_ns, end_ns - 1))
+    )  # what ended it may have moved an anchor
     return LiveComparison(
         live,
         None if off is None else off[0],
@@ -140,7 +149,9 @@ def _measure_difference(live: AlignmentPeriod, solved: AlignmentEstimate) -> tup
     return distance(apply(T, p_tracking), solved.pivot_world), quat_angle(T[1], solved.T_world_tracking[1])
 
 
-def find_outliers(looks: Sequence[RecordedObservation], resolver: AlignmentSmoother, anchors: AnchorHistory) -> list[Outlier]:
+def find_outliers(
+    looks: Sequence[RecordedObservation], resolver: AlignmentSmoother, anchors: AnchorHistory
+) -> list[Outlier]:
     """Viewpoints that contradict the solution of their time, the worst first."""
     groups: dict[tuple[str, int], list[RecordedObservation]] = {}
     for look in looks:
@@ -153,7 +164,11 @@ def find_outliers(looks: Sequence[RecordedObservation], resolver: AlignmentSmoot
         solved = resolver.estimate_at(at_ns)
         if place is None or solved.refused:
             continue
-        seen = [compose(solved.T_world_tracking, observed_pose(look.observation)) for look in group if is_rigid(observed_pose(look.observation))]
+        seen = [
+            compose(solved.T_world_tracking, observed_pose(look.observation))
+            for look in group
+            if is_rigid(observed_pose(look.observation))
+        ]
         if not seen:
             continue
         middle = np.median(np.array([p for p, _ in seen]), axis=0)
@@ -173,7 +188,9 @@ def noise_p95(look: RecordedObservation) -> float:
     config = AlignmentConfig()
     if look.p_tracking_head is None:
         return length_p95(isotropic_covariance(config.position_sigma_m, config.rotation_sigma_rad)[:3, :3])
-    common, each = NoiseModel().compute_covariances(np.array(look.p_tracking_head), np.array(look.observation.T_tracking_anchor.p))
+    common, each = NoiseModel().compute_covariances(
+        np.array(look.p_tracking_head), np.array(look.observation.T_tracking_anchor.p)
+    )
     return length_p95((common + each)[:3, :3])
 
 
@@ -223,7 +240,9 @@ def _list_sheet_observations(looks: AlignmentHistory) -> Iterable[SheetObservati
             groups[key] = groups.get(key, 0) + 1
             if o.kind in SHEETS and groups[key] <= MAX_IN_GROUP and is_rigid(observed_pose(o)):
                 headset = f"{frame.participant} {frame.run} {frame.jumps}"  # a tracking frame of its own after each
-                yield SheetObservation(headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, observed_pose(o), look.p_tracking_head)
+                yield SheetObservation(
+                    headset, o.tracking_epoch, o.viewpoint_id, o.anchor_id, observed_pose(o), look.p_tracking_head
+                )
 
 
 def _sizes(looks: AlignmentHistory, saved: Constellation) -> dict[str, float]:

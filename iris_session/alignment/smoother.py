@@ -34,7 +34,7 @@ from anchors.uncertainty import length_p95
 from iris_session.alignment.estimator import NUMERICAL_ERRORS
 from iris_session.protocol.client_messages import Observation
 from iris_session.protocol.names import AnchorKind
-from iris_session.recording import RecordedObservation, AlignmentHistory
+from iris_session.recording import AlignmentHistory, RecordedObservation
 
 Array = NDArray[np.float64]
 AROUND_NS: Final = 600_000_000_000
@@ -50,7 +50,9 @@ CHI2_6_999: Final = 22.458
 class AnchorHistory:
     """Where anchors were, over time: as configured, then as directors moved them; or by a file, always the same."""
 
-    def __init__(self, looks: AlignmentHistory, configured: Mapping[str, PoseTuple], given: Constellation | None) -> None:
+    def __init__(
+        self, looks: AlignmentHistory, configured: Mapping[str, PoseTuple], given: Constellation | None
+    ) -> None:
         self._eras: list[tuple[int, dict[str, PoseTuple]]] = [(0, dict(configured if given is None else given.anchors))]
         for moved in () if given is not None else looks.anchor_moves:
             pose = (moved.T_world_anchor.p, moved.T_world_anchor.q)
@@ -71,7 +73,9 @@ class AnchorHistory:
 class AlignmentSmoother:
     """Solutions of one tracking frame at any moment, each computed once. `looks`: in order of capture."""
 
-    def __init__(self, looks: Sequence[RecordedObservation], anchors: AnchorHistory, sizes: Mapping[str, float]) -> None:
+    def __init__(
+        self, looks: Sequence[RecordedObservation], anchors: AnchorHistory, sizes: Mapping[str, float]
+    ) -> None:
         self._looks, self._anchors, self._sizes = looks, anchors, sizes
         self._times = np.array([look.observation.capture_ns for look in looks], dtype=np.int64)
         self._known: dict[tuple[int, int], AlignmentEstimate] = {}

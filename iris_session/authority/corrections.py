@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+from anchors.correction import interpolate_about_pivot
 from anchors.pose import (
     Vec3,
     apply,
@@ -21,7 +22,6 @@ from anchors.pose import (
     quat_normalize,
     quat_to_rotvec,
 )
-from anchors.smooth import interpolate_about_pivot
 from iris_session.authority import stated_error, telling
 from iris_session.authority.context import Context
 from iris_session.authority.state import Correction, Participant, Placing

@@ -16,7 +16,7 @@ import numpy as np
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
 from anchors.controller import controller_covariance
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_to_matrix, quat_multiply
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_to_matrix
 from anchors.pose import IDENTITY_POSE, PoseTuple, Quat, Vec3, quat_from_yaw
 from anchors.touch import Touch, register_touches
 from anchors.uncertainty import length_p95

@@ -28,7 +28,7 @@ from iris_session.protocol.names import AlignAction, AlignmentKind
 if TYPE_CHECKING:
     from anchors.constellation import Constellation
     from anchors.pose import PoseTuple
-    from iris_session.alignment.resolve import LiveComparison, RelativePoses, FrameResult
+    from iris_session.alignment.resolve import FrameResult, LiveComparison, RelativePoses
     from iris_session.client import Client
     from iris_session.protocol.server_messages import ParticipantInfo
     from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
@@ -487,7 +487,9 @@ def _write_constellation(path: Path, relative: RelativePoses) -> str:
 # --- as text ----------------------------------------------------------------------------------------------------------
 
 
-def format_solution(looks: AlignmentHistory, results: list[FrameResult], relative: RelativePoses, damage: list[str]) -> Iterator[str]:
+def format_solution(
+    looks: AlignmentHistory, results: list[FrameResult], relative: RelativePoses, damage: list[str]
+) -> Iterator[str]:
     """Everybody who was to be aligned, then the sheets, then what could not be read."""
     wearers = [one for one in looks.participants.values() if one.aligned]
     if not wearers:
@@ -598,7 +600,12 @@ def _format_mm(metres: float) -> str:
 
 
 def solution_to_dict(
-    path: str, looks: AlignmentHistory, results: list[FrameResult], relative: RelativePoses, damage: list[str], written: str
+    path: str,
+    looks: AlignmentHistory,
+    results: list[FrameResult],
+    relative: RelativePoses,
+    damage: list[str],
+    written: str,
 ) -> dict[str, Any]:
     """For `--json`."""
     people = [

@@ -22,13 +22,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.protocol.server_messages import Event
-from iris_session.recording import items, paths, rrd_file
+from iris_session.recording import paths, rrd_file
+from iris_session.recording import record_batches as items
 from iris_session.recording.errors import NotARecordingError
-from iris_session.recording.items import UNREADABLE, RawSample, RecordedState
-from iris_session.recording.joining import count_joined_rows, join_pieces, group_spans
-from iris_session.recording.journal import FORMAT, JournalRow, Keyframe, SessionHeader, open_blob, blob_root, unpack_model
+from iris_session.recording.journal import (
+    FORMAT,
+    JournalRow,
+    Keyframe,
+    SessionHeader,
+    blob_root,
+    open_blob,
+    unpack_model,
+)
 from iris_session.recording.messages import DenialRecord, decode_header
 from iris_session.recording.probe import Prober
+from iris_session.recording.record_batches import (
+    UNREADABLE,
+    RawSample,
+    RecordedState,
+    count_joined_rows,
+    group_spans,
+    join_pieces,
+)
 
 _T = TypeVar("_T")
 #: Lines of `damage` at most: a file may be damaged in any number of places.

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from iris_session.protocol.entries import Entry, decode_entries
-from iris_session.recording import versions
+from iris_session.recording import environment as versions
 from iris_session.recording.errors import NotARecordingError
 from iris_session.recording.journal import (
     CRASHED,
@@ -28,10 +28,10 @@ from iris_session.recording.journal import (
     Keyframe,
     RowProblem,
     SessionHeader,
-    compute_chain,
     check_fields,
     check_keyframe,
     check_row,
+    compute_chain,
 )
 from iris_session.recording.messages import EndMark
 from iris_session.recording.reader import Recording

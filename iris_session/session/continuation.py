@@ -42,15 +42,14 @@ from iris_session.recording import (
     RecordingError,
     RecordingLock,
     SessionHeader,
-    blas,
     check_row,
     unpack_model,
 )
+from iris_session.recording.environment import read_boot_id, use_one_blas_thread
 from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
 from iris_session.recording.verify import Models
-from iris_session.recording.versions import read_boot_id
 from iris_session.security.resume_tokens import handback_above
 from iris_session.session.config import SessionConfig
 from iris_session.session.config_checks import check_arguments, check_objects, check_robots
@@ -179,7 +178,7 @@ class Continuation:
                 "was shown, or start the program that moved the world"
             )
         problems: list[str] = []
-        blas.use_one_blas_thread()  # as in the run that is taken again
+        use_one_blas_thread()  # as in the run that is taken again
         for keyframe in starts(recording):
             try:
                 self.core = core_at(header, keyframe, recording.model)

@@ -33,8 +33,8 @@ from iris_session.recording import (
     header_root,
     pack_model,
 )
+from iris_session.recording.environment import describe_environment, read_boot_id
 from iris_session.recording.feed import SILENCE_S
-from iris_session.recording.versions import read_boot_id, describe_environment
 from iris_session.scene.composed import ComposedScene
 from iris_session.session.config import SessionConfig
 from iris_session.session.continuation import Continuation, wait_until_free

@@ -33,7 +33,7 @@ from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import EntryMessage
 from iris_session.protocol.names import ControlAction, LateCause
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
-from iris_session.recording import blas
+from iris_session.recording.environment import use_one_blas_thread
 from iris_session.session.config import SessionConfig
 from iris_session.session.config_checks import check_timestep
 from iris_session.session.continuation import begin
@@ -137,7 +137,7 @@ class Session(Owner, SceneChanges):
         One step per tick. A tick that cannot be met in time is taken late and counted (`status().lateness`).
         """
         check_timestep(self.model)
-        blas.use_one_blas_thread()  # for the same bits in every run
+        use_one_blas_thread()  # for the same bits in every run
         stepper = self._make_stepper(user_owned=False)
         with self.signals(), freeze_garbage_collector(), tick_priority(self.config.realtime) as self._scheduling:
             # Counted from here: collecting garbage in a large process takes longer than a short run.

@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.camera import CameraModel, CameraError, pose_to_matrix, parse_camera, pose_from_rvec_tvec, pose_from_matrix, to_rvec_tvec
+from anchors.camera import (
+    CameraError,
+    CameraModel,
+    parse_camera,
+    pose_from_matrix,
+    pose_from_rvec_tvec,
+    pose_to_matrix,
+    to_rvec_tvec,
+)
 from tests.models import BESIDE
 
 CAMERA = CameraModel(640, 480, 585.0, 584.0, 319.5, 239.5, (0.08, -0.18, 0.0008, -0.0005, 0.01))

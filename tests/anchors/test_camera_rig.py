@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from anchors.camera import pose_to_matrix, pose_from_rvec_tvec, pose_from_matrix
+from anchors.camera import pose_from_matrix, pose_from_rvec_tvec, pose_to_matrix
 from anchors.camera_rig import SheetView, solve_rig
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
 from anchors.robot_world import CalibrationError

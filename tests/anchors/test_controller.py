@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anchors.controller import TipCalibration, calibrate_tip, controller_covariance, holder_anchor, tip_position
-from anchors.lie import Array, quat_exp, quat_to_matrix, quat_multiply
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, compose, inverse, quat_from_rotvec
 
 TIP = np.array([0.01, -0.02, -0.12])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from anchors.camera import CameraModel, pose_from_rvec_tvec
-from anchors.detection import DetectionError, SheetDetector, SheetDetection, detect_codes
+from anchors.detection import DetectionError, SheetDetection, SheetDetector, detect_codes
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
@@ -167,21 +167,21 @@ def test_corners_alone_agree_with_opencv() -> None:
 
 
 def test_wrong_marker_is_outvoted() -> None:
-    from anchors.detection import _consistent_board
+    from anchors.detection import _find_consistent_markers
 
     true = _facing((0.0, 0.0, 1.0), 25.0)
     seen = {k: CAMERA.project(corners, true) for k, corners in enumerate(TABLE.marker_corners)}
     seen[2] = seen[2] + 40.0  # the same marker on another sheet
-    poses = _consistent_board(TABLE, seen, CAMERA)
+    poses = _find_consistent_markers(TABLE, seen, CAMERA)
     assert poses is not None
     assert poses.markers == 3
     assert distance(poses.best[0][0], true[0]) < 1e-6
-    assert _consistent_board(TABLE, {0: seen[0], 2: seen[2]}, CAMERA) is None
-    assert _consistent_board(TABLE, {0: seen[0]}, CAMERA) is None
+    assert _find_consistent_markers(TABLE, {0: seen[0], 2: seen[2]}, CAMERA) is None
+    assert _find_consistent_markers(TABLE, {0: seen[0]}, CAMERA) is None
 
 
 def test_covariance_of_corners_is_that_of_their_noise() -> None:
-    from anchors.detection import _CORNER_SIGMA_PX, _by_corners, _plane_poses
+    from anchors.detection import _CORNER_SIGMA_PX, _detect_by_corners, _plane_poses
 
     rng = np.random.default_rng(5)
     true = _facing((0.1, 0.0, 0.8), 40.0)
@@ -191,7 +191,7 @@ def test_covariance_of_corners_is_that_of_their_noise() -> None:
         pixels = CAMERA.project(points, true) + rng.normal(0.0, _CORNER_SIGMA_PX, (len(points), 2))
         poses = _plane_poses(points, pixels, CAMERA, 4)
         assert poses is not None
-        seen = _by_corners(TABLE, poses, CAMERA)
+        seen = _detect_by_corners(TABLE, poses, CAMERA)
         turn = quat_to_rotvec(compose(seen.T_camera_sheet, inverse(true))[1])
         d = np.concatenate([np.subtract(seen.T_camera_sheet[0], true[0]), turn])
         distances.append(float(d @ np.linalg.solve(np.reshape(seen.covariance, (6, 6)), d)))

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from anchors.advice import error_advice
-from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, mirror_pose
+from anchors.alignment import AlignmentConfig, AlignmentEstimate, AlignmentEstimator, error_advice, mirror_pose
 from anchors.lie import quat_from_matrix, quat_to_matrix
-from anchors.noise import NoiseModel, validate_covariance
 from anchors.pose import PoseTuple, Vec3, apply, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_from_yaw
+from anchors.uncertainty import NoiseModel, validate_covariance
 from tests.anchors.worlds import NOISE, Look, around, axis, headset, shifted
 
 SHEET: PoseTuple = ((0.1, -0.4, 0.72), quat_from_yaw(0.3))
@@ -270,7 +269,9 @@ def test_near_looks_count_for_more_than_far_ones() -> None:
 def test_covariances_that_are_none_are_not_taken() -> None:
     good = tuple(np.diag([1e-6] * 6).ravel().tolist())
     assert validate_covariance(good) == good
-    assert all(validate_covariance(bad) == () for bad in ((), good[:35], (*good[:35], math.nan), tuple(-x for x in good)))
+    assert all(
+        validate_covariance(bad) == () for bad in ((), good[:35], (*good[:35], math.nan), tuple(-x for x in good))
+    )
     lopsided = list(good)
     lopsided[1] = 1.0
     assert validate_covariance(lopsided) == ()

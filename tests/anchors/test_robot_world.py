@@ -7,17 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from anchors.camera import pose_to_matrix, pose_from_rvec_tvec, pose_from_matrix
+from anchors.camera import pose_from_matrix, pose_from_rvec_tvec, pose_to_matrix
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat_from_rotvec, quat_to_rotvec
 from anchors.robot_world import (
     CalibrationError,
     CalibrationNoise,
     RobotWorldCalibration,
-    solve_twin_base,
-    _of_inverse,
+    _invert_covariance,
     solve_camera_on_hand,
-    solve_single_pose,
     solve_robot_world,
+    solve_single_pose,
+    solve_twin_base,
 )
 
 T_BASE_CAMERA: PoseTuple = ((1.4, -0.3, 0.9), quat_from_rotvec((-1.9, 0.4, 0.3)))
@@ -122,7 +122,7 @@ def test_covariance_of_the_inverse_is_that_of_inverted_samples() -> None:
         turn = quat_to_rotvec(compose(back, inverse(true))[1])
         samples.append([*np.subtract(back[0], true[0]), *turn])
     wanted = np.cov(np.array(samples).T)
-    found = np.reshape(_of_inverse(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
+    found = np.reshape(_invert_covariance(T_BASE_CAMERA, (root @ root).ravel().tolist()), (6, 6))
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
     assert np.allclose(found / scale, wanted / scale, atol=0.08)
 

@@ -122,7 +122,9 @@ def test_a_point_touched_in_two_places_is_named() -> None:
 
 
 def test_unknown_and_unread_points_are_refused() -> None:
-    assert "'x' is not marked" in register_touches(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
+    assert (
+        "'x' is not marked" in register_touches(MARKS, [*_touches("abc"), Touch("x", (0.0, 0.0, 0.0))]).estimate.advice
+    )
     assert register_touches(MARKS, [*_touches("abc"), Touch("d", (math.nan, 0.0, 0.0))]).estimate.refused
 
 

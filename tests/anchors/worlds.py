@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anchors.lie import Array, quat_exp, quat_to_matrix, quat_multiply
-from anchors.noise import NoiseModel
+from anchors.lie import Array, quat_exp, quat_multiply, quat_to_matrix
 from anchors.pose import PoseTuple, Vec3, apply, compose, inverse
+from anchors.uncertainty import NoiseModel
 
 NOISE = NoiseModel()
 

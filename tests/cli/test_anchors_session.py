@@ -20,7 +20,7 @@ import pytest
 from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
 from anchors.pose import PoseTuple, compose, distance, inverse, quat_from_rotvec
-from iris_session.alignment.smoother import AnchorHistory, AlignmentSmoother, fuse_estimates
+from iris_session.alignment.smoother import AlignmentSmoother, AnchorHistory, fuse_estimates
 from iris_session.authority import AuthorityConfig
 from iris_session.cli import anchors_session
 from iris_session.cli.anchors_session import format_alignment_status, select_participants, to_dict
@@ -37,7 +37,7 @@ from iris_session.protocol.status import (
     ParticipantReport,
     StatusReport,
 )
-from iris_session.recording import TrackingFrame, Recording, read_alignment_history
+from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.anchors_file import load_anchors
 from tests.anchors.worlds import headset, shifted
 from tests.client.harness import LiveSession
@@ -472,7 +472,9 @@ def test_an_anchor_that_a_director_moved_is_where_it_was_at_the_time(tmp_path: P
     played.wait(20.0)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
         looks = read_alignment_history(recording)
-    resolver = AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {})
+    resolver = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+    )
     before, after = resolver.estimate_at(moved_ns - 1), resolver.estimate_at(moved_ns)
     x, y, z = before.T_world_tracking[0]
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
@@ -488,7 +490,9 @@ def test_what_came_later_counts_too(tmp_path: Path) -> None:
     played.look(1, "table", TRUE["table"], T, 2)
     with Recording.open(played.write(tmp_path / "session.rrd")) as recording:
         looks = read_alignment_history(recording)
-    solution = AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}).estimate_at(early_ns)
+    solution = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, {"table": TRUE["table"]}, None), {}
+    ).estimate_at(early_ns)
     assert (solution.refused, solution.n_observations) == (False, 20)
 
 
@@ -608,9 +612,15 @@ def test_where_all_but_one_sheet_agree_that_one_was_moved(recording: Path, monke
     monkeypatch.setattr(AlignmentSmoother, "_solve", blind)
     with Recording.open(recording) as opened:
         looks = read_alignment_history(opened)
-    resolver = AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, BELIEVED, None), {})
+    resolver = AlignmentSmoother(
+        looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, BELIEVED, None), {}
+    )
     solved = resolver.estimate_at(10_000_000_000)
     assert (solved.refused, solved.moved) == (False, ("shelf",))
     assert "sheet 'shelf'; it is not used" in solved.advice
     two = {name: pose for name, pose in BELIEVED.items() if name != "door"}
-    assert AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, two, None), {}).estimate_at(10_000_000_000).refused
+    assert (
+        AlignmentSmoother(looks.observations[TrackingFrame("p1", 1, 0)], AnchorHistory(looks, two, None), {})
+        .estimate_at(10_000_000_000)
+        .refused
+    )

@@ -18,7 +18,7 @@ from iris_session.client import Client
 from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 from tests.e2e.conftest import DEADLINE_S, ENDS_WITH_US
 
-#: Twice the p95 of a pair is beyond chance (`anchors.crosscheck.Disagreement.as_expected`).
+#: Twice the p95 of a pair is beyond chance (`anchors.cross_check.Disagreement.as_expected`).
 BEYOND_CHANCE: Final = 2.0
 
 

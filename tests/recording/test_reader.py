@@ -19,11 +19,10 @@ from iris_session.recording import (
     rrd_file,
     verify,
 )
-from iris_session.recording.columns import bytes_column, duration_index, sequence_index
 from iris_session.recording.journal import FORMAT
 from iris_session.recording.paths import part_path
 from iris_session.recording.verify import _Run
-from iris_session.recording.writer import RrdWriter
+from iris_session.recording.writer import RrdWriter, bytes_column, duration_index, sequence_index
 from tests.recording.support import SmallCore, journal, write
 
 

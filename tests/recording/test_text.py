@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from iris_session.protocol.common import Alignment, Denial, Lease, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Event, Gap, LeaseChanged
-from iris_session.recording import versions
+from iris_session.recording import environment as versions
 from iris_session.recording.messages import DenialRecord
-from iris_session.recording.text import describe_denial, describe_event, describe_session
+from iris_session.recording.writer import describe_denial, describe_event, describe_session
 from tests.recording.support import make_header
 
 

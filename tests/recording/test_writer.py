@@ -25,10 +25,11 @@ from iris_session.protocol.scene import (
     patched,
 )
 from iris_session.protocol.server_messages import BodyInfo, EStopChanged, Event, PresenceItem
-from iris_session.recording import Recording, SessionHeader, pack_model, scene
+from iris_session.recording import Recording, SessionHeader, pack_model
+from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import Batch, DenialRecord, SceneAssets, SceneModel, StateFrame
-from iris_session.recording.pictures import build_components
-from iris_session.recording.scene import VisualShape
+from iris_session.recording.picture import build_components
+from iris_session.recording.scene_geometry import VisualShape
 from iris_session.recording.writer import RrdWriter
 from iris_session.scene import AssetStore
 from iris_session.scene.mujoco_scene import parse_mujoco

@@ -41,9 +41,9 @@ from iris_session.recording import (
     make_row,
     pack_model,
 )
+from iris_session.recording.environment import read_boot_id
 from iris_session.recording.journal import CRASHED, seal_keyframe
 from iris_session.recording.messages import Batch
-from iris_session.recording.versions import read_boot_id
 from iris_session.security.resume_tokens import ResumeTokens, handback_above
 from iris_session.session import continuation
 from iris_session.session.config import SessionConfig
@@ -438,13 +438,13 @@ class Journal:
     def __init__(self) -> None:
         self.batch = Batch()
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         self.batch.rows.append(row)
 
     def flush(self) -> None:
         pass
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         self.batch.keyframes.append(seal_keyframe(keyframe, chain))
 
     def state(
@@ -458,10 +458,10 @@ class Journal:
     ) -> None:
         pass
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         pass
 
-    def metric(self, name: str, value: float) -> None:
+    def add_metric(self, name: str, value: float) -> None:
         pass
 
     def take_gap(self) -> int:

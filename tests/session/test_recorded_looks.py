@@ -14,7 +14,7 @@ from iris_session.protocol.common import IDENTITY, Applied
 from iris_session.protocol.entries import AlignmentAlarm, Entry, Join
 from iris_session.protocol.server_messages import Event, StateHeader
 from iris_session.protocol.steps import Decision
-from iris_session.recording import TrackingFrame, JournalRow, Keyframe, Recording, header_root, read_alignment_history
+from iris_session.recording import JournalRow, Keyframe, Recording, TrackingFrame, header_root, read_alignment_history
 from iris_session.recording.messages import Batch
 from iris_session.recording.writer import RrdWriter
 from iris_session.session.stepper import Stepper
@@ -49,15 +49,15 @@ class Recorder:
         self.rows: list[JournalRow] = []
         self.events: list[Event] = []
 
-    def row(self, row: JournalRow) -> None:
+    def add_row(self, row: JournalRow) -> None:
         self.rows.append(row)
 
-    def decision(self, step: int, session_time: int, decision: Decision) -> None:
+    def add_decision(self, step: int, session_time: int, decision: Decision) -> None:
         self.events.extend(decision.events)
 
     def flush(self) -> None: ...
 
-    def keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
+    def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
 
     def state(
         self,
@@ -69,7 +69,7 @@ class Recorder:
         applied: Sequence[Applied] = (),
     ) -> None: ...
 
-    def metric(self, name: str, value: float) -> None: ...
+    def add_metric(self, name: str, value: float) -> None: ...
 
     def take_gap(self) -> int:
         return 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from anchors.alignment import AlignmentEstimate, AlignmentEstimator
-from anchors.crosscheck import CrossCheck, CrossCheckConfig
+from anchors.cross_check import CrossCheck, CrossCheckConfig
 from anchors.pose import PoseTuple, compose, inverse, quat_from_yaw
 from tests.anchors.worlds import Look, around, headset, shifted
 

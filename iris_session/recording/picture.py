@@ -18,10 +18,11 @@ import rerun as rr
 from anchors.pose import PoseTuple
 from iris_session.protocol.scene import SceneSpec, Visual
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import paths, scene
-from iris_session.recording.bending import DrawnDeformable
+from iris_session.recording import paths
+from iris_session.recording import scene_geometry as scene
+from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import SceneAssets
-from iris_session.recording.scene import VisualShape, SceneReader
+from iris_session.recording.scene_geometry import SceneReader, VisualShape
 from iris_session.scene import SceneBuildError
 
 #: Step, tick, simulated time [ns], session time [ns].
@@ -168,7 +169,9 @@ class ScenePicture:
             return
         frame, T_frame_visual = reader.place_visual(visual)
         self._visuals[visual.id] = _Drawn(visual, entity, form.kind, form.tint, shown=True)
-        self._rec.log(entity, *build_components(form, scene.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual), strict=True)
+        self._rec.log(
+            entity, *build_components(form, scene.to_rgba8(visual.rgba, form.tint), frame, T_frame_visual), strict=True
+        )
 
     def _redraw(self, reader: SceneReader, old: _Drawn, visual: Visual) -> None:
         """Says what has changed, and not the mesh again."""

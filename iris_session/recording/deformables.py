@@ -13,7 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from iris_session.protocol.scene import Deformable
-from iris_session.recording.scene import WORLD, Pixels, Rgba8, to_rgba8
+from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require
 from iris_session.scene.simplify import unit

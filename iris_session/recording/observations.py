@@ -157,7 +157,9 @@ class _Heads:
         return x, y, z
 
 
-def read_alignment_history(recording: Recording, on_progress: Callable[[int, int], None] | None = None) -> AlignmentHistory:
+def read_alignment_history(
+    recording: Recording, on_progress: Callable[[int, int], None] | None = None
+) -> AlignmentHistory:
     """Everything that `Looks` has. `told(done, total)` hears how far it is."""
     n_rows, n_samples = recording.count_rows(), recording.count_samples()
     say = on_progress or (lambda done, total: None)
@@ -234,7 +236,10 @@ def _take(event: Event, said: _Said, roster: _Roster, found: AlignmentHistory) -
 
 
 def _own(
-    person: RecordedParticipant, info: ParticipantInfo, joins: list[tuple[int, Join]], owners: dict[int, tuple[str, int]]
+    person: RecordedParticipant,
+    info: ParticipantInfo,
+    joins: list[tuple[int, Join]],
+    owners: dict[int, tuple[str, int]],
 ) -> None:
     """The join that this person came with, by its name and role (`info`), as who resumes may have another name. Those
     of one step are answered in their order, but for refused ones."""

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from anchors.alignment import AlignmentEstimate
+from anchors.correction import CorrectionConfig, CorrectionFilter, interpolate_about_pivot
 from anchors.pose import PoseTuple, Vec3, apply, distance, inverse, quat_from_rotvec, quat_from_yaw
-from anchors.smooth import CorrectionFilter, CorrectionConfig, interpolate_about_pivot
 
 PIVOT: Vec3 = (0.5, 2.0, 0.7)
 SECOND = 1_000_000_000
@@ -89,5 +89,10 @@ def test_on_the_way_the_pivot_moves_on_a_straight_line() -> None:
     a, b = apply(old, pivot), apply(new, pivot)
     for share in (0.0, 0.25, 0.5, 1.0):
         expected = tuple(x + share * (y - x) for x, y in zip(a, b, strict=True))
-        assert distance(apply(interpolate_about_pivot(old, new, pivot, share), pivot), (expected[0], expected[1], expected[2])) < 1e-12
+        assert (
+            distance(
+                apply(interpolate_about_pivot(old, new, pivot, share), pivot), (expected[0], expected[1], expected[2])
+            )
+            < 1e-12
+        )
     assert replace(_estimate(), refused=True).error_at(PIVOT) == math.inf

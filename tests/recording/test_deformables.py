@@ -13,9 +13,9 @@ import pytest
 from iris_session.physics.load import model_bytes, scene_hash
 from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording import SessionHeader, pack_model
-from iris_session.recording.bending import DrawnDeformable
+from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
-from iris_session.recording.writer import WAITING_VERTICES, RrdWriter
+from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
 from iris_session.scene.mujoco_deformables import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -214,7 +214,7 @@ def test_what_is_no_frame_is_refused_and_counted(world: World) -> None:
 
 def test_vertices_whose_states_do_not_come_are_bounded(world: World) -> None:
     world.state(0)
-    for i in range(WAITING_VERTICES + 5):
+    for i in range(MAX_PENDING_VERTICES + 5):
         world.writer.add_vertices(VertexFrame("flex-0", 8_000_000 + i, b""))
     assert world.writer.vertices_refused == 5
     assert len(told(world.read()[CLOTH], "Mesh3D:vertex_positions")) == 1

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from iris_session.recording.joining import ROW_ID, count_joined_rows, get_entity, join_pieces, group_spans
+from iris_session.recording.record_batches import ROW_ID, count_joined_rows, get_entity, group_spans, join_pieces
 
 COLUMNS = ("a", "b", "c")
 
@@ -98,7 +98,11 @@ def test_a_row_that_stands_twice_in_a_batch_is_one() -> None:
 
 def test_entities_are_kept_apart() -> None:
     mixed = [table(0, 2, entity="/x"), table(1, 3, entity="/y"), table(2, 2, entity="/x")]
-    assert [(get_entity(join_pieces(p)), count_joined_rows(p)) for p in group_spans(mixed)] == [("/x", 2), ("/x", 2), ("/y", 3)]
+    assert [(get_entity(join_pieces(p)), count_joined_rows(p)) for p in group_spans(mixed)] == [
+        ("/x", 2),
+        ("/x", 2),
+        ("/y", 3),
+    ]
 
 
 def test_two_values_of_one_row_are_an_error() -> None:

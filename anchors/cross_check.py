@@ -1,8 +1,8 @@
-"""Measured error between headsets: two that see the same sheet, or the same controller, should put it in the same
-place.
+"""Measure the error between headsets: two that observe the same target should place it at the same point of the world.
 
-Every stated error rests on a noise model; this does not. Sheets stand still, so the medians of what either saw within
-`max_age_ns` are compared; what moves is compared at the same instants. Pure: times are passed in.
+Every stated error rests on a noise model; this measurement does not. A target is a sheet, which stands still, so the
+medians of both headsets' observations within `max_age_ns` are compared; or it moves, such as a controller, and is
+compared at the same instants. Pure: times are passed in.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from anchors.alignment import AlignmentEstimate
-from anchors.lie import Array, quat_conjugate, quat_log, quat_to_matrix, quat_multiply
-from anchors.noise import NoiseModel, isotropic_covariance
-from anchors.pose import PoseTuple, Vec3, compose, is_valid_point, is_rigid
-from anchors.uncertainty import length_p95
+from anchors.lie import Array, quat_conjugate, quat_log, quat_multiply, quat_to_matrix
+from anchors.pose import PoseTuple, Vec3, compose, is_rigid, is_valid_point
+from anchors.uncertainty import NoiseModel, isotropic_covariance, length_p95
 
 
 class Disagreement(NamedTuple):
-    """Where headset `a` and headset `b` put the same thing: distance between the two [m], angle [rad], and the distance
-    that 95 % of pairs stay below by their stated errors and the noise of these looks. `p_world`: midway."""
+    """Difference between headsets `a` and `b` in the pose of one target: distance [m], angle [rad], and the distance
+    that 95 % of pairs stay below by their stated errors and the noise of these observations. `p_world`: midpoint."""
 
     a: str
     b: str
@@ -39,14 +38,17 @@ class Disagreement(NamedTuple):
 
     @property
     def is_expected(self) -> bool:
-        """Twice the p95 is beyond chance (about one pair in 10^4 for errors along one axis, fewer for others)."""
+        """False beyond twice the p95 (by chance about one pair in 10^4 for errors along one axis, fewer for others)."""
         return self.error_m <= 2.0 * self.expected_p95_m
 
 
 @dataclass(frozen=True)
 class CrossCheckConfig:
-    """`max_age_ns`: how long ago a headset may have looked. `max_gap_ns`: between two readings of a moving thing that
-    are interpolated. `max_seen`: per headset and thing, the oldest go first."""
+    """Bounds of the cross-check.
+
+    `max_age_ns`: age of the oldest observation compared. `max_gap_ns`: between two observations of a moving target that
+    are interpolated. `max_observations`: per headset and target; the oldest are discarded first.
+    """
 
     max_age_ns: int = 60 * 1_000_000_000
     max_gap_ns: int = 50_000_000
@@ -55,24 +57,25 @@ class CrossCheckConfig:
     max_targets: int = 64
 
 
-class _Look(NamedTuple):
+class _TargetObservation(NamedTuple):
     capture_ns: int
-    pose: PoseTuple  # T_tracking_thing
+    pose: PoseTuple  # T_tracking_target
     p_head: Vec3 | None
     viewpoint_id: int
 
 
 @dataclass
 class CrossCheck:
-    """Keeps what each headset saw of each thing. Alignments are passed in when asked, so one that improved counts.
+    """Buffer of observations by headset and target. Alignments are passed to `compare`, so the newest ones count.
 
-    `unseen_sigma_m`: noise per axis of looks from where nobody knows."""
+    `unknown_viewpoint_sigma_m`: noise per axis of observations without a head pose.
+    """
 
     noise: NoiseModel = field(default_factory=NoiseModel)
     config: CrossCheckConfig = field(default_factory=CrossCheckConfig)
     unknown_viewpoint_sigma_m: float = 0.005
     dropped: int = 0
-    _observations: dict[tuple[str, str], deque[_Look]] = field(default_factory=dict)
+    _observations: dict[tuple[str, str], deque[_TargetObservation]] = field(default_factory=dict)
     _epochs: dict[str, int] = field(default_factory=dict)
 
     def add_observation(
@@ -85,7 +88,10 @@ class CrossCheck:
         tracking_epoch: int,
         viewpoint_id: int = 0,
     ) -> None:
-        """One detection of a sheet, or one tracked pose of a controller, on the session's clock."""
+        """Add a detection of a sheet or a tracked pose of a controller; invalid and late ones are counted in `dropped`.
+
+        `capture_ns`: session time.
+        """
         key = (headset, target)
         epoch = self._epochs.get(headset, tracking_epoch)
         if not is_rigid(T_tracking_target) or not is_valid_point(p_tracking_head) or tracking_epoch < epoch:
@@ -93,7 +99,7 @@ class CrossCheck:
             return
         if tracking_epoch > epoch:
             self.discard_headset(headset)
-        if key not in self._observations and not self._room(capture_ns):
+        if key not in self._observations and not self._make_room(capture_ns):
             self.dropped += 1
             return
         self._epochs[headset] = tracking_epoch
@@ -101,54 +107,66 @@ class CrossCheck:
         if looks and capture_ns <= looks[-1].capture_ns:
             self.dropped += 1  # out of order
             return
-        looks.append(_Look(capture_ns, T_tracking_target, p_tracking_head, viewpoint_id))
+        looks.append(_TargetObservation(capture_ns, T_tracking_target, p_tracking_head, viewpoint_id))
 
-    def _room(self, now_ns: int) -> bool:
-        """Whether one thing more can be kept; those that nobody saw for long make room."""
+    def _make_room(self, now_ns: int) -> bool:
+        """Discard targets not observed for `max_age_ns` if there are too many; return whether one more fits."""
         if len(self._observations) >= self.config.max_targets:
             fresh = {
-                k: looks for k, looks in self._observations.items() if looks[-1].capture_ns > now_ns - self.config.max_age_ns
+                k: looks
+                for k, looks in self._observations.items()
+                if looks[-1].capture_ns > now_ns - self.config.max_age_ns
             }
             self._observations = fresh
         return len(self._observations) < self.config.max_targets
 
     def discard_headset(self, headset: str) -> None:
-        """It left, or its tracking frame is a new one."""
+        """Discard the observations of a headset that left or whose tracking frame changed."""
         for key in [key for key in self._observations if key[0] == headset]:
             del self._observations[key]
         self._epochs.pop(headset, None)
 
     def discard_target(self, thing: str) -> None:
-        """It was moved."""
+        """Discard the observations of a target that was moved."""
         for key in [key for key in self._observations if key[1] == thing]:
             del self._observations[key]
 
     def compare(
         self, alignments: Mapping[str, AlignmentEstimate], now_ns: int, moving: frozenset[str] = frozenset()
     ) -> list[Disagreement]:
-        """All pairs of aligned headsets and all things that both saw. `moving`: things that do not stand still."""
+        """Compare all pairs of aligned headsets on all targets that both observed. `moving`: targets that move."""
         out = []
         headsets = sorted(h for h, e in alignments.items() if not e.refused and e.tracking_epoch == self._epochs.get(h))
         for thing in sorted({thing for _, thing in self._observations}):
             for a, b in combinations(headsets, 2):
-                looks_a, looks_b = self._fresh(a, thing, now_ns), self._fresh(b, thing, now_ns)
-                ways = self._together if thing in moving else self._apart
+                looks_a, looks_b = self._select_recent(a, thing, now_ns), self._select_recent(b, thing, now_ns)
+                ways = self._pair_simultaneous if thing in moving else self._pair_resting
                 pairs = ways(looks_a, looks_b)
                 if pairs is not None:
-                    out.append(self._one((a, b, thing), (alignments[a], alignments[b]), (looks_a, looks_b), pairs))
+                    out.append(
+                        self._compare_pair((a, b, thing), (alignments[a], alignments[b]), (looks_a, looks_b), pairs)
+                    )
         return out
 
-    def _fresh(self, headset: str, thing: str, now_ns: int) -> list[_Look]:
+    def _select_recent(self, headset: str, thing: str, now_ns: int) -> list[_TargetObservation]:
         looks = self._observations.get((headset, thing), ())
         return [k for k in looks if 0 <= now_ns - k.capture_ns <= self.config.max_age_ns]
 
-    def _apart(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
-        """A thing at rest: every look of the one with the same number of the other; medians are taken later."""
+    def _pair_resting(
+        self, a: list[_TargetObservation], b: list[_TargetObservation]
+    ) -> list[tuple[PoseTuple, PoseTuple]] | None:
+        """Pair observations of a target at rest: the newest n of each; medians are taken later."""
         n = min(len(a), len(b))
-        return [(x.pose, y.pose) for x, y in zip(a[-n:], b[-n:], strict=True)] if n >= self.config.min_observations else None
+        return (
+            [(x.pose, y.pose) for x, y in zip(a[-n:], b[-n:], strict=True)]
+            if n >= self.config.min_observations
+            else None
+        )
 
-    def _together(self, a: list[_Look], b: list[_Look]) -> list[tuple[PoseTuple, PoseTuple]] | None:
-        """A thing that moves: looks of `a`, and those of `b` interpolated to the same instants."""
+    def _pair_simultaneous(
+        self, a: list[_TargetObservation], b: list[_TargetObservation]
+    ) -> list[tuple[PoseTuple, PoseTuple]] | None:
+        """Pair observations of a moving target: those of `a`, and those of `b` interpolated to the same instants."""
         times = [k.capture_ns for k in b]
         pairs = []
         for look in a:
@@ -166,11 +184,11 @@ class CrossCheck:
                 pairs.append((look.pose, (p, q0 if share < 0.5 else q1)))
         return pairs if len(pairs) >= self.config.min_observations else None
 
-    def _one(
+    def _compare_pair(
         self,
         names: tuple[str, str, str],
         estimates: tuple[AlignmentEstimate, AlignmentEstimate],
-        looks: tuple[list[_Look], list[_Look]],
+        looks: tuple[list[_TargetObservation], list[_TargetObservation]],
         pairs: list[tuple[PoseTuple, PoseTuple]],
     ) -> Disagreement:
         placed = [
@@ -181,15 +199,16 @@ class CrossCheck:
         at: Vec3 = (float(middle[0]), float(middle[1]), float(middle[2]))
         S = estimates[0].covariance_at(at) + estimates[1].covariance_at(at)
         for estimate, seen in zip(estimates, looks, strict=True):
-            S = S + self._look_noise(estimate, seen)
+            S = S + self._observation_noise(estimate, seen)
         turns = quat_log(
             quat_multiply(np.array([x[1] for x, _ in placed]), quat_conjugate(np.array([y[1] for _, y in placed])))
         )
         turn = float(np.linalg.norm(np.median(turns, axis=0)))
         return Disagreement(*names, float(np.linalg.norm(between)), turn, length_p95(S), at, len(pairs))
 
-    def _look_noise(self, estimate: AlignmentEstimate, looks: list[_Look]) -> Array:
-        """Covariance of where these looks put the thing, seen in the world: what viewpoints share counts once each."""
+    def _observation_noise(self, estimate: AlignmentEstimate, looks: list[_TargetObservation]) -> Array:
+        """Return the covariance (3, 3) of the observed position, world axes; errors common to a viewpoint count once
+        each."""
         viewpoints = len({k.viewpoint_id for k in looks})
         heads = [k.p_head for k in looks if k.p_head is not None]
         if heads:

@@ -15,7 +15,7 @@ from iris_session.protocol.server_messages import (
     ParticipantInfo,
     ParticipantLeft,
 )
-from iris_session.recording import TrackingFrame, AlignmentHistory, Recording, read_alignment_history
+from iris_session.recording import AlignmentHistory, Recording, TrackingFrame, read_alignment_history
 from tests.recording.headsets import Played, S
 
 TABLE: PoseTuple = ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -44,7 +44,10 @@ def test_looks_are_told_apart_by_whose_they_are(played: Played, tmp_path: Path) 
     played.look(2, "table", TABLE, HERE, 2, n=3)
     played.look(9, "table", TABLE, HERE, 3, n=2)
     found = read(played, tmp_path)
-    assert {frame: len(looks) for frame, looks in found.observations.items()} == {TrackingFrame("p1", 1, 0): 3, TrackingFrame("p2", 1, 0): 4}
+    assert {frame: len(looks) for frame, looks in found.observations.items()} == {
+        TrackingFrame("p1", 1, 0): 3,
+        TrackingFrame("p2", 1, 0): 4,
+    }
     assert found.unowned == 2, "nobody joined by that connection"
     assert {id: one.aligned for id, one in found.participants.items()} == {"p1": True, "p2": True, "p3": False}
 

@@ -13,9 +13,10 @@ import pytest
 from anchors.pose import apply, compose
 from iris_session.protocol.scene import SceneSpec
 from iris_session.protocol.server_messages import BodyInfo
-from iris_session.recording import pack_model, scene
+from iris_session.recording import pack_model
+from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import SceneAssets
-from iris_session.recording.pictures import build_components
+from iris_session.recording.picture import build_components
 from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
 from iris_session.scene.compose import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
@@ -50,7 +51,12 @@ def test_the_small_scene(tmp_path: Path) -> None:
     assert forms[0].size == (10.0, 10.0, scene.PLANE_HALF_THICKNESS_M)
     assert forms[2].size == pytest.approx((0.04, 0.04, 0.2))
     assert scene.to_rgba8(visuals[0].rgba) == (204, 204, 204, 255)
-    assert [reader.place_visual(visuals[i])[0] for i in range(6)] == ["world", "ball", *["arm/link 1"] * 2, *["tip"] * 2]
+    assert [reader.place_visual(visuals[i])[0] for i in range(6)] == [
+        "world",
+        "ball",
+        *["arm/link 1"] * 2,
+        *["tip"] * 2,
+    ]
 
 
 def test_a_body_that_is_not_streamed_is_drawn_in_its_parents_frame(tmp_path: Path) -> None:
@@ -208,7 +214,8 @@ def test_colours_at_corners_are_drawn(tmp_path: Path) -> None:
     spec = builder.build(store).spec
     reader = scene.SceneReader(spec, store, [])
     drawn = [
-        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), *reader.place_visual(visual))[-1] for visual in spec.visuals
+        build_components(reader.read_shape(visual), scene.to_rgba8(visual.rgba), *reader.place_visual(visual))[-1]
+        for visual in spec.visuals
     ]
     packed = (colors.astype(np.uint32) * [1 << 24, 1 << 16, 1 << 8, 1]).sum(axis=1)
     assert drawn[0].vertex_colors.as_arrow_array().to_pylist() == packed.tolist()

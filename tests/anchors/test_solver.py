@@ -8,9 +8,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from anchors.lie import Array, quat_conjugate, quat_exp, quat_to_matrix, quat_multiply, swing
-from anchors.robust import MergedObservation, merge_poses, fast_median
-from anchors.solve import AlignmentPrior, AlignmentProblem, AlignmentSolution, build_problem, solve_alignment
+from anchors.lie import Array, quat_conjugate, quat_exp, quat_multiply, quat_to_matrix, swing
+from anchors.solver import AlignmentPrior, AlignmentProblem, AlignmentSolution, build_problem, solve_alignment
+from anchors.viewpoints import MergedObservation, fast_median, merge_poses
 
 PRIOR = AlignmentPrior(math.radians(0.2), 0.003 / 60.0, 0.0)
 P_WORLD = np.array([[0.0, 0.0, 0.7], [1.5, 0.1, 0.7], [0.6, 1.2, 0.8], [0.0, 0.0, 0.7]])
