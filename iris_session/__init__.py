@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from iris_session.protocol.specs import ObjectSpec, RobotSpec
     from iris_session.recording import Recording, RecordingError
     from iris_session.scene.budget import QUEST_3, Budget
-    from iris_session.scene.compose import SceneBuilder
+    from iris_session.scene.builder import SceneBuilder
     from iris_session.scene.errors import SceneBuildError
     from iris_session.scene.mujoco_scene import parse_mujoco
     from iris_session.session.config import SessionConfig
@@ -76,7 +76,7 @@ _PUBLIC: Final = {
     "iris_session.physics": ("load_model", "load_robots_toml"),
     "iris_session.demo.scenes": ("scene_path", "n_arms_scene"),
     "iris_session.demo.named_scenes": ("scene_by_name",),
-    "iris_session.scene.compose": ("SceneBuilder",),
+    "iris_session.scene.builder": ("SceneBuilder",),
     "iris_session.scene.errors": ("SceneBuildError",),
     "iris_session.scene.mujoco_scene": ("parse_mujoco",),
     "iris_session.scene.budget": ("Budget", "QUEST_3"),

@@ -42,7 +42,7 @@ FORBIDDEN = {
 #: Imports between rooms that are still to be untied.
 TRANSITIONAL = {
     ("netsim", "session"),
-    ("security", "link"), ("session", "client"),
+    ("session", "client"),
 }  # fmt: skip
 #: Rooms whose result may depend on nothing but what they are given: no order of sets, no addresses, no hash seed.
 PURE = ("anchors", "protocol", "authority", "control", "streams")

@@ -72,7 +72,7 @@ def test_processes_are_heard(tmp_path: Path) -> None:
     assert recorder.alive
     assert recorder.close()
     with ImpairmentProcess({"127.0.0.2": "none"}, []) as proxy:
-        assert proxy.do("stats")["ok"]
+        assert proxy.execute("stats")["ok"]
     with (tmp_path / "shown").open("w+") as out:
         with LiveView(_Session(), out, "title").open() as update:  # type: ignore[arg-type]
             update()

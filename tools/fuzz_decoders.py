@@ -34,10 +34,10 @@ from iris_session.recording import journal, messages
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowedKey, AllowList
 from iris_session.security.curve import load_public, load_secret
-from iris_session.security.files import PrivateFolder
 from iris_session.security.join_codes import JoinCode, JoinCodes
 from iris_session.security.known_servers import KnownServer, KnownServers
-from iris_session.security.session_notes import SessionNote, SessionNotes
+from iris_session.security.private_folder import PrivateFolder
+from iris_session.security.session_registry import RegisteredSession, SessionRegistry
 from iris_session.streams.errors import StreamError
 from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 
@@ -504,7 +504,9 @@ DECODERS: Final[dict[str, Callable[[Random], Any]]] = {
     "keys-servers": lambda rng: KeyFiles(
         rng, list[KnownServer], lambda f: KnownServers(f).read(), "known_servers.json"
     ),
-    "keys-sessions": lambda rng: KeyFiles(rng, list[SessionNote], lambda f: SessionNotes(f).read(), "sessions.json"),
+    "keys-sessions": lambda rng: KeyFiles(
+        rng, list[RegisteredSession], lambda f: SessionRegistry(f).read(), "sessions.json"
+    ),
     "keys-public": lambda rng: KeyFiles(rng, None, lambda f: load_public(f.path / "x.key"), "x.key", _certificate),
     "keys-secret": lambda rng: KeyFiles(rng, None, lambda f: load_secret(f.path / "x.key"), "x.key", _certificate),
     "media-header": lambda rng: Decoder(rng, [lambda r: encoded(r, MediaHeader)], codec.decode_media_header, _OURS),

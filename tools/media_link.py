@@ -53,11 +53,11 @@ def row(port: int, proxy: ImpairmentProcess, profile: Path, options: argparse.Na
     """The end of one line of the table: ages of state, frames of media, the classes that were in use."""
     ages: list[float] = []
     classes: dict[str, float] = {}
-    proxy.do("profile lan")
+    proxy.execute("profile lan")
     with Client(f"{LINK}:{port}", role="observer", name="viewer", alignment="not_needed") as client:
         feed = client.media("cloud")
         client.sleep(3.0)  # it learns what is usual on its link
-        proxy.do(f"profile {profile}")
+        proxy.execute(f"profile {profile}")
         client.sleep(options.settle)
         client.on_state = lambda state: ages.append(state.age_ns * 1e-6)
         received, end = feed.received, time.monotonic() + options.seconds

@@ -5,7 +5,7 @@ Layout below the root, where `<hash>` and `<key>` are 64 lower-case hex digits:
     <hash[:2]>/<hash>               an asset; the name is given only after its bytes were hashed, and it never changes
     <hash[:2]>/<hash>.part          a partial download, locked while it is written; the next download resumes it
     <hash[:2]>/<hash>.<word>.part   a file that one process writes; nothing resumes it
-    index/<key[:2]>/<key>           what was built from the raw content with this key (`scene.build`)
+    index/<key[:2]>/<key>           what was built from the raw content with this key (`scene.asset_builder`)
     holds/                          addresses that running processes hold
 
 Any number of processes and threads may share a folder. Above `max_bytes` the files that were used longest ago are

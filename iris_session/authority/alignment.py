@@ -1,8 +1,15 @@
-"""The alignment gate: proposals of the estimator, a director's word, and jumps of a tracking frame.
+"""Alignments: the gate for proposals, placements and tracking frames, corrections, stated errors, notices to the
+wearer.
 
-A proposal is accepted when its stated p95 error at the robot (lever arm included) is within the bound, and when it
-differs enough from what is in force, or on its way, to be worth a version. How it then comes into force is decided in
-`corrections`; runs, alarms and moved anchors are in `anchoring`.
+Gate: a proposal of the estimator is accepted when its stated p95 error at the robot (lever arm included) is within the
+bound, and when it differs enough from the alignment in force, or from the correction under way, to be worth a version.
+
+Corrections: the first measurements come into force at once, later ones so that the wearer is not startled. Before the
+alignment is in use every better one applies at once. Afterwards small corrections slide in, larger ones are announced
+and come in one go, and while a clutch is engaged nothing changes: the displayed scene moves no robot, and the pose that
+moves a robot (`LeaseGrant.T_world_tracking`) is frozen for the engagement anyway.
+
+Alignment runs, alarms and moved anchors are in `anchoring`.
 """
 
 from __future__ import annotations
@@ -10,66 +17,81 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from anchors.pose import apply, distance, inverse, quat_angle, quat_normalize
-from iris_session.authority import corrections, engagement, stated_error, telling
+from anchors.correction import interpolate_about_pivot
+from anchors.pose import (
+    apply,
+    compose,
+    distance,
+    inverse,
+    quat_angle,
+    quat_conj,
+    quat_mul,
+    quat_normalize,
+    quat_to_rotvec,
+)
+from iris_session.authority import engagement
 from iris_session.authority.context import Context
-from iris_session.authority.state import Participant, Placing
+from iris_session.authority.state import Correction, Participant, Placement, WarningState
 from iris_session.protocol.client_messages import PlaceAlignment, TrackingEpoch
-from iris_session.protocol.common import MAX_TEXT, Denial, Pose
+from iris_session.protocol.common import MAX_TEXT, Alignment, Denial, Pose, Vec3
 from iris_session.protocol.entries import AlignmentProposal
 from iris_session.protocol.names import AlignmentKind, DenialReason, HoldReason
-from iris_session.protocol.server_messages import Notice
+from iris_session.protocol.server_messages import AlignmentChanged, Notice
 
+#: 95 % quantile of the standard normal distribution.
+Z95: Final = 1.6448536269514722
 ADVICE: Final = "step closer to the sheet, look at it from a second place, or add a sheet near the robot"
 
 
-def propose(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
-    """Gate for the estimator's result: accepted, ignored as no news, or refused with advice."""
+def process_proposal(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
+    """Accept the estimator's result, ignore it as no news, or refuse it with advice."""
     if not p.needs_alignment or not p.aligning or m.tracking_epoch < p.tracking_epoch:
         return None
     if ctx.entry_ns <= max(p.proposals_from_ns, ctx.state.anchors_ns):
         return None  # made before the front knew of a jump, a new run, or where the anchors are now
-    if m.refused or not _valid(ctx, m):
+    if m.refused or not _is_valid_proposal(ctx, m):
         text = "the anchor measurement is not good enough" if m.refused else "the measurement is not a valid pose"
-        return _refuse(ctx, p, text, m.advice or ADVICE)
+        return _notify_refusal(ctx, p, text, m.advice or ADVICE)
     if m.tracking_epoch > p.tracking_epoch:
-        # The frame's announcement can come after the first observation in it.
-        tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
-    error = stated_error.at_robots(ctx, p, m.covariance, m.pivot_world, m.error_at_anchor_m)
+        # The announcement of the frame can arrive after the first observation in it.
+        set_tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
+    error = compute_error_at_robots(ctx, p, m.covariance, m.pivot_world, m.error_at_anchor_m)
     if error > ctx.config.max_error_at_robot_m:
-        return refuse_at_robot(ctx, p, "the robot", error, m.advice)
+        return refuse_large_error(ctx, p, "the robot", error, m.advice)
     tilted = m.residual_tilt_rad > ctx.config.max_residual_tilt_rad
     degrees = math.degrees(m.residual_tilt_rad)
     tilt = f"{p.name}: the anchor is tilted by {degrees:.1f} degrees, is the sheet level?"
-    telling.warn(ctx, p, "tilt", tilt if tilted else "", same="tilted")
+    warn_wearer(ctx, p, "tilt", tilt if tilted else "", same="tilted")
     advice = f"alignment of {p.name}: {m.advice}" if m.advice and not tilted else ""
-    telling.warn(ctx, p, "advice", advice, same=m.advice)
+    warn_wearer(ctx, p, "advice", advice, same=m.advice)
     if not p.placed and _is_news(ctx, p, m, error):
-        corrections.offer(ctx, p, m)
+        offer_measurement(ctx, p, m)
     return None
 
 
-def _valid(ctx: Context, m: AlignmentProposal) -> bool:
+def _is_valid_proposal(ctx: Context, m: AlignmentProposal) -> bool:
     if len(m.covariance) != 36 or not math.isfinite(sum(m.covariance) + sum(m.pivot_world) + m.residual_tilt_rad):
         return False
     variances = m.covariance[::7]
-    return min(variances) >= 0.0 and 0.0 <= m.error_at_anchor_m < math.inf and is_pose(ctx, m.T_world_tracking)
+    return min(variances) >= 0.0 and 0.0 <= m.error_at_anchor_m < math.inf and is_valid_pose(ctx, m.T_world_tracking)
 
 
-def is_pose(ctx: Context, T: Pose) -> bool:
-    """Whether numbers from elsewhere are a pose: finite, within reach, a unit quaternion."""
+def is_valid_pose(ctx: Context, T: Pose) -> bool:
+    """Return true for numbers that are a pose: finite, within reach, a unit quaternion."""
     n = math.sqrt(sum(c * c for c in T.q))
     return abs(n - 1.0) <= ctx.config.quaternion_tolerance and all(abs(c) <= ctx.config.reach_m for c in T.p)
 
 
 def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -> bool:
-    """Whether a measurement says something else, or says it better, than the one in force or on its way."""
+    """Return true when a measurement differs from the alignment in force or under way, or has a smaller
+    stated error.
+    """
     now, coming = p.alignment, p.correction
     if now is None or now.kind == AlignmentKind.PLACED or (p.alarm is not None and not p.alarm.beside):
         return True
     if coming is not None:
         old: Pose | None = coming.T_world_tracking
-        known = stated_error.at_robots(ctx, p, coming.covariance, coming.pivot_world, coming.error_at_anchor_m)
+        known = compute_error_at_robots(ctx, p, coming.covariance, coming.pivot_world, coming.error_at_anchor_m)
     else:
         old, known = p.T_world_tracking_measured, now.error_at_robot_m
     if old is None or error < 0.8 * known:
@@ -81,15 +103,15 @@ def _is_news(ctx: Context, p: Participant, m: AlignmentProposal, error: float) -
     return moved > ctx.config.min_change_m or quat_angle(old.q, T_new[1]) > ctx.config.min_change_rad
 
 
-def refuse_at_robot(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
-    """Tells the wearer that the stated error at the robot is too large."""
+def refuse_large_error(ctx: Context, p: Participant, robot: str, error: float, advice: str = "") -> None:
+    """Refuse an alignment whose stated error at the robot is too large."""
     bound = ctx.config.max_error_at_robot_m
     text = f"predicted error {error * 1000:.0f} mm at {robot}, at most {bound * 1000:.0f} mm is allowed"
-    _refuse(ctx, p, text, advice or ADVICE)
+    _notify_refusal(ctx, p, text, advice or ADVICE)
 
 
-def _refuse(ctx: Context, p: Participant, text: str, advice: str) -> None:
-    """Tells everyone why, the wearer among them, at most once per report period. The alignment in force stays."""
+def _notify_refusal(ctx: Context, p: Participant, text: str, advice: str) -> None:
+    """Publish why an alignment was refused, at most once per report period. The alignment in force stays."""
     if p.refused_ns is not None and ctx.now_ns - p.refused_ns < ctx.config.report_ns:
         return
     p.refused_ns = ctx.now_ns
@@ -97,37 +119,350 @@ def _refuse(ctx: Context, p: Participant, text: str, advice: str) -> None:
     ctx.emit(Notice("warning", text, p.id, DenialReason.ALIGNMENT_REFUSED))
 
 
-def place(ctx: Context, p: Participant, m: PlaceAlignment) -> None:
-    """A director's word: the whole alignment, or an offset in the world on top of the measured one."""
-    person = ctx.person(m.participant)
+def place_alignment(ctx: Context, p: Participant, m: PlaceAlignment) -> None:
+    """Apply a director's placement: the whole alignment, or an offset in the world on top of the measured one."""
+    person = ctx.find_participant(m.participant)
     if person is None:
         text = f"no participant {m.participant}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
-    if not person.needs_alignment or not is_pose(ctx, m.T_world_tracking):
+    if not person.needs_alignment or not is_valid_pose(ctx, m.T_world_tracking):
         text = f"{person.name} needs no alignment, or the pose is not finite with a unit quaternion"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text))
     if m.offset and person.T_world_tracking_measured is None:
         text = f"{person.name} has no measured alignment to add an offset to"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNALIGNED, text, "place it without offset"))
-    corrections.place(ctx, person, Placing(corrections.clean(m.T_world_tracking), m.offset))
+    apply_placement(ctx, person, Placement(normalise_pose(m.T_world_tracking), m.offset))
     return ctx.accept(p, m.request_id)
 
 
-def tracking_epoch(ctx: Context, p: Participant, m: TrackingEpoch) -> None:
-    """The tracking frame jumped: alignment and engagements of this participant end."""
+def set_tracking_epoch(ctx: Context, p: Participant, m: TrackingEpoch) -> None:
+    """Start another tracking frame after a jump: alignment and engagements of this participant end."""
     if m.tracking_epoch <= p.tracking_epoch:
         return
     p.tracking_epoch = m.tracking_epoch
-    new_frame(ctx, p)
+    void_tracking_frame(ctx, p)
     ctx.publish_participant(p)
     if p.needs_alignment and not p.aligning:
-        telling.inform(ctx, p, f"{p.name} is not aligned, and its alignment run is stopped: start it")
+        inform_wearer(ctx, p, f"{p.name} is not aligned, and its alignment run is stopped: start it")
 
 
-def new_frame(ctx: Context, p: Participant) -> None:
-    """What was seen and aligned in the old frame counts no more, and what it moved holds."""
+def void_tracking_frame(ctx: Context, p: Participant) -> None:
+    """Void poses and alignment of the old tracking frame, and hold everything that they moved."""
     for device in p.seen.values():
         device.pose = None
     if p.needs_alignment:
-        corrections.void(p)
+        void_alignment(p)
     engagement.rearm_participant(ctx, p, HoldReason.REARM)
+
+
+# --- corrections ---
+
+
+def is_engaged(ctx: Context, p: Participant) -> bool:
+    """Return true when `p` moves anything now."""
+    leases = (*ctx.state.robots.values(), *ctx.held_objects)
+    return any(g.engagement and g.participant == p.id for lease in leases for g in lease.grants)
+
+
+def is_in_use(ctx: Context, p: Participant) -> bool:
+    """Return true when a sudden change would startle: `p` has engaged, or has been aligned for a while, in this run and
+    frame.
+    """
+    return p.in_use or (p.aligned_ns is not None and ctx.now_ns - p.aligned_ns >= ctx.config.settle_ns)
+
+
+def offer_measurement(ctx: Context, p: Participant, m: AlignmentProposal) -> None:
+    """Put a measurement that passed the gate in force at once, or make it the goal of a correction."""
+    covariance = tuple(map(float, m.covariance))
+    x, y, z = m.pivot_world
+    pivot_world = (float(x), float(y), float(z))
+    goal = Correction(
+        normalise_pose(m.T_world_tracking),
+        covariance,
+        pivot_world,
+        float(m.error_at_anchor_m),
+        ctx.now_ns + ctx.config.slide_ns,
+    )
+    if p.alignment is None or not (is_in_use(ctx, p) or is_engaged(ctx, p)):
+        return _complete_correction(ctx, p, goal)
+    if p.correction is not None:
+        before = p.correction
+        goal.slides_ns, goal.T_told = before.slides_ns, before.T_told
+    p.correction = goal
+    return None
+
+
+def apply_placement(ctx: Context, p: Participant, word: Placement) -> None:
+    """Put a director's placement in force at once, or when the clutch of its wearer opens."""
+    if is_engaged(ctx, p):
+        p.placing = word
+        return inform_wearer(ctx, p, f"a director has placed {p.name}: it comes into force when you let go")
+    p.placing = None
+    if word.offset and p.T_world_tracking_measured is not None:
+        p.offset = word.T_world_tracking
+        T = compose_poses(p.offset, p.T_world_tracking_measured)
+        return _set_alignment(ctx, p, AlignmentKind.MEASURED, T, offset=True)
+    p.offset = p.T_world_tracking_measured = p.correction = None
+    p.placed = True
+    _set_alignment(ctx, p, AlignmentKind.PLACED, word.T_world_tracking)
+    return _clear_answered_alarm(ctx, p)
+
+
+def void_alignment(p: Participant) -> None:
+    """Clear everything about the alignment, because the tracking frame is another one."""
+    p.alignment = p.offset = p.T_world_tracking_measured = p.correction = p.placing = p.alarm = None
+    p.placed = p.in_use = False
+    p.aligned_ns = None
+
+
+def advance_corrections(ctx: Context) -> None:
+    """Apply waiting placements and corrections where nothing is engaged. Once per step, after the samples."""
+    for p in ctx.state.participants.values():
+        if p.correction is None and p.placing is None:
+            continue
+        if is_engaged(ctx, p):
+            _announce_while_engaged(ctx, p)
+            continue
+        if p.placing is not None:
+            apply_placement(ctx, p, p.placing)
+        if p.correction is not None:
+            _advance_correction(ctx, p, p.correction)
+
+
+def measure_pending_correction(p: Participant) -> tuple[float, float]:
+    """Return how far the pending alignment differs from the one in force, at the anchor: [m] and [rad]."""
+    if p.alignment is None:
+        return 0.0, 0.0
+    if p.placing is not None and not p.placing.offset:
+        return _measure_difference(p.alignment.T_world_tracking, p.placing.T_world_tracking, p.pivot_world)
+    return (0.0, 0.0) if p.correction is None else _measure_correction(p, p.correction)
+
+
+def normalise_pose(T: Pose) -> Pose:
+    """Return the pose in floats (a host may pass ints, which would not replay byte for byte) with an exact unit
+    quaternion.
+    """
+    x, y, z = T.p
+    return Pose((float(x), float(y), float(z)), quat_normalize(T.q))
+
+
+def compose_poses(a: Pose, b: Pose) -> Pose:
+    return Pose(*compose((a.p, a.q), (b.p, b.q)))
+
+
+def _get_measured_pose(p: Participant) -> Pose:
+    """Return the alignment in force without the director's offset."""
+    assert p.alignment is not None
+    return p.T_world_tracking_measured or p.alignment.T_world_tracking
+
+
+def _measure_correction(p: Participant, c: Correction) -> tuple[float, float]:
+    return _measure_difference(_get_measured_pose(p), c.T_world_tracking, c.pivot_world)
+
+
+def _measure_difference(old: Pose, new: Pose, pivot_world: Vec3) -> tuple[float, float]:
+    """Return how far `old` puts the point that `new` puts at `pivot_world` from there [m], and their angle [rad]."""
+    p_tracking = apply(inverse((new.p, new.q)), pivot_world)
+    return distance(apply((old.p, old.q), p_tracking), pivot_world), quat_angle(old.q, new.q)
+
+
+def _is_large(ctx: Context, away_m: float, turn_rad: float) -> bool:
+    return away_m > ctx.config.announce_m or turn_rad > ctx.config.announce_rad
+
+
+def _announce_while_engaged(ctx: Context, p: Participant) -> None:
+    """Announce a pending correction once while a clutch is engaged, unless it will slide in unseen."""
+    c = p.correction
+    if c is not None and c.T_told is None and _is_large(ctx, *_measure_correction(p, c)) and _may_announce(ctx, p):
+        _announce_correction(ctx, p, c, "the correction waits until you let go")
+
+
+def _may_announce(ctx: Context, p: Participant) -> bool:
+    """Return true when the last announcement is old enough: wild measurements must not fill the wearer's view."""
+    return p.told_ns is None or ctx.now_ns - p.told_ns >= ctx.config.announce_ns
+
+
+def _announce_correction(ctx: Context, p: Participant, c: Correction, what: str) -> None:
+    away_m, turn_rad = _measure_correction(p, c)
+    c.T_told, p.told_ns = c.T_world_tracking, ctx.now_ns
+    far = f"{away_m * 1e3:.0f} mm" if away_m >= 0.001 else ""
+    turned = f"{math.degrees(turn_rad):.1f} degrees" if turn_rad >= 0.001 else ""
+    inform_wearer(ctx, p, f"the alignment of {p.name} is off by {' and '.join(filter(None, (far, turned)))}: {what}")
+
+
+def _advance_correction(ctx: Context, p: Participant, c: Correction) -> None:
+    away_m, turn_rad = _measure_correction(p, c)
+    if not is_in_use(ctx, p):
+        _complete_correction(ctx, p, c)
+    elif not _is_large(ctx, away_m, turn_rad):
+        if ctx.now_ns >= c.slides_ns:
+            _slide_correction(ctx, p, c, away_m, turn_rad)
+    elif _may_announce(ctx, p):
+        # The correction may have changed since it was announced.
+        if c.T_told is None or _is_large(ctx, *_measure_difference(c.T_told, c.T_world_tracking, c.pivot_world)):
+            _announce_correction(ctx, p, c, f"the scene moves by that in {ctx.config.announce_ns * 1e-9:g} s")
+        else:
+            _complete_correction(ctx, p, c)
+
+
+def _slide_correction(ctx: Context, p: Participant, c: Correction, away_m: float, turn_rad: float) -> None:
+    """Apply one part of a small correction; after a pause it continues to slide, it does not leap."""
+    seconds = ctx.config.slide_ns * 1e-9
+    parts = max(away_m / (ctx.config.slide_m_per_s * seconds), turn_rad / (ctx.config.slide_rad_per_s * seconds))
+    if parts <= 1.0 + 1e-6:  # a rounding error is no part of its own
+        return _complete_correction(ctx, p, c)
+    old, new = _get_measured_pose(p), c.T_world_tracking
+    p_tracking = apply(inverse((new.p, new.q)), c.pivot_world)
+    T = Pose(*interpolate_about_pivot((old.p, old.q), (new.p, new.q), p_tracking, 1.0 / parts))
+    at = apply((T.p, T.q), p_tracking)
+    left = [c.pivot_world[i] - at[i] for i in range(3)] + list(quat_to_rotvec(quat_mul(new.q, quat_conj(T.q))))
+    c.slides_ns = ctx.now_ns + ctx.config.slide_ns
+    error_at_anchor_m = c.error_at_anchor_m + distance(at, c.pivot_world)
+    return _apply_measured(ctx, p, T, c.pivot_world, widen_covariance(c.covariance, tuple(left)), error_at_anchor_m)
+
+
+def _complete_correction(ctx: Context, p: Participant, c: Correction) -> None:
+    """Apply all of a correction."""
+    p.correction = None
+    _apply_measured(ctx, p, c.T_world_tracking, c.pivot_world, c.covariance, c.error_at_anchor_m)
+    _clear_answered_alarm(ctx, p)
+
+
+def _apply_measured(
+    ctx: Context,
+    p: Participant,
+    T: Pose,
+    pivot_world: Vec3,
+    covariance: tuple[float, ...],
+    error_at_anchor_m: float,
+) -> None:
+    """Put a measured alignment in force; a director's offset on top of it voids the stated error."""
+    p.T_world_tracking_measured, p.pivot_world = T, pivot_world
+    if p.offset is not None:
+        return _set_alignment(ctx, p, AlignmentKind.MEASURED, compose_poses(p.offset, T), offset=True)
+    error_at_robot_m = compute_error_at_robots(ctx, p, covariance, pivot_world, error_at_anchor_m)
+    return _set_alignment(ctx, p, AlignmentKind.MEASURED, T, covariance, error_at_anchor_m, error_at_robot_m)
+
+
+def _set_alignment(
+    ctx: Context,
+    p: Participant,
+    kind: str,
+    T_world_tracking: Pose,
+    covariance: tuple[float, ...] = (),
+    error_at_anchor_m: float = 0.0,
+    error_at_robot_m: float = 0.0,
+    offset: bool = False,
+) -> None:
+    p.alignment_version += 1
+    p.refused_ns = None
+    if p.aligned_ns is None:
+        p.aligned_ns = ctx.now_ns
+    p.alignment = Alignment(
+        p.alignment_version,
+        kind,
+        T_world_tracking,
+        p.tracking_epoch,
+        covariance,
+        error_at_anchor_m,
+        error_at_robot_m,
+        offset,
+    )
+    warn_wearer(ctx, p, "unaligned", "", same="")
+    ctx.emit(AlignmentChanged(p.id, p.alignment))
+
+
+def _clear_answered_alarm(ctx: Context, p: Participant) -> None:
+    """Clear an alarm that a new alignment resolves; one about a moved sheet stays."""
+    if p.alarm is not None and not p.alarm.beside:
+        p.alarm = None
+        warn_wearer(ctx, p, "alarm", "", same="")
+
+
+# --- stated errors ---
+
+
+def compute_position_p95(covariance: tuple[float, ...], pivot: Vec3, point: Vec3) -> float:
+    """Return the 95 % quantile [m] of the length of the position error at `point`, from a 6x6 covariance stated at
+    `pivot`.
+
+    The error at the point is dp + dtheta x r with r = point - pivot. Its squared length is a weighted sum of chi-square
+    variables, approximated by one with the same mean and variance (Satterthwaite), its quantile by Wilson-Hilferty.
+    """
+    r = (point[0] - pivot[0], point[1] - pivot[1], point[2] - pivot[2])
+    # Rows of [I | -[r]x]: how (dp, dtheta) moves the point.
+    J = (
+        (1.0, 0.0, 0.0, 0.0, r[2], -r[1]),
+        (0.0, 1.0, 0.0, -r[2], 0.0, r[0]),
+        (0.0, 0.0, 1.0, r[1], -r[0], 0.0),
+    )
+    CJ = [[sum(covariance[6 * i + k] * row[k] for k in range(6)) for i in range(6)] for row in J]
+    C = [[sum(J[i][k] * CJ[j][k] for k in range(6)) for j in range(3)] for i in range(3)]
+    mean = C[0][0] + C[1][1] + C[2][2]
+    if not (0.0 < mean < math.inf):
+        return 0.0 if mean == 0.0 else math.inf
+    spread = sum(c * c for row in C for c in row)
+    freedom = min(3.0, max(1.0, mean * mean / spread)) if math.isfinite(spread) and spread > 0.0 else 1.0
+    a = 2.0 / (9.0 * freedom)
+    return math.sqrt(mean * (1.0 - a + Z95 * math.sqrt(a)) ** 3)
+
+
+def compute_error_at_robot(ctx: Context, p: Participant, robot: str) -> float:
+    """Return the stated p95 position error [m] of `p` at the end effector of `robot`; 0 where none is stated (placed,
+    offset).
+    """
+    alignment = p.alignment
+    if alignment is None or not alignment.covariance:
+        return 0.0
+    return compute_position_p95(alignment.covariance, p.pivot_world, ctx.view.tip_pose(robot).p)
+
+
+def compute_error_at_robots(
+    ctx: Context, p: Participant, covariance: tuple[float, ...], pivot_world: Vec3, error_at_anchor_m: float
+) -> float:
+    """Return the stated p95 error [m]: the largest at the robots that `p` holds, else at the robot nearest to the
+    anchor.
+    """
+    held = [g.target for g in ctx.state.robots.values() if any(h.participant == p.id for h in g.grants)]
+    points = {name: ctx.view.tip_pose(name).p for name in held or ctx.robots}
+    errors = [compute_position_p95(covariance, pivot_world, point) for point in points.values()]
+    return max(errors) if held else min(errors, default=error_at_anchor_m)
+
+
+def widen_covariance(covariance: tuple[float, ...], away: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a covariance that includes an error (3 m, 3 rad, at its pivot) still to be corrected: C + v v^T.
+
+    Its p95 is never less than that error itself, at any lever arm.
+    """
+    return tuple(c + away[i // 6] * away[i % 6] for i, c in enumerate(covariance))
+
+
+# --- notices to the wearer ---
+
+
+def warn_wearer(ctx: Context, p: Participant, kind: str, text: str, *, same: str) -> None:
+    """Warn the wearer, at most once per `warning_ns` and kind; the next warning counts those left out meanwhile.
+
+    `text` empty: the condition has ended. `same`: the part of a warning that stays equal in repetitions, which are not
+    sent again.
+    """
+    w = p.warnings.get(kind)
+    if w is None:
+        if not text:
+            return
+        w = p.warnings[kind] = WarningState(said_ns=ctx.now_ns - ctx.config.warning_ns)
+    now = same if text else ""
+    changed, w.seen = now != w.seen, now
+    if not now:
+        w.said = ""
+    elif now != w.said and ctx.now_ns - w.said_ns < ctx.config.warning_ns:
+        w.left_out += changed
+    elif now != w.said:
+        more = f" ({w.left_out} more of these meanwhile)" if w.left_out else ""
+        ctx.emit(Notice("warning", text[: MAX_TEXT - len(more)] + more, p.id))
+        w.said, w.said_ns, w.left_out = now, ctx.now_ns, 0
+
+
+def inform_wearer(ctx: Context, p: Participant, text: str) -> None:
+    """Send the wearer a notice that reports no fault."""
+    ctx.emit(Notice("info", text[:MAX_TEXT], p.id))

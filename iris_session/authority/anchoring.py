@@ -1,13 +1,13 @@
-"""Alignment runs, moved anchors, alarms of the front's watch, comparisons of headsets, and how all of it stands."""
+"""Alignment runs, moved anchors, alarms of the drift monitor, cross-checks of headsets, and the reports about them."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-from iris_session.authority import alignment, corrections, telling
-from iris_session.authority.context import Context, no_such, some
-from iris_session.authority.state import HOST_ID, Alarmed, Compared, Participant
+from iris_session.authority import alignment
+from iris_session.authority.context import Context, build_unknown_denial, join_names
+from iris_session.authority.state import HOST_ID, AlarmState, CrossCheckState, Participant
 from iris_session.protocol.client_messages import Align, MoveAnchor, TrackingEpoch
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.entries import AlignmentAlarm, CrossChecked
@@ -24,12 +24,12 @@ from iris_session.protocol.status import AlignmentReport, CrossCheckReport
 MAX_REPORTED: Final = 64
 
 
-def align(ctx: Context, p: Participant, m: Align) -> None:
-    """Starts or stops an alignment run: a director's (or the host's) for everybody, others for themselves."""
+def control_alignment_run(ctx: Context, p: Participant, m: Align) -> None:
+    """Start or stop an alignment run: a director's (or the host's) for everyone, others for themselves."""
     if m.action not in AlignAction.ALL:
         known = f"actions: {', '.join(sorted(AlignAction.ALL))}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
-    person = ctx.person(m.participant) if m.participant else p
+    person = ctx.find_participant(m.participant) if m.participant else p
     if person is not p and p.role != Role.DIRECTOR:
         text = f"role {p.role} may align only itself"
         return ctx.deny(
@@ -41,7 +41,7 @@ def align(ctx: Context, p: Participant, m: Align) -> None:
     if not person.needs_alignment:
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, f"{person.name} needs no alignment"))
     if m.action == AlignAction.START:
-        _start(ctx, person)
+        _start_run(ctx, person)
     elif person.aligning:
         person.aligning, person.correction = False, None
     else:
@@ -50,37 +50,42 @@ def align(ctx: Context, p: Participant, m: Align) -> None:
     return ctx.accept(p, m.request_id)
 
 
-def _start(ctx: Context, p: Participant) -> None:
-    """Measures anew: what is in force stays until then, a director's word and offset do not outlive it."""
+def _start_run(ctx: Context, p: Participant) -> None:
+    """Start to measure anew: the alignment in force stays until then, a director's placement and offset end."""
     p.alignment_run += 1
     p.aligning, p.placed, p.aligned_ns = True, False, None
-    p.in_use = corrections.engaged(ctx, p)  # who works with it meanwhile is not startled by the first of the new ones
+    p.in_use = alignment.is_engaged(
+        ctx, p
+    )  # the first of the new measurements must not startle a wearer who is engaged
     p.correction = p.placing = p.offset = None
     p.proposals_from_ns = ctx.now_ns
     if p.alignment is not None and p.alignment.kind == AlignmentKind.MEASURED:
         p.T_world_tracking_measured = p.alignment.T_world_tracking
-    _clear(ctx, p)
+    _clear_alarm(ctx, p)
 
 
 def move_anchor(ctx: Context, p: Participant, m: MoveAnchor) -> None:
-    """A director says where an anchor is: what was measured to its old place counts no more."""
+    """Move an anchor for a director: measurements at its old place no longer count."""
     if m.anchor_id not in ctx.state.anchors:
-        return ctx.deny(p, m.request_id, no_such("anchor", m.anchor_id, ctx.state.anchors))
-    if not alignment.is_pose(ctx, m.T_world_anchor):
+        return ctx.deny(p, m.request_id, build_unknown_denial("anchor", m.anchor_id, ctx.state.anchors))
+    if not alignment.is_valid_pose(ctx, m.T_world_anchor):
         text = f"the pose is not finite with a unit quaternion, or further than {ctx.config.reach_m:g} m away"
         return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "", m.anchor_id))
     away_m, most_m = math.dist(m.T_world_anchor.p, ctx.state.anchors[m.anchor_id].p), ctx.config.max_anchor_move_m
     if away_m > most_m and not m.force:
         text = f"anchor {m.anchor_id} would be moved by {away_m:.1f} m; more than {most_m:g} m needs --force (`force`)"
         return ctx.deny(p, m.request_id, Denial(DenialReason.TOO_FAR, text, "poses are in metres", m.anchor_id))
-    _move(ctx, {**ctx.state.anchors, m.anchor_id: corrections.clean(m.T_world_anchor)}, p.id)
+    _set_anchors(ctx, {**ctx.state.anchors, m.anchor_id: alignment.normalise_pose(m.T_world_anchor)}, p.id)
     return ctx.accept(p, m.request_id)
 
 
-def _move(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
-    """The front cannot know of it before this step is over. What it proposes between then and the moment it hears of it
-    is followed by what it proposes afterwards, over the same connection: nothing of it has come into force by then for
-    anyone who uses an alignment, as corrections need half a second to begin."""
+def _set_anchors(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
+    """Replace the anchors and publish those that moved.
+
+    The front cannot know of it before this step is over. What it proposes between then and the moment it receives the
+    news is followed by what it proposes afterwards, over the same connection: nothing of it has come into force by then
+    for any alignment in use, as corrections need half a second to begin.
+    """
     moved = [name for name, T in anchors.items() if ctx.state.anchors.get(name) != T]
     if not moved and anchors.keys() == ctx.state.anchors.keys():
         return
@@ -89,42 +94,44 @@ def _move(ctx: Context, anchors: dict[str, Pose], by: str) -> None:
         ctx.emit(AnchorMoved(name, anchors[name], by))
     for p in ctx.state.participants.values():
         p.correction = None
-        about = "" if p.alarm is None else p.alarm.anchor_id  # empty too where a head jumped: no anchor answers that
+        about = "" if p.alarm is None else p.alarm.anchor_id  # empty too where a head jumped: no anchor resolves that
         if about and (about in moved or about not in anchors):
-            _clear(ctx, p)
+            _clear_alarm(ctx, p)
 
 
-def give_anew(ctx: Context, anchors: dict[str, Pose]) -> None:
-    """A session that goes on from a recording was given other anchors than it had."""
-    if anchors and all(alignment.is_pose(ctx, T) for T in anchors.values()):
-        _move(ctx, {name: corrections.clean(T) for name, T in anchors.items()}, HOST_ID)
+def replace_anchors(ctx: Context, anchors: dict[str, Pose]) -> None:
+    """Set the anchors given to a session that resumes from a recording."""
+    if anchors and all(alignment.is_valid_pose(ctx, T) for T in anchors.values()):
+        _set_anchors(ctx, {name: alignment.normalise_pose(T) for name, T in anchors.items()}, HOST_ID)
 
 
-def alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
-    """The front's watch found the alignment wrong. A jump voids it at once, the others ask for a new look."""
+def raise_alarm(ctx: Context, p: Participant, m: AlignmentAlarm) -> None:
+    """Record an alarm of the front's drift monitor. A jump voids the alignment at once, the others ask for a new
+    measurement.
+    """
     if not p.needs_alignment or m.kind not in AlarmKind.ALL or m.tracking_epoch < p.tracking_epoch:
         return
     if m.tracking_epoch > p.tracking_epoch:
-        alignment.tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
+        alignment.set_tracking_epoch(ctx, p, TrackingEpoch(m.tracking_epoch))
     if m.kind == AlarmKind.DIFFERS and not m.beside and (p.correction is not None or p.alignment is None):
-        return  # known: what was measured is not in force (yet)
+        return  # known: the measurement is not in force (yet)
     size_m = min(max(0.0, m.size_m), ctx.config.reach_m) if math.isfinite(m.size_m) else ctx.config.reach_m
     if m.kind == AlarmKind.JUMP:
         p.proposals_from_ns = max(p.proposals_from_ns, ctx.entry_ns)
-        alignment.new_frame(ctx, p)
+        alignment.void_tracking_frame(ctx, p)
     elif not m.beside:
-        p.correction = None  # what it was measured from contradicts what is seen now
-    p.alarm = Alarmed(m.kind, m.anchor_id, size_m, m.beside, ctx.now_ns)
+        p.correction = None  # its measurements contradict the present observations
+    p.alarm = AlarmState(m.kind, m.anchor_id, size_m, m.beside, ctx.now_ns)
     ctx.emit(AlignmentAlarmed(p.id, m.kind, m.anchor_id, size_m, m.beside))
     if m.kind == AlarmKind.JUMP:
         ctx.publish_participant(p)
-    telling.warn(ctx, p, "alarm", _text(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
+    alignment.warn_wearer(ctx, p, "alarm", _describe_alarm(p, m, size_m), same=f"{m.kind} {m.anchor_id}")
 
 
-def _text(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
+def _describe_alarm(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
     size = f"{size_m * 1e3:.0f} mm"
     if m.beside:
-        others = some(m.beside)
+        others = join_names(m.beside)
         return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere, and {others} where it was: was the sheet moved?"
     advice = "look at an anchor sheet again" if p.aligning else "start its alignment run again"
     if m.kind == AlarmKind.JUMP:
@@ -132,13 +139,13 @@ def _text(p: Participant, m: AlignmentAlarm, size_m: float) -> str:
     return f"{p.name} sees anchor {m.anchor_id} {size} elsewhere than its alignment says: {advice}"
 
 
-def _clear(ctx: Context, p: Participant) -> None:
+def _clear_alarm(ctx: Context, p: Participant) -> None:
     p.alarm = None
-    telling.warn(ctx, p, "alarm", "", same="")
+    alignment.warn_wearer(ctx, p, "alarm", "", same="")
 
 
-def cross_checked(ctx: Context, p: Participant, m: CrossChecked) -> None:
-    """Two headsets saw the same thing. Ignored when either has gone, or for numbers that are none."""
+def record_cross_check(ctx: Context, p: Participant, m: CrossChecked) -> None:
+    """Record that two headsets observed the same anchor. Ignored when either has left, or for invalid numbers."""
     other = ctx.by_connection.get(m.other)
     if other is None or other is p or HOST_ID in (p.id, other.id):
         return
@@ -147,20 +154,20 @@ def cross_checked(ctx: Context, p: Participant, m: CrossChecked) -> None:
     if not all(math.isfinite(v) for v in (*sizes, x, y, z)) or min(sizes) < 0.0:
         return
     key = " ".join(sorted((p.id, other.id)))
-    ctx.state.cross_checks[key] = Compared(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns)
+    ctx.state.cross_checks[key] = CrossCheckState(p.id, other.id, m.anchor_id, *sizes, m.n, ctx.now_ns)
     ctx.emit(HeadsetsCompared(p.id, other.id, m.anchor_id, *sizes, (float(x), float(y), float(z)), m.n))
 
 
-def forget(ctx: Context, p: Participant) -> None:
-    """It has left: nobody can look at what it saw again."""
+def remove_cross_checks(ctx: Context, p: Participant) -> None:
+    """Remove the cross-checks of a participant that has left."""
     kept = {key: c for key, c in ctx.state.cross_checks.items() if p.id not in (c.a, c.b)}
     ctx.state.cross_checks = kept
 
 
-def alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
-    """What the authority knows of an alignment; the front adds what it sees."""
+def build_alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
+    """Return the authority's part of an alignment report; the front adds what it observes."""
     now, last = p.alignment, p.alarm
-    pending_m, pending_rad = corrections.pending(p)
+    pending_m, pending_rad = alignment.measure_pending_correction(p)
     return AlignmentReport(
         version=0 if now is None else now.version,
         running=p.aligning,
@@ -175,8 +182,8 @@ def alignment_report(ctx: Context, p: Participant) -> AlignmentReport:
     )
 
 
-def cross_check_reports(ctx: Context) -> tuple[CrossCheckReport, ...]:
-    """The newest comparison of every pair, newest first."""
+def build_cross_check_reports(ctx: Context) -> tuple[CrossCheckReport, ...]:
+    """Return the newest cross-check of every pair, newest first."""
     newest = sorted(ctx.state.cross_checks.values(), key=lambda c: -c.compared_ns)[:MAX_REPORTED]
     return tuple(
         CrossCheckReport(

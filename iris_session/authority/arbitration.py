@@ -1,46 +1,57 @@
-"""From counted samples to exactly one command per robot and step."""
+"""From counted samples to exactly one command per robot and step, commands of held objects, and feedback to holders.
+
+Free objects are held by hands without a robot. The hand that engaged first leads: the object follows it with the offset
+latched at that moment. When it releases while another hand holds, the offset to that one is latched from the object's
+last commanded pose, so nothing jumps.
+"""
 
 from __future__ import annotations
 
-from anchors.pose import compose, quat_rotate
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from anchors.pose import compose, inverse, quat_rotate
 from iris_session.authority import engagement, roster, samples
 from iris_session.authority.context import HUMAN, Context
-from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant
+from iris_session.authority.state import DeviceState, FeedbackState, JointReading, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Pose
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import CommandKind, Device, HoldReason, LeaseMode, RejectReason, SampleKind
-from iris_session.protocol.server_messages import PresenceItem
-from iris_session.protocol.steps import Command, CommandSource
+from iris_session.protocol.server_messages import Feedback, PresenceItem
+from iris_session.protocol.steps import Command, CommandSource, ObjectCommand
 
-#: Hold reasons after which a closed clutch alone shows the wearer what is missing: let go and take hold again.
+#: Objects farther away than this [m] have left the scene; far below what arithmetic can hold.
+_FARTHEST: Final = 1e9
+#: Hold reasons after which a closed clutch changes the reason to `rearm`: the clutch must open and close again.
 _WAITING = (HoldReason.NO_SAMPLE, HoldReason.CLUTCH_OPEN)
 _INVISIBLE = (Device.JOINTS, Device.TARGET)
 
 
-def sample(ctx: Context, entry: Entry, s: Sample) -> None:
-    """One sample of the reconcile phase: counted, or rejected with its reason."""
+def process_sample(ctx: Context, entry: Entry, s: Sample) -> None:
+    """Count one sample, or reject it with its reason."""
     p = ctx.by_connection.get(entry.connection)
     if p is None:
-        return samples.count(ctx, None, s.device, RejectReason.CONNECTION_EPOCH)
+        return samples.count_rejection(ctx, None, s.device, RejectReason.CONNECTION_EPOCH)
     drives: list[samples.Drive] = []
-    reason = samples.check(ctx, p, entry, s, drives)
+    reason = samples.check_sample(ctx, p, entry, s, drives)
     if reason:
-        return samples.reject(ctx, p, s, reason)
+        return samples.reject_sample(ctx, p, s, reason)
     usable = s.tracked and s.worn
-    _remember(p, s, usable)
+    _store_payload(p, s, usable)
     if s.worn != p.worn:
         roster.set_worn(ctx, p, s.worn)
     for lease, g in drives:
-        _latch(ctx, p, lease, g, s)
+        _update_latch(ctx, p, lease, g, s)
         if g.engagement and g.device == s.device:
-            _follow(ctx, p, lease, g, entry, s)
+            _set_source(ctx, p, lease, g, entry, s)
     if usable and s.kind == SampleKind.POSE and s.device not in _INVISIBLE:
-        _show(ctx, p, s)
+        _publish_presence(ctx, p, s)
     return None
 
 
-def _remember(p: Participant, s: Sample, usable: bool) -> None:
+def _store_payload(p: Participant, s: Sample, usable: bool) -> None:
     seen = p.seen.get(s.device)
     if seen is None:
         seen = p.seen[s.device] = DeviceState()
@@ -51,24 +62,24 @@ def _remember(p: Participant, s: Sample, usable: bool) -> None:
     elif usable and s.kind == SampleKind.JOINTS:
         before = seen.joints.get(len(s.q))
         capture_ns = s.capture_ns if before is None else max(before.capture_ns, s.capture_ns)
-        seen.joints[len(s.q)] = JointsSeen(capture_ns, tuple(map(float, s.q)))
+        seen.joints[len(s.q)] = JointReading(capture_ns, tuple(map(float, s.q)))
 
 
-def _latch(ctx: Context, p: Participant, lease: LeaseState, g: Grant, s: Sample) -> None:
-    """Clutch edges, and what ends an engagement by the sample's own word."""
+def _update_latch(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant, s: Sample) -> None:
+    """Update the clutch latch of a grant, and end an engagement that the sample itself ends."""
     mine = g.engagement != 0 and g.device == s.device
     if not (s.worn and s.tracked):
         if s.device in g.armed:
             g.armed.remove(s.device)
         if mine or not g.engagement:
-            engagement.end(ctx, lease, g, HoldReason.UNTRACKED if s.worn else HoldReason.NOT_WORN)
+            engagement.end_engagement(ctx, lease, g, HoldReason.UNTRACKED if s.worn else HoldReason.NOT_WORN)
     elif not s.clutch:
         if s.device not in g.armed:
             g.armed.append(s.device)
         if mine or not g.engagement:
-            engagement.end(ctx, lease, g, HoldReason.CLUTCH_OPEN)
+            engagement.end_engagement(ctx, lease, g, HoldReason.CLUTCH_OPEN)
     elif not g.engagement and s.device in g.armed and _may_engage(ctx, p, lease):
-        engagement.begin(ctx, lease, g, p, s.device)
+        engagement.begin_engagement(ctx, lease, g, p, s.device)
     elif not mine:
         # A closed clutch without an edge: it must open first.
         if s.device in g.armed:
@@ -76,7 +87,7 @@ def _latch(ctx: Context, p: Participant, lease: LeaseState, g: Grant, s: Sample)
         if not g.engagement and g.hold in _WAITING:
             g.hold = HoldReason.REARM
     if not s.clutch and lease.override == p.id and g.device == s.device:
-        engagement.give_back(ctx, lease)
+        engagement.end_intervention(ctx, lease)
 
 
 def _may_engage(ctx: Context, p: Participant, lease: LeaseState) -> bool:
@@ -86,8 +97,8 @@ def _may_engage(ctx: Context, p: Participant, lease: LeaseState) -> bool:
     return not lease.override or lease.override == p.id or p.role in HUMAN
 
 
-def _follow(ctx: Context, p: Participant, lease: LeaseState, g: Grant, entry: Entry, s: Sample) -> None:
-    """Makes the sample the newest source of an engaged grant, in the world by the alignment of the engagement."""
+def _set_source(ctx: Context, p: Participant, lease: LeaseState, g: LeaseGrant, entry: Entry, s: Sample) -> None:
+    """Make the sample the newest source of an engaged grant, in the world by the alignment of the engagement."""
     T = g.T_world_tracking
     pose: Pose | None = None
     twist: tuple[float, float, float, float, float, float] | None = None
@@ -124,8 +135,8 @@ def _follow(ctx: Context, p: Participant, lease: LeaseState, g: Grant, entry: En
         g.gripper = min(1.0, max(0.0, float(s.gripper)))
 
 
-def _show(ctx: Context, p: Participant, s: Sample) -> None:
-    """Presence of an aligned participant's device, newest of this step. By the alignment in force."""
+def _publish_presence(ctx: Context, p: Participant, s: Sample) -> None:
+    """Publish the pose of an aligned participant's device, newest of this step, by the alignment in force."""
     if p.alignment is None or s.pose is None:
         return
     T = p.alignment.T_world_tracking
@@ -134,43 +145,44 @@ def _show(ctx: Context, p: Participant, s: Sample) -> None:
 
 
 def expire_samples(ctx: Context) -> None:
-    """Ends every engagement without a counted sample within the freshness bound, by session time, and every
-    intervention whose human has not been engaged for a while."""
+    """End every engagement without a counted sample within the freshness bound, by session time, and every intervention
+    whose human has not been engaged for a while.
+    """
     oldest = ctx.now_ns - ctx.config.freshness_ns
     for lease in (*ctx.state.robots.values(), *ctx.held_objects):
         for g in lease.grants:
             if g.engagement and g.counted_ns < oldest:
-                engagement.rearm(ctx, lease, g, HoldReason.STALE)
+                engagement.rearm_grant(ctx, lease, g, HoldReason.STALE)
             if g.participant == lease.override:
                 if g.engagement or ctx.state.paused or ctx.state.estop:
                     lease.override_ns = ctx.now_ns
                 elif ctx.now_ns - lease.override_ns >= ctx.config.intervention_idle_ns:
-                    engagement.give_back(ctx, lease)
+                    engagement.end_intervention(ctx, lease)
 
 
-class Commands:
-    """Builds the commands of a step; unchanged ones are the same objects as in the step before (a cache, no state)."""
+class CommandBuilder:
+    """Builder of a step's commands; unchanged ones are the same objects as in the step before (a cache, no state)."""
 
     def __init__(self) -> None:
         self._holds: dict[tuple[str, str], Command] = {}
         self._last: dict[str, Command] = {}
 
-    def build(self, ctx: Context) -> tuple[Command, ...]:
-        """Exactly one command per robot, in the order of the specification."""
-        return tuple([self._command(ctx, lease) for lease in ctx.state.robots.values()])
+    def build_commands(self, ctx: Context) -> tuple[Command, ...]:
+        """Return exactly one command per robot, in the order of the specification."""
+        return tuple([self._build_command(ctx, lease) for lease in ctx.state.robots.values()])
 
-    def _command(self, ctx: Context, lease: LeaseState) -> Command:
+    def _build_command(self, ctx: Context, lease: LeaseState) -> Command:
         grants = lease.grants
         if not grants:
-            return self._hold(lease.target, HoldReason.ESTOP if ctx.state.estop else HoldReason.NO_LEASE)
+            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else HoldReason.NO_LEASE)
         if lease.mode == LeaseMode.SHARED and len(grants) > 1:
-            return self._blend(ctx, lease)
+            return self._blend_sources(ctx, lease)
         g = grants[0]
         if lease.override:
             g = next(other for other in grants if other.participant == lease.override)
         if not g.engagement or g.source is None:
-            return self._hold(lease.target, HoldReason.ESTOP if ctx.state.estop else g.hold)
-        source = _aged(ctx, g)
+            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else g.hold)
+        source = _age_source(ctx, g)
         last = self._last.get(lease.target)
         if last is not None and last.sources[0] is source and last.scale == g.scale and len(last.sources) == 1:
             return last
@@ -178,38 +190,40 @@ class Commands:
         self._last[lease.target] = command
         return command
 
-    def _hold(self, robot: str, reason: str) -> Command:
+    def _get_hold_command(self, robot: str, reason: str) -> Command:
         command = self._holds.get((robot, reason))
         if command is None:
             command = self._holds[(robot, reason)] = Command(robot, CommandKind.HOLD, reason)
         return command
 
-    def _blend(self, ctx: Context, lease: LeaseState) -> Command:
-        """All engaged sharers, who send samples of one kind (`samples` sees to that), weights summing to 1."""
+    def _blend_sources(self, ctx: Context, lease: LeaseState) -> Command:
+        """Blend all engaged sharers, whose samples are of one kind (`samples` ensures it), with weights
+        summing to 1.
+        """
         engaged = [g for g in lease.grants if g.engagement and g.source is not None]
         if not engaged:
-            return self._hold(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)
+            return self._get_hold_command(lease.target, HoldReason.ESTOP if ctx.state.estop else lease.grants[0].hold)
         total = sum(g.weight for g in engaged)
-        sources = tuple(_weighted(_aged(ctx, g), g.weight / total) for g in engaged)
+        sources = tuple(_weigh_source(_age_source(ctx, g), g.weight / total) for g in engaged)
         gripping = [(g.weight, g.gripper) for g in engaged if g.gripper is not None]
         gripper = sum(w * v for w, v in gripping) / sum(w for w, _ in gripping) if gripping else None
-        return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.scale(lease))
+        return Command(lease.target, engaged[0].kind, "", sources, gripper, ctx.get_scale(lease))
 
 
-def _aged(ctx: Context, g: Grant) -> CommandSource:
-    """The grant's source, with `new` only in the step in which it was counted."""
+def _age_source(ctx: Context, g: LeaseGrant) -> CommandSource:
+    """Return the grant's source, with `new` only in the step in which it was counted."""
     s = g.source
     assert s is not None
     if s.new and g.counted_step != ctx.state.step:
-        s = g.source = _copy(s, s.weight, False)
+        s = g.source = _copy_source(s, s.weight, False)
     return s
 
 
-def _weighted(s: CommandSource, weight: float) -> CommandSource:
-    return _copy(s, weight, s.new)
+def _weigh_source(s: CommandSource, weight: float) -> CommandSource:
+    return _copy_source(s, weight, s.new)
 
 
-def _copy(s: CommandSource, weight: float, new: bool) -> CommandSource:
+def _copy_source(s: CommandSource, weight: float, new: bool) -> CommandSource:
     return CommandSource(
         s.participant,
         s.device,
@@ -225,3 +239,82 @@ def _copy(s: CommandSource, weight: float, new: bool) -> CommandSource:
         s.qd,
         s.absolute,
     )
+
+
+# --- held objects ---
+
+
+def _is_finite_pose(T: Pose) -> bool:
+    """Return false for the pose of an object in physics that diverged: no hand can hold that."""
+    n = math.sqrt(sum(c * c for c in T.q))
+    return all(abs(c) < _FARTHEST for c in T.p) and 0.5 < n < 2.0
+
+
+def build_object_commands(ctx: Context) -> tuple[ObjectCommand, ...]:
+    """Return one command per object that an engaged hand holds, in the order of the specification."""
+    commands = []
+    for lease in ctx.held_objects:
+        command = _build_object_command(ctx, lease)
+        if command is not None:
+            commands.append(command)
+    return tuple(commands)
+
+
+def _build_object_command(ctx: Context, lease: LeaseState) -> ObjectCommand | None:
+    hands = [g for g in lease.grants if g.engagement]
+    if not hands:
+        lease.lead = 0
+        return None
+    leader = min(hands, key=lambda g: g.engagement)
+    source = leader.source
+    assert source is not None
+    assert source.pose_world is not None
+    T_world_hand = (source.pose_world.p, source.pose_world.q)
+    if lease.lead != leader.engagement:
+        T_now = lease.T_world_object if lease.lead else ctx.view.object_pose(lease.target)
+        if not _is_finite_pose(T_now):
+            for g in hands:
+                engagement.rearm_grant(ctx, lease, g, HoldReason.REARM)
+            lease.lead = 0
+            return None
+        lease.T_hand_object = Pose(*compose(inverse(T_world_hand), (T_now.p, T_now.q)))
+        lease.lead = leader.engagement
+    offset = lease.T_hand_object
+    lease.T_world_object = Pose(*compose(T_world_hand, (offset.p, offset.q)))
+    return ObjectCommand(lease.target, lease.lead, lease.T_world_object)
+
+
+# --- feedback to holders ---
+
+
+def send_feedback(ctx: Context, commands: Sequence[Command]) -> None:
+    """Send feedback on change, at most once per `feedback_ns` and robot."""
+    for command in commands:
+        state = ctx.state.feedback.get(command.robot)
+        if state is None:
+            state = ctx.state.feedback[command.robot] = FeedbackState()
+        if ctx.now_ns >= state.due_ns:
+            state.due_ns = ctx.now_ns + ctx.config.feedback_ns
+            _send_robot_feedback(ctx, command, state)
+
+
+def _send_robot_feedback(ctx: Context, command: Command, state: FeedbackState) -> None:
+    lease = ctx.state.robots[command.robot]
+    holders = [g.participant for g in lease.grants]
+    for participant in [name for name in state.sent if name not in holders]:
+        del state.sent[participant]
+    if not holders:
+        return
+    step = ctx.config.contact_step_n
+    force = ctx.view.gripper_force(command.robot)
+    contact_n = round(force / step) * step if math.isfinite(force) else 0.0  # not finite: physics that diverged
+    limits: tuple[str, ...] = next((c.limits for c in ctx.control if c.robot == command.robot), ())
+    for name in dict.fromkeys(holders):
+        p = ctx.state.participants[name]
+        kind, reason = command.kind, command.hold_reason
+        if lease.override and name != lease.override:
+            kind, reason = CommandKind.HOLD, HoldReason.INTERVENTION  # the human moves it, not this agent
+        message = Feedback(command.robot, kind, reason, contact_n, limits, dict(p.rejected))
+        if state.sent.get(name) != message:
+            state.sent[name] = message
+            ctx.send(p, message)

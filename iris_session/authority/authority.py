@@ -15,22 +15,16 @@ from iris_session.authority import (
     alignment,
     anchoring,
     arbitration,
-    corrections,
-    episodes,
-    feedback,
-    grasps,
     handover,
     leases,
     requests,
     roster,
     samples,
-    scaling,
-    scenes,
-    stops,
+    session_control,
 )
 from iris_session.authority.config import AuthorityConfig, check_config
 from iris_session.authority.context import Context
-from iris_session.authority.state import HOST_ID, Participant, State
+from iris_session.authority.state import HOST_ID, AuthorityState, Participant
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol import entries as em
 from iris_session.protocol.client_messages import RemoveParticipant
@@ -45,10 +39,10 @@ from iris_session.protocol.scene import PatchOp
 from iris_session.protocol.server_messages import Audited, Gap, MarkerAdded, Reply
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
 from iris_session.protocol.status import AlignmentReport, CrossCheckReport
-from iris_session.protocol.steps import ControlStatus, Decision, Outgoing, WorldView
+from iris_session.protocol.steps import ControlStatus, Decision, OutgoingMessage, WorldView
 
 #: Requests that only a director (or the host) may make.
-DIRECTING: Final = (
+DIRECTOR_ONLY: Final = (
     cm.Assign,
     cm.SetMode,
     cm.Control,
@@ -68,30 +62,32 @@ HOST_ONLY: Final = (
     em.SceneLoaded,
     em.ScenePatched,
 )
-#: Entries that the front makes of its own, for the participant of a connection: no envelope, quota or sign of life.
+#: Entries that the front itself makes for the participant of a connection: no envelope, quota or sign of life.
 FRONT_MADE: Final = (em.AlignmentProposal, em.AlignmentAlarm, em.CrossChecked)
 
 NOT_JOINED: Final = Denial(DenialReason.NOT_JOINED, "this connection is no participant", "say hello first")
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(State)
+_decoder = msgspec.msgpack.Decoder(AuthorityState)
 
 
 class Authority:
-    """The one truth of a session: who is in it, who drives which robot, and what every robot does in each step."""
+    """The single source of truth of a session: its participants, who drives which robot, and one command per robot and
+    step.
+    """
 
     def __init__(self, config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
-        """Raises `ValueError` for names that occur twice, unknown modes, policies, or robots in `assignments`."""
+        """Raise `ValueError` for names that occur twice, unknown modes, policies, or robots in `assignments`."""
         check_config(config, robots, objects)
-        self._first = (tuple(robots), tuple(objects))
-        state = State(
-            robots=scenes.robot_leases(self._first[0], config.default_mode),
-            objects=scenes.object_leases(self._first[1]),
-            participants={HOST_ID: roster.host()},
-            anchors={name: corrections.clean(T) for name, T in config.anchors.items()},
+        self._initial_targets = (tuple(robots), tuple(objects))
+        state = AuthorityState(
+            robots=session_control.create_robot_leases(self._initial_targets[0], config.default_mode),
+            objects=session_control.create_object_leases(self._initial_targets[1]),
+            participants={HOST_ID: roster.create_host()},
+            anchors={name: alignment.normalise_pose(T) for name, T in config.anchors.items()},
         )
         self._ctx = Context(config, robots, objects, state)
-        self._commands = arbitration.Commands()
+        self._commands = arbitration.CommandBuilder()
 
     def step(
         self,
@@ -101,30 +97,30 @@ class Authority:
         view: WorldView,
         control: Sequence[ControlStatus] = (),
     ) -> Decision:
-        """Takes one step at session time `now_ns` (never decreasing, else `ValueError`) before `n_ticks` of physics.
+        """Take one step at session time `now_ns` (never decreasing, else `ValueError`) before `n_ticks` of physics.
 
-        `view`: the world after the last tick. `control`: what control reported after the previous step.
+        `view`: the world after the last tick. `control`: the status that control reported after the previous step.
         """
         ctx = self._ctx
-        self._begin(now_ns, n_ticks, view, control, resumed=bool(entries) and _resumes(entries[0]))
-        others, observed = self._urgent(entries)
+        self._begin_step(now_ns, n_ticks, view, control, resumed=bool(entries) and _is_resume(entries[0]))
+        others, observed = self._apply_urgent_entries(entries)
         for entry in others:
-            self._request(entry)
+            self._apply_entry(entry)
         for entry in observed:
             if isinstance(entry.message, cm.Sample):
-                arbitration.sample(ctx, entry, entry.message)
-        roster.expire(ctx)
+                arbitration.process_sample(ctx, entry, entry.message)
+        roster.expire_participants(ctx)
         arbitration.expire_samples(ctx)
-        corrections.advance(ctx)
+        alignment.advance_corrections(ctx)
         if ctx.state.queue or ctx.state.consents:
-            requests.advance(ctx)
-        handover.observe(ctx)
-        commands = self._commands.build(ctx)
-        objects = grasps.build(ctx) if ctx.held_objects else ()
-        feedback.report(ctx, commands)
+            requests.advance_requests(ctx)
+        handover.track_handovers(ctx)
+        commands = self._commands.build_commands(ctx)
+        objects = arbitration.build_object_commands(ctx) if ctx.held_objects else ()
+        arbitration.send_feedback(ctx, commands)
         for connection, request_id in ctx.snapshots:
             if connection in ctx.by_connection:
-                ctx.outgoing.append(Outgoing(connection, roster.snapshot(ctx, request_id)))
+                ctx.outgoing.append(OutgoingMessage(connection, roster.build_snapshot(ctx, request_id)))
         state = ctx.state
         return Decision(
             commands,
@@ -144,29 +140,29 @@ class Authority:
         )
 
     def snapshot(self) -> bytes:
-        """The whole state, as MessagePack."""
+        """Return the whole state, as MessagePack."""
         return _encoder.encode(self._ctx.state)
 
     def restore(self, data: bytes) -> None:
-        """Continues from a snapshot of a session that began with the same robots and objects, else `ValueError`.
+        """Continue from a snapshot of a session that began with the same robots and objects, else raise `ValueError`.
 
         Raises `msgspec.DecodeError` for bytes that are no snapshot.
         """
         state = _decoder.decode(data)
-        robots, objects = self._first if state.scene is None else (state.scene.robots, state.scene.objects)
+        robots, objects = self._initial_targets if state.scene is None else (state.scene.robots, state.scene.objects)
         had, have = [r.name for r in robots], [o.name for o in objects]
         if list(state.robots) != had or list(state.objects) != have:
             raise ValueError(
                 f"the snapshot has robots {list(state.robots)} and objects {list(state.objects)}, "
                 f"this session has {had} and {have}"
             )
-        self._ctx.use(robots, objects)
-        self._ctx.adopt(state)
-        self._commands = arbitration.Commands()
+        self._ctx.set_targets(robots, objects)
+        self._ctx.adopt_state(state)
+        self._commands = arbitration.CommandBuilder()
 
     @property
     def last_connection(self) -> int:
-        """Highest connection number that was ever let in: no other one may come again."""
+        """Highest connection number that was ever admitted: later ones must be higher."""
         return self._ctx.state.last_connection
 
     @property
@@ -181,7 +177,7 @@ class Authority:
 
     @property
     def patches(self) -> tuple[PatchOp, ...]:
-        """What has changed in how the scene is drawn since it was loaded."""
+        """Visual changes of the scene since it was loaded, merged."""
         return self._ctx.state.patches
 
     @property
@@ -189,18 +185,18 @@ class Authority:
         """`T_world_anchor` by id, as they are now."""
         return dict(self._ctx.state.anchors)
 
-    def alignment_reports(self) -> dict[str, AlignmentReport]:
-        """How the alignments of those who need one stand, by participant."""
+    def build_alignment_reports(self) -> dict[str, AlignmentReport]:
+        """Return the state of the alignment of each participant that needs one, by participant id."""
         people = self._ctx.state.participants.values()
-        return {p.id: anchoring.alignment_report(self._ctx, p) for p in people if p.needs_alignment}
+        return {p.id: anchoring.build_alignment_report(self._ctx, p) for p in people if p.needs_alignment}
 
-    def cross_check_reports(self) -> tuple[CrossCheckReport, ...]:
-        """The newest comparisons of headsets."""
-        return anchoring.cross_check_reports(self._ctx)
+    def build_cross_check_reports(self) -> tuple[CrossCheckReport, ...]:
+        """Return the newest cross-checks of headsets."""
+        return anchoring.build_cross_check_reports(self._ctx)
 
     # --- phases of a step ---
 
-    def _begin(
+    def _begin_step(
         self, now_ns: int, n_ticks: int, view: WorldView, control: Sequence[ControlStatus], *, resumed: bool
     ) -> None:
         ctx = self._ctx
@@ -211,21 +207,21 @@ class Authority:
         ctx.view, ctx.control = view, control
         ctx.state.step += 1
         ctx.clear_effects()
-        self._gap_seen = before is not None and now_ns - before > ctx.config.gap_ns
-        if before is not None and self._gap_seen and not resumed:
-            stops.gap(ctx, now_ns - before)
+        self._has_gap = before is not None and now_ns - before > ctx.config.gap_ns
+        if before is not None and self._has_gap and not resumed:
+            session_control.record_gap(ctx, now_ns - before)
 
-    def _urgent(self, entries: Sequence[Entry]) -> tuple[list[Entry], list[Entry]]:
-        """Applies the urgent lane and sorts the rest into requests and samples, within everyone's quota."""
+    def _apply_urgent_entries(self, entries: Sequence[Entry]) -> tuple[list[Entry], list[Entry]]:
+        """Apply the urgent entries and sort the rest into requests and samples, within each participant's quota."""
         ctx = self._ctx
         others: list[Entry] = []
         observed: list[Entry] = []
         spent: dict[int, int] = {}
-        self._gone: list[int] = []
-        self._released: list[tuple[int, int, frozenset[str]]] = []
+        self._ended_connections: list[int] = []
+        self._released_targets: list[tuple[int, int, frozenset[str]]] = []
         for index, entry in enumerate(entries):
             if isinstance(entry.message, URGENT):
-                self._apply_urgent(index, entry)
+                self._apply_urgent_entry(index, entry)
         for index, entry in enumerate(entries):
             m = entry.message
             if isinstance(m, URGENT):
@@ -236,11 +232,13 @@ class Authority:
             n = spent.get(entry.connection, 0) + 1
             spent[entry.connection] = n
             if n > ctx.config.quota and entry.connection != HOST:
-                self._over_quota(entry)
+                self._reject_over_quota(entry)
             elif isinstance(m, cm.Sample):
                 observed.append(entry)
-            elif isinstance(m, (cm.Acquire, cm.Grasp)) and self._released_again(index, entry.connection, m):
-                self._deny(entry, Denial(DenialReason.INVALID, "released again within the same step", "acquire again"))
+            elif isinstance(m, (cm.Acquire, cm.Grasp)) and self._is_released_again(index, entry.connection, m):
+                self._deny_entry(
+                    entry, Denial(DenialReason.INVALID, "released again within the same step", "acquire again")
+                )
             else:
                 others.append(entry)
             p = ctx.by_connection.get(entry.connection)
@@ -248,148 +246,148 @@ class Authority:
                 p.heard_ns, p.spared = min(entry.receive_ns, ctx.now_ns), False
         return others, observed
 
-    def _apply_urgent(self, index: int, entry: Entry) -> None:
+    def _apply_urgent_entry(self, index: int, entry: Entry) -> None:
         ctx, m = self._ctx, entry.message
         p = ctx.by_connection.get(entry.connection)
         if isinstance(m, cm.EStop):
-            # An honest stop must not fail on a stale envelope, nor because its sender was just given up or is not yet
-            # let in: the front takes it from anyone whose `hello` it has accepted.
-            stops.estop(ctx, p.id if p is not None else "", m)
+            # An honest stop must not fail on a stale envelope, nor because its sender was just disconnected or is not
+            # admitted yet: the front accepts it from every connection whose `hello` it has accepted.
+            session_control.latch_estop(ctx, p.id if p is not None else "", m)
         elif p is None:
             if isinstance(m, (em.Lost, cm.Bye)):
-                self._gone.append(entry.connection)
+                self._ended_connections.append(entry.connection)
             else:
-                samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
-                self._deny(entry, NOT_JOINED)
+                samples.count_rejection(ctx, None, "", RejectReason.CONNECTION_EPOCH)
+                self._deny_entry(entry, NOT_JOINED)
         elif isinstance(m, em.Lost):
-            roster.lose(ctx, p, m.reason)
-            self._gone.append(entry.connection)
+            roster.disconnect_participant(ctx, p, m.reason)
+            self._ended_connections.append(entry.connection)
         elif entry.connection_epoch != entry.connection:
-            samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
+            samples.count_rejection(ctx, p, "", RejectReason.CONNECTION_EPOCH)
         elif isinstance(m, cm.Bye):
-            roster.leave(ctx, p, m.reason)
-            self._gone.append(entry.connection)
+            roster.process_bye(ctx, p, m.reason)
+            self._ended_connections.append(entry.connection)
         elif isinstance(m, cm.Release):
-            leases.release(ctx, p, m)
-            self._released.append((index, entry.connection, frozenset(t.name for t in m.targets)))
+            leases.process_release(ctx, p, m)
+            self._released_targets.append((index, entry.connection, frozenset(t.name for t in m.targets)))
 
-    def _released_again(self, index: int, connection: int, m: cm.Acquire | cm.Grasp) -> bool:
-        """Whether a later release of this step, applied already, meant what this request asks for."""
+    def _is_released_again(self, index: int, connection: int, m: cm.Acquire | cm.Grasp) -> bool:
+        """Return true when a later release of this step, applied already, covers the targets of this request."""
         names = {m.object} if isinstance(m, cm.Grasp) else {*m.robots, *m.objects}
         return any(
             sender == connection and index < at and (not released or not names or names & released)
-            for at, sender, released in self._released
+            for at, sender, released in self._released_targets
         )
 
-    def _over_quota(self, entry: Entry) -> None:
+    def _reject_over_quota(self, entry: Entry) -> None:
         ctx, m = self._ctx, entry.message
         p = ctx.by_connection.get(entry.connection)
         if p is not None and isinstance(m, cm.Sample):
-            samples.reject(ctx, p, m, RejectReason.QUOTA)
+            samples.reject_sample(ctx, p, m, RejectReason.QUOTA)
         else:
-            samples.count(ctx, p, "", RejectReason.QUOTA)
+            samples.count_rejection(ctx, p, "", RejectReason.QUOTA)
             denial = Denial(DenialReason.QUOTA, f"more than {ctx.config.quota} messages in one step", "send less")
-            self._deny(entry, denial)
+            self._deny_entry(entry, denial)
 
-    def _deny(self, entry: Entry, denial: Denial) -> None:
-        """Answers a request that was not even looked at."""
+    def _deny_entry(self, entry: Entry, denial: Denial) -> None:
+        """Deny a request without processing it."""
         request_id = getattr(entry.message, "request_id", None)
         if request_id is not None:
-            self._ctx.outgoing.append(Outgoing(entry.connection, Reply(request_id, False, denial)))
+            self._ctx.outgoing.append(OutgoingMessage(entry.connection, Reply(request_id, False, denial)))
 
-    def _request(self, entry: Entry) -> None:
-        """Everything that is neither urgent nor a sample."""
+    def _apply_entry(self, entry: Entry) -> None:
+        """Apply an entry that is neither urgent nor a sample."""
         ctx, m = self._ctx, entry.message
         if isinstance(m, em.Join):
-            if entry.connection not in self._gone:
-                roster.join(ctx, entry.connection, m)
+            if entry.connection not in self._ended_connections:
+                roster.process_join(ctx, entry.connection, m)
             return
         p = ctx.by_connection.get(entry.connection)
         ctx.entry_ns = entry.receive_ns
         if p is None:
             if isinstance(m, FRONT_MADE):
                 return  # the connection was lost meanwhile
-            samples.count(ctx, None, "", RejectReason.CONNECTION_EPOCH)
-            self._deny(entry, NOT_JOINED)
+            samples.count_rejection(ctx, None, "", RejectReason.CONNECTION_EPOCH)
+            self._deny_entry(entry, NOT_JOINED)
         elif entry.connection_epoch != entry.connection and not isinstance(m, FRONT_MADE):
-            samples.count(ctx, p, "", RejectReason.CONNECTION_EPOCH)
+            samples.count_rejection(ctx, p, "", RejectReason.CONNECTION_EPOCH)
             denial = Denial(DenialReason.NOT_JOINED, "the envelope names another connection", "use the latest welcome")
-            self._deny(entry, denial)
-        elif isinstance(m, DIRECTING) and p.role != Role.DIRECTOR:
-            self._deny(entry, Denial(DenialReason.ROLE, f"role {p.role} may not do this", "ask a director"))
+            self._deny_entry(entry, denial)
+        elif isinstance(m, DIRECTOR_ONLY) and p.role != Role.DIRECTOR:
+            self._deny_entry(entry, Denial(DenialReason.ROLE, f"role {p.role} may not do this", "ask a director"))
         elif isinstance(m, HOST_ONLY):
             if p.id == HOST_ID:
-                self._host(m)
+                self._apply_host_entry(m)
         else:
             _HANDLERS[type(m)](ctx, p, m)
 
-    def _host(self, m: em.EntryMessage) -> None:
+    def _apply_host_entry(self, m: em.EntryMessage) -> None:
         ctx = self._ctx
         if isinstance(m, em.ExternalReset):
-            stops.new_scene(ctx, "external")
+            session_control.begin_scene_epoch(ctx, "external")
         elif isinstance(m, em.FrontRestarted):
-            roster.lose_everyone(ctx, "front_restarted")
+            roster.disconnect_all(ctx, "front_restarted")
         elif isinstance(m, em.RecordingGap):
             ctx.emit(Gap("recording", 0, m.rows))
         elif isinstance(m, em.Audit):
             ctx.emit(Audited(m.kind, m.subject, m.name, m.address, m.detail, m.count))
         elif isinstance(m, em.SessionResumed):
-            roster.lose_everyone(ctx, "session_resumed")
-            anchoring.give_anew(ctx, m.anchors)
-            stops.gap(ctx, m.gap_ns, "resumed")
-            roster.begin_grace_anew(ctx)
+            roster.disconnect_all(ctx, "session_resumed")
+            anchoring.replace_anchors(ctx, m.anchors)
+            session_control.record_gap(ctx, m.gap_ns, "resumed")
+            roster.restart_grace_periods(ctx)
         elif isinstance(m, em.SceneLoaded):
-            scenes.load(ctx, m)
-            self._commands = arbitration.Commands()
+            session_control.load_scene(ctx, m)
+            self._commands = arbitration.CommandBuilder()
         elif isinstance(m, em.ScenePatched):
-            scenes.patch(ctx, m)
-        elif isinstance(m, em.StalledGap) and not self._gap_seen:
-            self._gap_seen = True
-            stops.gap(ctx, m.duration_ns)
+            session_control.patch_scene(ctx, m)
+        elif isinstance(m, em.StalledGap) and not self._has_gap:
+            self._has_gap = True
+            session_control.record_gap(ctx, m.duration_ns)
 
 
-def _resumes(entry: Entry) -> bool:
-    """Whether a step begins with the news that the session goes on from a recording, which tells of the gap itself."""
+def _is_resume(entry: Entry) -> bool:
+    """Return true when the entry resumes the session from a recording; it reports the gap itself."""
     return entry.connection == HOST and isinstance(entry.message, em.SessionResumed)
 
 
-def _heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:
+def _process_heartbeat(ctx: Context, p: Participant, m: cm.Heartbeat) -> None:
     roster.set_worn(ctx, p, m.worn)
 
 
-def _marker(ctx: Context, p: Participant, m: cm.Marker) -> None:
+def _process_marker(ctx: Context, p: Participant, m: cm.Marker) -> None:
     ctx.emit(MarkerAdded(p.id, m.text))
     ctx.accept(p, m.request_id)
 
 
-def _get_snapshot(ctx: Context, p: Participant, m: cm.GetSnapshot) -> None:
+def _request_snapshot(ctx: Context, p: Participant, m: cm.GetSnapshot) -> None:
     ctx.snapshots[(p.connection, m.request_id)] = None
 
 
-def _observation(ctx: Context, p: Participant, m: cm.Observation) -> None:
-    """Kept in the journal only; the estimator in the front makes proposals of it."""
+def _ignore_observation(ctx: Context, p: Participant, m: cm.Observation) -> None:
+    """Do nothing: observations are only journaled; the estimator in the front makes proposals from them."""
 
 
 _HANDLERS: Final[dict[type, Callable[[Context, Participant, Any], None]]] = {
-    cm.Heartbeat: _heartbeat,
-    cm.GetSnapshot: _get_snapshot,
-    cm.Acquire: requests.acquire,
-    cm.Consent: requests.consent,
-    cm.Assign: requests.assign,
+    cm.Heartbeat: _process_heartbeat,
+    cm.GetSnapshot: _request_snapshot,
+    cm.Acquire: requests.acquire_targets,
+    cm.Consent: requests.answer_consent,
+    cm.Assign: requests.assign_robots,
     cm.SetMode: requests.set_mode,
-    cm.SetScale: scaling.set_scale,
-    cm.Grasp: requests.grasp,
-    cm.Observation: _observation,
-    em.AlignmentProposal: alignment.propose,
-    em.AlignmentAlarm: anchoring.alarm,
-    em.CrossChecked: anchoring.cross_checked,
-    cm.PlaceAlignment: alignment.place,
-    cm.Align: anchoring.align,
+    cm.SetScale: requests.set_scale,
+    cm.Grasp: requests.grasp_object,
+    cm.Observation: _ignore_observation,
+    em.AlignmentProposal: alignment.process_proposal,
+    em.AlignmentAlarm: anchoring.raise_alarm,
+    em.CrossChecked: anchoring.record_cross_check,
+    cm.PlaceAlignment: alignment.place_alignment,
+    cm.Align: anchoring.control_alignment_run,
     cm.MoveAnchor: anchoring.move_anchor,
-    cm.TrackingEpoch: alignment.tracking_epoch,
-    cm.Episode: episodes.episode,
-    cm.ClearEStop: stops.clear_estop,
-    cm.Control: stops.control,
-    cm.Marker: _marker,
-    RemoveParticipant: roster.remove_participant,
+    cm.TrackingEpoch: alignment.set_tracking_epoch,
+    cm.Episode: session_control.control_episode,
+    cm.ClearEStop: session_control.clear_estop,
+    cm.Control: session_control.control_session,
+    cm.Marker: _process_marker,
+    RemoveParticipant: roster.process_removal,
 }

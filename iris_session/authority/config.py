@@ -96,7 +96,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_residual_tilt_rad: float = 0.01745  # 1 degree: a warning
     min_change_m: float = 0.002  # smaller corrections of an accepted alignment are not worth a new version
     min_change_rad: float = 0.002
-    max_anchor_move_m: float = 5.0  # at once, without being told that it is meant: wrong units are seen by it
+    max_anchor_move_m: float = 5.0  # at once, unless forced: catches wrong units
     anchors: dict[str, Pose] = {}  # T_world_anchor by id, until a director moves one
     settle_ns: int = 15 * SECOND  # after the first alignment of a run; from then on corrections come gently
     slide_ns: int = 500 * MS  # between two parts of a correction that slides in
@@ -118,7 +118,7 @@ class AuthorityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_config(config: AuthorityConfig, robots: Sequence[RobotSpec], objects: Sequence[ObjectSpec]) -> None:
-    """Raises `ValueError` that says what would have been right."""
+    """Raise `ValueError` for a setting that cannot work; the message says which values can."""
     names = [r.name for r in robots]
     for kind, all_names in (("robot", names), ("object", [o.name for o in objects])):
         if len(set(all_names)) != len(all_names):

@@ -2,28 +2,28 @@
 
 A latch is armed by a counted sample with the clutch open, and fires with a counted sample with the clutch closed. Every
 disturbance (e-stop, gap, reset, rejection, takeover, resume, new tracking frame) disarms it, so that nothing moves
-before the person has let go and taken hold again.
+before the clutch was opened and closed again.
 """
 
 from __future__ import annotations
 
 from iris_session.authority.context import HUMAN, Context
-from iris_session.authority.state import NO_CONNECTION, Grant, LeaseState, Participant
+from iris_session.authority.state import NO_CONNECTION, LeaseGrant, LeaseState, Participant
 from iris_session.protocol.names import HoldReason, LeaseMode, TargetKind
 from iris_session.protocol.server_messages import EngagementChanged, Intervention, ObjectGrasped
 
 
-def _announce(ctx: Context, lease: LeaseState, g: Grant, engaged: bool, reason: str = "") -> None:
+def _emit_change(ctx: Context, lease: LeaseState, g: LeaseGrant, engaged: bool, reason: str = "") -> None:
     if lease.kind == TargetKind.OBJECT:
         ctx.emit(ObjectGrasped(lease.target, g.participant, g.device, engaged))
     else:
         ctx.emit(EngagementChanged(lease.target, g.participant, engaged, reason))
 
 
-def begin(ctx: Context, lease: LeaseState, g: Grant, p: Participant, device: str) -> None:
-    """Engages `g` with `device`; the alignment is frozen until the engagement ends."""
+def begin_engagement(ctx: Context, lease: LeaseState, g: LeaseGrant, p: Participant, device: str) -> None:
+    """Engage `g` with `device`; the alignment is frozen until the engagement ends."""
     if lease.mode == LeaseMode.PRIORITY and p.role in HUMAN and len(lease.grants) > 1 and not lease.override:
-        preempt(ctx, lease, p)
+        preempt_agent(ctx, lease, p)
     g.armed.remove(device)
     g.engagement = ctx.state.next_engagement
     ctx.state.next_engagement += 1
@@ -33,54 +33,54 @@ def begin(ctx: Context, lease: LeaseState, g: Grant, p: Participant, device: str
     if p.alignment is not None:
         g.alignment_version = p.alignment.version
         g.T_world_tracking = p.alignment.T_world_tracking
-    _announce(ctx, lease, g, True)
+    _emit_change(ctx, lease, g, True)
 
 
-def end(ctx: Context, lease: LeaseState, g: Grant, reason: str) -> None:
-    """Ends the engagement, if there is one: from this step on the target holds for `reason`."""
+def end_engagement(ctx: Context, lease: LeaseState, g: LeaseGrant, reason: str) -> None:
+    """End the engagement, if there is one: from this step on the target holds for `reason`."""
     if g.engagement:
-        _announce(ctx, lease, g, False, reason)
+        _emit_change(ctx, lease, g, False, reason)
         g.engagement = 0
         g.source = None
         g.gripper = None
     g.hold = reason
 
 
-def rearm(ctx: Context, lease: LeaseState, g: Grant, reason: str) -> None:
-    """Ends the engagement and disarms every latch of `g`: the clutch must open and close again."""
-    end(ctx, lease, g, reason)
+def rearm_grant(ctx: Context, lease: LeaseState, g: LeaseGrant, reason: str) -> None:
+    """End the engagement and disarm every latch of `g`: the clutch must open and close again."""
+    end_engagement(ctx, lease, g, reason)
     g.armed.clear()
 
 
 def rearm_participant(ctx: Context, p: Participant, reason: str) -> None:
-    """Rearms everything that `p` holds."""
-    for lease in ctx.leases_of(p):
+    """Rearm everything that `p` holds."""
+    for lease in ctx.list_leases(p):
         for g in lease.grants:
             if g.participant == p.id:
-                rearm(ctx, lease, g, reason)
+                rearm_grant(ctx, lease, g, reason)
 
 
 def rearm_all(ctx: Context, reason: str) -> None:
-    """Rearms everything in the session."""
+    """Rearm everything in the session."""
     for lease in (*ctx.state.robots.values(), *ctx.held_objects):
         for g in lease.grants:
-            rearm(ctx, lease, g, reason)
+            rearm_grant(ctx, lease, g, reason)
 
 
-def preempt(ctx: Context, lease: LeaseState, human: Participant) -> None:
-    """Mode `priority`: `human` takes the robot from the agent that drives it."""
+def preempt_agent(ctx: Context, lease: LeaseState, human: Participant) -> None:
+    """Let `human` override the agent that drives the robot (mode `priority`)."""
     agent = lease.grants[0]
-    rearm(ctx, lease, agent, HoldReason.INTERVENTION)
+    rearm_grant(ctx, lease, agent, HoldReason.INTERVENTION)
     lease.override, lease.override_ns = human.id, ctx.now_ns
-    ctx.publish(lease, "priority", agent.participant)
+    ctx.publish_lease(lease, "priority", agent.participant)
     ctx.emit(Intervention(lease.target, human.id, agent.participant, True))
 
 
-def give_back(ctx: Context, lease: LeaseState) -> None:
-    """Ends an intervention: the agent is in charge again, and must clutch again."""
+def end_intervention(ctx: Context, lease: LeaseState) -> None:
+    """End an intervention: the agent is in charge again, and must clutch again."""
     human, agent = lease.override, lease.grants[0]
     lease.override = ""
     lost = ctx.state.participants[agent.participant].connection == NO_CONNECTION
-    rearm(ctx, lease, agent, HoldReason.DISCONNECTED if lost else HoldReason.REARM)
-    ctx.publish(lease, "priority", human)
+    rearm_grant(ctx, lease, agent, HoldReason.DISCONNECTED if lost else HoldReason.REARM)
+    ctx.publish_lease(lease, "priority", human)
     ctx.emit(Intervention(lease.target, human, agent.participant, False))

@@ -1,112 +1,116 @@
-"""Granting, releasing and fencing of leases. Who may ask for what is decided in `requests`."""
+"""Granting, releasing and fencing of leases. `requests` decides which requests are granted."""
 
 from __future__ import annotations
 
 from iris_session.authority import engagement
-from iris_session.authority.context import Context, find_grant, no_such
-from iris_session.authority.state import KEPT, Grant, LeaseState, Participant, Pending
+from iris_session.authority.context import Context, build_unknown_denial, find_grant
+from iris_session.authority.state import NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
 from iris_session.protocol.client_messages import Release
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, HoldReason, LeaseMode, TargetKind
 from iris_session.protocol.server_messages import Feedback
 
 
-def held_by_other(ctx: Context, lease: LeaseState, action: str = "ask the holder to release it") -> Denial:
-    """The denial `held`, with the holder and what to do."""
-    holder = ctx.holder(lease)
+def build_held_denial(ctx: Context, lease: LeaseState, action: str = "ask the holder to release it") -> Denial:
+    """Return the denial `held`, with the holder and what to do."""
+    holder = ctx.get_holder(lease)
     name = ctx.state.participants[holder].name if holder else ""
     text = f"{lease.target} is held by {name}" if holder else f"others wait for {lease.target}"
     advice = f"{action}, or acquire with wait to queue for it"
     return Denial(DenialReason.HELD, text, advice, lease.target, holder, name)
 
 
-def revoke(ctx: Context, lease: LeaseState, g: Grant) -> None:
-    """Takes one grant away without publishing it."""
-    engagement.end(ctx, lease, g, HoldReason.REARM)
+def revoke_grant(ctx: Context, lease: LeaseState, g: LeaseGrant) -> None:
+    """Remove one grant without publishing the lease."""
+    engagement.end_engagement(ctx, lease, g, HoldReason.REARM)
     if lease.override and (g.participant == lease.override or g is lease.grants[0]):
-        # One side of an intervention is gone, so it is over: the other one alone is in charge.
-        engagement.give_back(ctx, lease)
+        # One side of an intervention has left, so it is over: the other one alone is in charge.
+        engagement.end_intervention(ctx, lease)
     lease.grants.remove(g)
     if lease.kind == TargetKind.OBJECT:
         if not lease.grants:
-            lease.lead = 0  # nobody holds it from here on: it may lie anywhere when it is next taken
-        ctx.refresh_held()
+            lease.lead = 0  # free from here on: it may lie anywhere when it is next taken
+        ctx.update_held_objects()
 
 
-def grant(ctx: Context, lease: LeaseState, p: Participant, cause: str, weight: float = 1.0, hand: str = "") -> None:
-    """Gives `lease` to `p`; who must give way loses it in the same step. Holding it already only sets the weight."""
+def grant_lease(
+    ctx: Context, lease: LeaseState, p: Participant, cause: str, weight: float = 1.0, hand: str = ""
+) -> None:
+    """Grant `lease` to `p`; grants that exclude it are revoked in the same step. For a holder only the
+    weight is set.
+    """
     own = find_grant(lease, p.id, hand)
     joins = lease.mode in (LeaseMode.SHARED, LeaseMode.PRIORITY) and cause != "assigned"
     if own is not None and own.hand == hand and (joins or len(lease.grants) == 1):
         if own.weight != weight and lease.mode == LeaseMode.SHARED:
             own.weight = weight
-            ctx.publish(lease, "acquired", ctx.holder(lease))
+            ctx.publish_lease(lease, "acquired", ctx.get_holder(lease))
         return
-    previous = ctx.holder(lease)
+    previous = ctx.get_holder(lease)
     if not joins:
-        clear(ctx, lease)
+        revoke_all(ctx, lease)
     lease.version += 1
-    scale = ctx.scale(lease) if lease.mode == LeaseMode.SHARED else ctx.plain_scale
-    lease.grants.append(Grant(p.id, lease.version, weight, hand, scale))
+    scale = ctx.get_scale(lease) if lease.mode == LeaseMode.SHARED else ctx.default_scale
+    lease.grants.append(LeaseGrant(p.id, lease.version, weight, hand, scale))
     if lease.kind == TargetKind.OBJECT:
-        ctx.refresh_held()
-    ctx.publish(lease, cause, previous if previous != p.id else "")
+        ctx.update_held_objects()
+    ctx.publish_lease(lease, cause, previous if previous != p.id else "")
 
 
-def clear(ctx: Context, lease: LeaseState) -> None:
-    """Takes a robot from everyone who holds it, and tells them so by feedback."""
+def revoke_all(ctx: Context, lease: LeaseState) -> None:
+    """Revoke every grant of a robot and notify the holders by feedback."""
     for g in tuple(lease.grants):
         old = ctx.state.participants[g.participant]
-        revoke(ctx, lease, g)
+        revoke_grant(ctx, lease, g)
         ctx.send(old, Feedback(lease.target, "hold", HoldReason.NO_LEASE, rejected=dict(old.rejected)))
 
 
-def free(ctx: Context, lease: LeaseState, p: Participant, cause: str) -> None:
-    """Ends every grant of `p` on one target and publishes the lease."""
-    previous = ctx.holder(lease)
+def release_target(ctx: Context, lease: LeaseState, p: Participant, cause: str) -> None:
+    """End every grant of `p` on one target and publish the lease."""
+    previous = ctx.get_holder(lease)
     for g in [g for g in lease.grants if g.participant == p.id]:
-        revoke(ctx, lease, g)
-    ctx.publish(lease, cause, previous)
+        revoke_grant(ctx, lease, g)
+    ctx.publish_lease(lease, cause, previous)
 
 
-def free_all(ctx: Context, p: Participant, cause: str) -> None:
-    """Ends everything that `p` holds or waits for."""
-    forget_requests(ctx, p, "")
-    for lease in ctx.leases_of(p):
-        free(ctx, lease, p, cause)
+def release_everything(ctx: Context, p: Participant, cause: str) -> None:
+    """End every grant and every pending request of `p`."""
+    cancel_requests(ctx, p, "")
+    for lease in ctx.list_leases(p):
+        release_target(ctx, lease, p, cause)
 
 
-def fence(ctx: Context, p: Participant) -> None:
-    """After a resume: new fencing tokens for everything `p` holds, so that nothing sent before it counts."""
-    for lease in ctx.leases_of(p):
+def renew_fencing_tokens(ctx: Context, p: Participant) -> None:
+    """Issue new fencing tokens for everything `p` holds after a resume, so that nothing sent before it counts."""
+    for lease in ctx.list_leases(p):
         lease.version += 1
         for g in lease.grants:
             if g.participant == p.id:
-                engagement.rearm(ctx, lease, g, HoldReason.REARM)
+                engagement.rearm_grant(ctx, lease, g, HoldReason.REARM)
                 g.version = lease.version
-        ctx.publish(lease, "resumed")
+        ctx.publish_lease(lease, "resumed")
 
 
-def release(ctx: Context, p: Participant, m: Release) -> None:
-    """The urgent `release`: named targets, or everything and every place in a queue."""
+def process_release(ctx: Context, p: Participant, m: Release) -> None:
+    """Process the urgent `release`: named targets, or everything and every place in a queue."""
     if not m.targets:
-        forget_requests(ctx, p, "you released everything")
-        held = ctx.leases_of(p)
+        cancel_requests(ctx, p, "you released everything")
+        held = ctx.list_leases(p)
         for own in held:
-            free(ctx, own, p, "released")
+            release_target(ctx, own, p, "released")
         return ctx.accept(p, m.request_id, held)
     chosen: list[LeaseState] = []
     for t in m.targets:
-        lease = ctx.lease(t.kind, t.name)
+        lease = ctx.find_lease(t.kind, t.name)
         grants = [g for g in lease.grants if g.participant == p.id] if lease is not None else []
         if t.kind not in (TargetKind.ROBOT, TargetKind.OBJECT):
             known = f"kinds: {TargetKind.ROBOT}, {TargetKind.OBJECT}"
             return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown kind {t.kind}", known))
         if lease is None:
             there = ctx.robots if t.kind == TargetKind.ROBOT else ctx.objects
-            return ctx.deny(p, m.request_id, no_such(t.kind, t.name, there))
+            return ctx.deny(p, m.request_id, build_unknown_denial(t.kind, t.name, there))
         if not grants:
-            text, holder = f"you do not hold {t.name}", ctx.holder(lease)
+            text, holder = f"you do not hold {t.name}", ctx.get_holder(lease)
             return ctx.deny(p, m.request_id, Denial(DenialReason.NOT_HOLDER, text, "", t.name, holder))
         if not any(g.version <= t.lease_version <= lease.version for g in grants):
             text = f"{t.name}: lease version {t.lease_version} is not yours"
@@ -115,25 +119,27 @@ def release(ctx: Context, p: Participant, m: Release) -> None:
         if lease not in chosen:
             chosen.append(lease)
     for own in chosen:
-        free(ctx, own, p, "released")
+        release_target(ctx, own, p, "released")
     return ctx.accept(p, m.request_id, chosen)
 
 
-def forget_requests(ctx: Context, p: Participant, why: str, *, keeps_place: bool = False) -> None:
-    """Drops what `p` waits for; answers it with `why` unless that is empty (the participant is gone). `keeps_place`:
-    its place in the queue stays, and nobody waits for the answer."""
+def cancel_requests(ctx: Context, p: Participant, why: str, *, keeps_place: bool = False) -> None:
+    """Cancel the pending requests of `p`, denied with `why` unless that is empty (the participant is removed).
+
+    `keeps_place`: its place in the queue stays, without a request to answer.
+    """
     for pending in (*ctx.state.queue, *ctx.state.consents):
         if pending.participant == p.id and keeps_place and pending in ctx.state.queue:
-            pending.request_id = KEPT
+            pending.request_id = NO_REPLY
         elif pending.participant == p.id:
-            drop_request(ctx, pending)
-            if why and pending.request_id != KEPT:
+            remove_request(ctx, pending)
+            if why and pending.request_id != NO_REPLY:
                 text = f"no longer waiting: {why}"
                 ctx.deny(p, pending.request_id, Denial(DenialReason.NOT_HOLDER, text, "acquire again to wait again"))
 
 
-def drop_request(ctx: Context, pending: Pending) -> None:
-    """Takes one unanswered request off its list and publishes the queues it stood in."""
+def remove_request(ctx: Context, pending: Pending) -> None:
+    """Remove one unanswered request and publish the queues it stood in."""
     ctx.state.consents = [other for other in ctx.state.consents if other is not pending]
     waiting = len(ctx.state.queue)
     ctx.state.queue = [other for other in ctx.state.queue if other is not pending]
@@ -142,7 +148,7 @@ def drop_request(ctx: Context, pending: Pending) -> None:
 
 
 def publish_queues(ctx: Context, pending: Pending) -> None:
-    """Shows everyone the queues that `pending` has joined or left."""
+    """Publish the queues that `pending` has joined or left."""
     for lease in ctx.state.robots.values():
         if pending.any_robot or lease.target in pending.robots:
-            ctx.publish(lease, "queue", ctx.holder(lease))
+            ctx.publish_lease(lease, "queue", ctx.get_holder(lease))

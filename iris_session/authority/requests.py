@@ -1,91 +1,101 @@
-"""Requests for leases: acquire (all or none), queue, consent, grasp, and a director's assign and set_mode.
+"""Requests for leases: acquire (all or none), queue, consent, grasp, a director's assign and set_mode, motion scaling.
 
 No deadlock: a waiting request takes nothing until everything it wants is free, later requests do not overtake it, and
-nobody waits while holding a robot. Every request gets exactly one reply, when it is decided.
+no holder of a robot may wait for another. Every request gets exactly one reply, when it is decided.
+
+Motion scaling is how far a robot moves as its holder's hand moves. It belongs to the grant, so it ends with it. The
+scale of a robot is that of the grant in charge (`Context.get_scale`). In mode `shared` one scale is set for all
+sharers, and a new one inherits it. In mode `priority` agent and human each keep their own, so an intervention at a
+tenth of the speed leaves the agent's alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from iris_session.authority import assignment, engagement, leases
-from iris_session.authority.context import HUMAN, Context, find_grant, no_such, some
-from iris_session.authority.leases import held_by_other
-from iris_session.authority.state import KEPT, NO_CONNECTION, LeaseState, Participant, Pending
-from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode
+from iris_session.authority.context import HUMAN, Context, build_unknown_denial, find_grant, join_names
+from iris_session.authority.leases import build_held_denial
+from iris_session.authority.state import NO_CONNECTION, NO_REPLY, LeaseGrant, LeaseState, Participant, Pending
+from iris_session.protocol.client_messages import Acquire, Assign, Consent, Grasp, SetMode, SetScale
 from iris_session.protocol.common import Denial
 from iris_session.protocol.names import DenialReason, Device, HoldReason, LeaseMode, Role
-from iris_session.protocol.server_messages import ConsentRequested
+from iris_session.protocol.server_messages import ConsentRequested, ScaleChanged
 
 #: Weights of sharers differ by at most a factor of a million, so that normalising them is exact enough.
 MIN_WEIGHT: Final = 1e-3
 
 
-def acquire(ctx: Context, p: Participant, m: Acquire) -> None:
-    """All or none of the named robots and objects; without names, what the assignment policy chooses."""
+def acquire_targets(ctx: Context, p: Participant, m: Acquire) -> None:
+    """Acquire all or none of the named robots and objects; without names, those that the assignment policy chooses."""
     if ctx.state.queue:
-        advance(ctx)  # what was freed earlier in this step belongs to those who wait for it
+        advance_requests(ctx)  # robots freed earlier in this step belong to the queue
     robots, objects = tuple(dict.fromkeys(m.robots)), tuple(dict.fromkeys(m.objects))
-    denial = _acquire_denial(ctx, p, m, robots, objects)
+    denial = _check_acquire(ctx, p, m, robots, objects)
     any_robot = not robots and not objects
     if denial is None and any_robot:
-        chosen = assignment.choose(ctx, p, _free_robots(ctx, p))
+        chosen = assignment.choose_robots(ctx, p, _list_free_robots(ctx, p))
         if isinstance(chosen, Denial):
             denial = chosen
         elif not chosen and not m.wait:
-            denial = _none_free(ctx)
+            denial = _build_none_free_denial(ctx)
         else:
             robots, any_robot = chosen, not chosen
     if denial is not None:
         return ctx.deny(p, m.request_id, denial)
     pending = Pending(p.id, m.request_id, robots, objects, float(m.weight), any_robot)
-    denial, consent = _obstacles(ctx, p, pending, ctx.state.queue)
+    denial, consent = _find_obstacles(ctx, p, pending, ctx.state.queue)
     if denial is not None or any_robot:
-        return _queue(ctx, p, pending, denial) if m.wait else ctx.deny(p, m.request_id, denial or _none_free(ctx))
-    return _ask_consent(ctx, p, pending, consent) if consent else _fulfil(ctx, p, pending, "acquired")
+        return (
+            _enqueue_request(ctx, p, pending, denial)
+            if m.wait
+            else ctx.deny(p, m.request_id, denial or _build_none_free_denial(ctx))
+        )
+    return _ask_consent(ctx, p, pending, consent) if consent else _grant_request(ctx, p, pending, "acquired")
 
 
-def _acquire_denial(
+def _check_acquire(
     ctx: Context, p: Participant, m: Acquire, robots: tuple[str, ...], objects: tuple[str, ...]
 ) -> Denial | None:
-    denial = _role_denial(p)
+    denial = _check_role(p)
     if denial is not None:
         return denial
     for name in robots:
         if name not in ctx.robots:
-            return no_such("robot", name, ctx.robots)
+            return build_unknown_denial("robot", name, ctx.robots)
     for name in objects:
         if name not in ctx.objects:
-            return no_such("object", name, ctx.objects)
+            return build_unknown_denial("object", name, ctx.objects)
     if not MIN_WEIGHT <= m.weight <= 1.0 / MIN_WEIGHT:
         text = f"weight {m.weight} is not between {MIN_WEIGHT} and {1.0 / MIN_WEIGHT:g}"
         return Denial(DenialReason.INVALID, text, "use 1.0")
-    return assignment.permitted(ctx, p, robots) if robots else None
+    return assignment.check_policy(ctx, p, robots) if robots else None
 
 
-def _role_denial(p: Participant) -> Denial | None:
+def _check_role(p: Participant) -> Denial | None:
     if p.role in Role.DRIVING:
         return None
     may = ", ".join(sorted(Role.DRIVING))
     return Denial(DenialReason.ROLE, f"role {p.role} may not hold anything", f"join as one of: {may}")
 
 
-def _none_free(ctx: Context) -> Denial:
+def _build_none_free_denial(ctx: Context) -> Denial:
     robots = list(ctx.state.robots.values())
     if not robots:
         return Denial(DenialReason.UNKNOWN_TARGET, "this session has no robots", "acquire objects by name")
-    return held_by_other(ctx, robots[0], "no robot is free: ask a holder to release one")
+    return build_held_denial(ctx, robots[0], "no robot is free: ask a holder to release one")
 
 
-def _free_robots(ctx: Context, p: Participant) -> list[str]:
+def _list_free_robots(ctx: Context, p: Participant) -> list[str]:
     reserved = [name for waiting in ctx.state.queue if waiting.participant != p.id for name in waiting.robots]
     return [n for n, lease in ctx.state.robots.items() if not lease.grants and n not in reserved]
 
 
-def _obstacles(
+def _find_obstacles(
     ctx: Context, p: Participant, pending: Pending, ahead: list[Pending]
 ) -> tuple[Denial | None, list[LeaseState]]:
-    """What stands in the way of a request: a denial, or the robots whose holders must consent."""
+    """Return what prevents a request: a denial, or the robots whose holders must consent."""
     consent: list[LeaseState] = []
     for name in pending.robots:
         lease = ctx.state.robots[name]
@@ -93,20 +103,20 @@ def _obstacles(
             continue
         if not lease.grants:
             if any(w.participant != p.id and name in w.robots for w in ahead):
-                return held_by_other(ctx, lease), []
+                return build_held_denial(ctx, lease), []
         elif lease.mode == LeaseMode.REQUEST:
             consent.append(lease)
-        elif not _gives_way(ctx, p, lease):
-            return held_by_other(ctx, lease), []
+        elif not _admits_at_once(ctx, p, lease):
+            return build_held_denial(ctx, lease), []
     for name in pending.objects:
         lease = ctx.state.objects[name]
         if find_grant(lease, p.id) is None and len(lease.grants) >= ctx.config.max_sub_holders:
-            return held_by_other(ctx, lease), []
+            return build_held_denial(ctx, lease), []
     return None, consent
 
 
-def _gives_way(ctx: Context, p: Participant, lease: LeaseState) -> bool:
-    """Whether the mode of a held robot lets `p` in at once."""
+def _admits_at_once(ctx: Context, p: Participant, lease: LeaseState) -> bool:
+    """Return true when the mode of a held robot admits `p` at once."""
     if lease.mode == LeaseMode.TAKEOVER:
         return True
     if lease.mode == LeaseMode.SHARED:
@@ -117,32 +127,32 @@ def _gives_way(ctx: Context, p: Participant, lease: LeaseState) -> bool:
     return False
 
 
-def _fulfil(ctx: Context, p: Participant, pending: Pending, cause: str) -> None:
+def _grant_request(ctx: Context, p: Participant, pending: Pending, cause: str) -> None:
     granted = []
     for name in pending.robots:
         lease = ctx.state.robots[name]
         taken = lease.mode == LeaseMode.TAKEOVER and lease.grants
-        leases.grant(ctx, lease, p, "takeover" if taken else cause, pending.weight)
+        leases.grant_lease(ctx, lease, p, "takeover" if taken else cause, pending.weight)
         granted.append(lease)
     for name in pending.objects:
-        leases.grant(ctx, ctx.state.objects[name], p, "acquired")
+        leases.grant_lease(ctx, ctx.state.objects[name], p, "acquired")
         granted.append(ctx.state.objects[name])
-    if pending.request_id != KEPT:
+    if pending.request_id != NO_REPLY:
         ctx.accept(p, pending.request_id, granted)
     if pending.robots:
-        leases.forget_requests(ctx, p, "you hold a robot now")
+        leases.cancel_requests(ctx, p, "you hold a robot now")
 
 
-def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None) -> None:
+def _enqueue_request(ctx: Context, p: Participant, pending: Pending, denial: Denial | None) -> None:
     state = ctx.state
     held = [lease.target for lease in state.robots.values() if any(g.participant == p.id for g in lease.grants)]
     if held:
-        text = f"who holds a robot cannot wait for another: you hold {some(held)}"
+        text = f"who holds a robot cannot wait for another: you hold {join_names(held)}"
         denial = Denial(
             DenialReason.HELD, text, "release it and acquire all robots in one request", held[0], p.id, p.name
         )
         return ctx.deny(p, pending.request_id, denial)
-    if _takes_kept_place(ctx, pending):
+    if _resume_kept_place(ctx, pending):
         return None
     if any(w.participant == p.id for w in state.queue) or len(state.queue) >= ctx.config.max_queue:
         full = Denial(DenialReason.QUEUE_FULL, "you wait already, or the queue is full", "release to leave the queue")
@@ -152,26 +162,26 @@ def _queue(ctx: Context, p: Participant, pending: Pending, denial: Denial | None
     return None
 
 
-def _takes_kept_place(ctx: Context, pending: Pending) -> bool:
-    """Whether this is asked again by somebody whose place was kept; who asks for something else gives it up."""
-    kept = next((w for w in ctx.state.queue if w.participant == pending.participant and w.request_id == KEPT), None)
+def _resume_kept_place(ctx: Context, pending: Pending) -> bool:
+    """Return true when `pending` repeats the request whose place was kept; any other request gives that place up."""
+    kept = next((w for w in ctx.state.queue if w.participant == pending.participant and w.request_id == NO_REPLY), None)
     if kept is None:
         return False
-    if _wish(kept) == _wish(pending):
+    if _get_request_key(kept) == _get_request_key(pending):
         kept.request_id, kept.weight = pending.request_id, pending.weight
         return True
-    leases.drop_request(ctx, kept)
+    leases.remove_request(ctx, kept)
     return False
 
 
-def _wish(pending: Pending) -> tuple[object, ...]:
+def _get_request_key(pending: Pending) -> tuple[object, ...]:
     return (pending.any_robot, () if pending.any_robot else pending.robots, pending.objects)
 
 
-def advance(ctx: Context) -> None:
-    """Grants what has become free, in the order of the requests, and ends consents that nobody answered.
+def advance_requests(ctx: Context) -> None:
+    """Grant what has become free, in the order of the requests, and end consents that timed out.
 
-    Who keeps a place and is not back yet is waited for.
+    A kept place of a disconnected participant blocks those behind it.
     """
     for pending in tuple(ctx.state.consents):
         if not any(pending is other for other in ctx.state.consents):
@@ -181,9 +191,9 @@ def advance(ctx: Context) -> None:
             if not ctx.state.robots[name].grants:
                 del pending.consents[consent_id]
         if not pending.consents:
-            _consented(ctx, p, pending)
+            _complete_consent(ctx, p, pending)
         elif ctx.now_ns >= pending.expires_ns:
-            leases.drop_request(ctx, pending)
+            leases.remove_request(ctx, pending)
             text = f"no answer within {ctx.config.consent_timeout_ns / 1e9:g} s"
             ctx.deny(p, pending.request_id, Denial(DenialReason.CONSENT_REFUSED, text, "ask the holder in person"))
     ahead: list[Pending] = []
@@ -193,20 +203,20 @@ def advance(ctx: Context) -> None:
         p = ctx.state.participants[pending.participant]
         if pending.any_robot:
             reserved = [name for w in ahead for name in w.robots]
-            chosen = assignment.choose(ctx, p, [n for n in _unheld(ctx) if n not in reserved])
+            chosen = assignment.choose_robots(ctx, p, [n for n in _list_unheld_robots(ctx) if n not in reserved])
             pending.robots = () if isinstance(chosen, Denial) else chosen
             ready = bool(pending.robots)
         else:
-            denial, consent = _obstacles(ctx, p, pending, ahead)
+            denial, consent = _find_obstacles(ctx, p, pending, ahead)
             ready = denial is None and not consent
         if ready and p.connection != NO_CONNECTION:
-            leases.drop_request(ctx, pending)
-            _fulfil(ctx, p, pending, "acquired")
+            leases.remove_request(ctx, pending)
+            _grant_request(ctx, p, pending, "acquired")
         else:
             ahead.append(pending)
 
 
-def _unheld(ctx: Context) -> list[str]:
+def _list_unheld_robots(ctx: Context) -> list[str]:
     return [name for name, lease in ctx.state.robots.items() if not lease.grants]
 
 
@@ -218,7 +228,9 @@ def _ask_consent(ctx: Context, p: Participant, pending: Pending, robots: list[Le
     for lease in robots:
         if lease.target in asked:
             text = f"someone already asked for {lease.target}"
-            denial = Denial(DenialReason.CONSENT_PENDING, text, "wait for the answer", lease.target, ctx.holder(lease))
+            denial = Denial(
+                DenialReason.CONSENT_PENDING, text, "wait for the answer", lease.target, ctx.get_holder(lease)
+            )
             return ctx.deny(p, pending.request_id, denial)
     if any(other.participant == p.id for other in ctx.state.consents):
         text = "you asked already, and nobody has answered yet"
@@ -232,13 +244,13 @@ def _ask_consent(ctx: Context, p: Participant, pending: Pending, robots: list[Le
         consent_id = ctx.state.next_consent
         ctx.state.next_consent += 1
         pending.consents[consent_id] = lease.target
-        ctx.emit(ConsentRequested(consent_id, lease.target, p.id, ctx.holder(lease)))
+        ctx.emit(ConsentRequested(consent_id, lease.target, p.id, ctx.get_holder(lease)))
     ctx.state.consents.append(pending)
     return None
 
 
-def consent(ctx: Context, p: Participant, m: Consent) -> None:
-    """A holder's or director's answer to `consent_requested`."""
+def answer_consent(ctx: Context, p: Participant, m: Consent) -> None:
+    """Process a holder's or director's answer to `consent_requested`."""
     pending = next((c for c in ctx.state.consents if m.consent_id in c.consents), None)
     if pending is None:
         text = f"no request {m.consent_id} waits for consent"
@@ -246,40 +258,40 @@ def consent(ctx: Context, p: Participant, m: Consent) -> None:
     lease = ctx.state.robots[pending.consents[m.consent_id]]
     if p.role != Role.DIRECTOR and not any(g.participant == p.id for g in lease.grants):
         text = "only the holder or a director can consent"
-        return ctx.deny(p, m.request_id, Denial(DenialReason.ROLE, text, "", lease.target, ctx.holder(lease)))
+        return ctx.deny(p, m.request_id, Denial(DenialReason.ROLE, text, "", lease.target, ctx.get_holder(lease)))
     requester = ctx.state.participants[pending.participant]
     ctx.accept(p, m.request_id)
     if not m.grant:
-        leases.drop_request(ctx, pending)
-        denial = Denial(DenialReason.CONSENT_REFUSED, f"{p.name} said no", "", lease.target, ctx.holder(lease))
+        leases.remove_request(ctx, pending)
+        denial = Denial(DenialReason.CONSENT_REFUSED, f"{p.name} said no", "", lease.target, ctx.get_holder(lease))
         return ctx.deny(requester, pending.request_id, denial)
     del pending.consents[m.consent_id]
-    pending.granted[lease.target] = ctx.holder(lease)
-    return None if pending.consents else _consented(ctx, requester, pending)
+    pending.granted[lease.target] = ctx.get_holder(lease)
+    return None if pending.consents else _complete_consent(ctx, requester, pending)
 
 
-def _consented(ctx: Context, p: Participant, pending: Pending) -> None:
-    leases.drop_request(ctx, pending)
-    denial, consent = _obstacles(ctx, p, pending, ctx.state.queue)
-    # Consent is that of one holder: somebody may have taken one of the robots since.
-    unasked = [lease for lease in consent if pending.granted.get(lease.target) != ctx.holder(lease)]
+def _complete_consent(ctx: Context, p: Participant, pending: Pending) -> None:
+    leases.remove_request(ctx, pending)
+    denial, consent = _find_obstacles(ctx, p, pending, ctx.state.queue)
+    # Consent is that of one holder: one of the robots may have another holder since.
+    unasked = [lease for lease in consent if pending.granted.get(lease.target) != ctx.get_holder(lease)]
     if denial is None and unasked:
-        denial = held_by_other(ctx, unasked[0])
+        denial = build_held_denial(ctx, unasked[0])
     if denial is not None:
         ctx.deny(p, pending.request_id, denial)
     else:
-        _fulfil(ctx, p, pending, "consent")
+        _grant_request(ctx, p, pending, "consent")
 
 
 # --- objects and directors ---
 
 
-def grasp(ctx: Context, p: Participant, m: Grasp) -> None:
-    """A hand takes a free object; several hands may hold one."""
-    denial = _role_denial(p)
+def grasp_object(ctx: Context, p: Participant, m: Grasp) -> None:
+    """Grant a free object to a hand; several hands may hold one."""
+    denial = _check_role(p)
     lease = ctx.state.objects.get(m.object)
     if denial is None and lease is None:
-        denial = no_such("object", m.object, ctx.objects)
+        denial = build_unknown_denial("object", m.object, ctx.objects)
     if denial is None and m.device not in Device.ALL:
         known = f"devices: {', '.join(sorted(Device.ALL))}"
         denial = Denial(DenialReason.UNKNOWN_VALUE, f"unknown device {m.device}", known)
@@ -289,53 +301,108 @@ def grasp(ctx: Context, p: Participant, m: Grasp) -> None:
         return ctx.deny(p, m.request_id, denial) if denial is not None else None
     own = any(g.participant == p.id and g.hand == m.device for g in lease.grants)
     if not own and len(lease.grants) >= ctx.config.max_sub_holders:
-        return ctx.deny(p, m.request_id, held_by_other(ctx, lease))
-    leases.grant(ctx, lease, p, "acquired", hand=m.device)
+        return ctx.deny(p, m.request_id, build_held_denial(ctx, lease))
+    leases.grant_lease(ctx, lease, p, "acquired", hand=m.device)
     return ctx.accept(p, m.request_id, (lease,))
 
 
-def assign(ctx: Context, p: Participant, m: Assign) -> None:
-    """A director gives robots to a participant, or frees them."""
-    person = ctx.person(m.participant) if m.participant else None
+def assign_robots(ctx: Context, p: Participant, m: Assign) -> None:
+    """Assign robots to a participant for a director, or free them."""
+    person = ctx.find_participant(m.participant) if m.participant else None
     if m.participant and person is None:
         text = f"no participant {m.participant}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_PARTICIPANT, text, "use an id of the roster"))
-    denial = _role_denial(person) if person is not None else None
+    denial = _check_role(person) if person is not None else None
     unknown = next((name for name in m.robots if name not in ctx.robots), None)
     if unknown is not None:
-        denial = no_such("robot", unknown, ctx.robots)
+        denial = build_unknown_denial("robot", unknown, ctx.robots)
     if denial is not None:
         return ctx.deny(p, m.request_id, denial)
     chosen = [ctx.state.robots[name] for name in dict.fromkeys(m.robots)]
     for lease in chosen:
         if person is not None:
-            leases.grant(ctx, lease, person, "assigned")
+            leases.grant_lease(ctx, lease, person, "assigned")
         elif lease.grants:
-            previous = ctx.holder(lease)
-            leases.clear(ctx, lease)
-            ctx.publish(lease, "assigned", previous)
+            previous = ctx.get_holder(lease)
+            leases.revoke_all(ctx, lease)
+            ctx.publish_lease(lease, "assigned", previous)
     if person is not None and chosen:
-        leases.forget_requests(ctx, person, "a director assigned you a robot")
+        leases.cancel_requests(ctx, person, "a director assigned you a robot")
     return ctx.accept(p, m.request_id, chosen)
 
 
 def set_mode(ctx: Context, p: Participant, m: SetMode) -> None:
-    """A director changes the mode of a robot. Of several holders only the one in charge stays, unless it is shared."""
+    """Change the mode of a robot for a director. Of several holders only the one in charge stays, unless it is
+    shared.
+    """
     lease = ctx.state.robots.get(m.robot)
     if lease is None:
-        return ctx.deny(p, m.request_id, no_such("robot", m.robot, ctx.robots))
+        return ctx.deny(p, m.request_id, build_unknown_denial("robot", m.robot, ctx.robots))
     if m.mode not in LeaseMode.ALL:
         known = f"modes: {', '.join(sorted(LeaseMode.ALL))}"
         return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown mode {m.mode}", known))
     if m.mode != lease.mode:
-        in_charge = ctx.holder(lease)
+        in_charge = ctx.get_holder(lease)
         if lease.override:
-            engagement.give_back(ctx, lease)
+            engagement.end_intervention(ctx, lease)
         if m.mode != LeaseMode.SHARED:
             for g in [g for g in lease.grants if g.participant != in_charge]:
-                leases.revoke(ctx, lease, g)
+                leases.revoke_grant(ctx, lease, g)
         for g in lease.grants:
-            engagement.rearm(ctx, lease, g, HoldReason.REARM)
+            engagement.rearm_grant(ctx, lease, g, HoldReason.REARM)
         lease.mode = m.mode
-        ctx.publish(lease, "mode", in_charge)
+        ctx.publish_lease(lease, "mode", in_charge)
     return ctx.accept(p, m.request_id, (lease,))
+
+
+# --- motion scaling ---
+
+
+def set_scale(ctx: Context, p: Participant, m: SetScale) -> None:
+    """Set the scale of a holder's own grants, for a director that of the grant in charge; all robots or none."""
+    low, high = ctx.config.min_scale, ctx.config.max_scale
+    if not low <= m.scale <= high:  # a scale that is no number is in no range
+        advice = f"use a scale from {low:g} to {high:g}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, f"scale {m.scale:g} is out of range", advice))
+    names = tuple(dict.fromkeys(m.robots)) or _list_held_robots(ctx, p)
+    denial = _check_scale_targets(ctx, p, names)
+    if denial is not None:
+        return ctx.deny(p, m.request_id, denial)
+    chosen = [ctx.state.robots[name] for name in names]
+    for lease in chosen:
+        before = ctx.get_scale(lease)
+        for g in _list_scaled_grants(ctx, p, lease):
+            g.scale = float(m.scale)
+        if ctx.get_scale(lease) != before:
+            ctx.emit(ScaleChanged(lease.target, ctx.get_scale(lease), p.id))
+    return ctx.accept(p, m.request_id, chosen)
+
+
+def _list_held_robots(ctx: Context, p: Participant) -> tuple[str, ...]:
+    return tuple(n for n, lease in ctx.state.robots.items() if any(g.participant == p.id for g in lease.grants))
+
+
+def _check_scale_targets(ctx: Context, p: Participant, names: Sequence[str]) -> Denial | None:
+    if not names:
+        return Denial(DenialReason.NOT_HOLDER, "you hold no robot", "acquire one first, or name robots")
+    for name in names:
+        lease = ctx.state.robots.get(name)
+        if lease is None:
+            return build_unknown_denial("robot", name, ctx.robots)
+        if not _list_scaled_grants(ctx, p, lease):
+            holder = ctx.get_holder(lease)
+            held_by = ctx.state.participants[holder].name if holder else "nobody"
+            advice = "acquire it first, or ask its holder" if holder else "acquire it first"
+            text = f"{name} is held by {held_by}"
+            return Denial(DenialReason.NOT_HOLDER, text, advice, name, holder, held_by if holder else "")
+    return None
+
+
+def _list_scaled_grants(ctx: Context, p: Participant, lease: LeaseState) -> list[LeaseGrant]:
+    """Return the grants whose scale `p` sets; empty when it may not."""
+    own = [g for g in lease.grants if g.participant == p.id]
+    if lease.mode == LeaseMode.SHARED and (own or p.role == Role.DIRECTOR):
+        return lease.grants
+    if own or p.role != Role.DIRECTOR:
+        return own
+    return [g for g in lease.grants if g.participant == ctx.get_holder(lease)]

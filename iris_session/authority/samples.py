@@ -1,4 +1,4 @@
-"""Which samples count: every check of docs/protocol.md section 6 with its typed reason, and what a rejection does.
+"""Checks of samples: every one of docs/protocol.md section 6 with its typed reason, and the effects of a rejection.
 
 A rejection rearms only the latches of the sending participant's own device on the targets it names and holds. An old
 `seq` is only counted. NaN and infinity may arrive in any float: they are compared so that they fail.
@@ -9,20 +9,22 @@ from __future__ import annotations
 import math
 
 from anchors.pose import distance, quat_angle
-from iris_session.authority import alignment, engagement, stated_error, telling
+from iris_session.authority import alignment, engagement
 from iris_session.authority.context import Context, find_grant
-from iris_session.authority.state import DeviceState, Grant, JointsSeen, LeaseState, Participant, Rejections
+from iris_session.authority.state import DeviceState, JointReading, LeaseGrant, LeaseState, Participant, Rejections
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import Device, HoldReason, LeaseMode, RejectReason, Role, SampleKind, TargetKind
 from iris_session.protocol.server_messages import SamplesRejected
 
-Drive = tuple[LeaseState, Grant]
+Drive = tuple[LeaseState, LeaseGrant]
 UNSEEN = DeviceState()
 
 
-def check(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
-    """The `RejectReason` of a sample, or empty when it counts; then `drives` holds its targets' leases and grants."""
+def check_sample(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Drive]) -> str:
+    """Return the `RejectReason` of a sample, or empty when it counts; then `drives` holds its targets' leases and
+    grants.
+    """
     if entry.connection_epoch != entry.connection:
         return RejectReason.CONNECTION_EPOCH
     if s.device not in Device.ALL or s.kind not in SampleKind.ALL:
@@ -36,20 +38,20 @@ def check(ctx: Context, p: Participant, entry: Entry, s: Sample, drives: list[Dr
         return RejectReason.SCENE_EPOCH
     if s.tracking_epoch != p.tracking_epoch:
         return RejectReason.TRACKING_EPOCH
-    reason = _time(ctx, entry, s)
+    reason = _check_time(ctx, entry, s)
     if not reason and s.targets:
-        reason = _targets(ctx, p, s, drives)
+        reason = _check_targets(ctx, p, s, drives)
     if not reason:
-        reason = _alignment(p, s, drives)
+        reason = _check_alignment(p, s, drives)
     if not reason:
-        reason = _numbers(ctx, s)
+        reason = _check_numbers(ctx, s)
     if not reason and s.tracked and s.worn:
-        reason = _payload(ctx, s, seen) or (_engaging(ctx, p, s, drives) if s.clutch else "")
+        reason = _check_payload(ctx, s, seen) or (_check_engagement(ctx, p, s, drives) if s.clutch else "")
     return reason
 
 
-def _time(ctx: Context, entry: Entry, s: Sample) -> str:
-    """Fresh and not from the future, by the capture time and by the time of receipt."""
+def _check_time(ctx: Context, entry: Entry, s: Sample) -> str:
+    """Reject stale samples and those from the future, by the capture time and by the time of receipt."""
     oldest = ctx.now_ns - ctx.config.freshness_ns
     if s.capture_ns < oldest or entry.receive_ns < oldest:
         return RejectReason.STALE
@@ -58,13 +60,13 @@ def _time(ctx: Context, entry: Entry, s: Sample) -> str:
     return RejectReason.FUTURE if entry.receive_ns - ctx.now_ns > ctx.config.future_ns else ""
 
 
-def _targets(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
+def _check_targets(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
     if p.role not in Role.DRIVING:
         return RejectReason.ROLE
     for t in s.targets:
         if t.kind not in (TargetKind.ROBOT, TargetKind.OBJECT):
             return RejectReason.UNKNOWN_VALUE
-        lease = ctx.lease(t.kind, t.name)
+        lease = ctx.find_lease(t.kind, t.name)
         if lease is None:
             return RejectReason.UNKNOWN_TARGET
         g = find_grant(lease, p.id, s.device)
@@ -76,8 +78,8 @@ def _targets(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> st
     return ""
 
 
-def _alignment(p: Participant, s: Sample, drives: list[Drive]) -> str:
-    """Poses and twists count in the alignment in force, or in the one frozen at this engagement."""
+def _check_alignment(p: Participant, s: Sample, drives: list[Drive]) -> str:
+    """Reject poses and twists in another alignment than the one in force, or the one frozen at this engagement."""
     if not p.needs_alignment or s.kind == SampleKind.JOINTS:
         return ""
     if p.alignment is None:
@@ -90,8 +92,8 @@ def _alignment(p: Participant, s: Sample, drives: list[Drive]) -> str:
     return "" if frozen else RejectReason.ALIGNMENT_VERSION
 
 
-def _numbers(ctx: Context, s: Sample) -> str:
-    """Finite and within reach, whether or not this sample's payload will be used."""
+def _check_numbers(ctx: Context, s: Sample) -> str:
+    """Reject numbers that are not finite or out of reach, whether or not this sample's payload will be used."""
     total = sum(s.q) + sum(s.qd) + sum(s.hand_joints)
     if s.gripper is not None:
         total += s.gripper
@@ -106,8 +108,8 @@ def _numbers(ctx: Context, s: Sample) -> str:
     return "" if math.isfinite(total) else RejectReason.NOT_FINITE
 
 
-def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
-    """Shape and possible speed of the payload that `kind` names."""
+def _check_payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
+    """Reject a wrong shape or an impossible speed of the payload that `kind` names."""
     limit = ctx.config.speed_limits[s.device]
     if s.kind == SampleKind.POSE:
         if s.pose is None:
@@ -133,7 +135,7 @@ def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
     else:
         if not s.q or (s.qd and len(s.qd) != len(s.q)):
             return RejectReason.SHAPE
-        before = seen.joints.get(len(s.q), JointsSeen(0, s.q))
+        before = seen.joints.get(len(s.q), JointReading(0, s.q))
         bound = limit.angular * max(0, s.capture_ns - before.capture_ns) * 1e-9 + ctx.config.speed_slack_rad
         possible = max(map(abs, (*s.q, *s.qd))) <= ctx.config.reach_m and all(
             abs(a - b) <= bound for a, b in zip(s.q, before.q, strict=True)
@@ -141,8 +143,8 @@ def _payload(ctx: Context, s: Sample, seen: DeviceState) -> str:
     return "" if possible else RejectReason.TOO_FAST
 
 
-def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
-    """What must hold beyond the checks above for a robot to follow."""
+def _check_engagement(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> str:
+    """Reject samples that cannot drive their target, beyond the checks above."""
     for lease, g in drives:
         if lease.kind == TargetKind.OBJECT:
             if s.kind != SampleKind.POSE:
@@ -150,40 +152,42 @@ def _engaging(ctx: Context, p: Participant, s: Sample, drives: list[Drive]) -> s
             continue
         if s.kind == SampleKind.JOINTS and len(s.q) != len(ctx.robots[lease.target].joints):
             return RejectReason.SHAPE
-        if (g.engagement or s.device in g.armed) and _other_kind(lease, g, s):
+        if (g.engagement or s.device in g.armed) and _is_kind_mismatch(lease, g, s):
             return RejectReason.KIND_MISMATCH
         if g.engagement or s.device not in g.armed:
             continue
         if p.role == Role.LEADER and s.kind == SampleKind.JOINTS and ctx.config.leader_apart == "refuse":
             apart = max(abs(a - b) for a, b in zip(s.q, ctx.view.joints(lease.target), strict=True))
-            if not apart <= ctx.config.leader_apart_rad:  # a robot that is nowhere is not near its leader
+            if not apart <= ctx.config.leader_apart_rad:  # NaN joints of a diverged robot are not near its leader
                 return RejectReason.LEADER_APART
         if s.kind != SampleKind.JOINTS and p.needs_alignment:
-            error = stated_error.at_robot(ctx, p, lease.target)
+            error = alignment.compute_error_at_robot(ctx, p, lease.target)
             if error > ctx.config.max_error_at_robot_m:
-                alignment.refuse_at_robot(ctx, p, lease.target, error)
+                alignment.refuse_large_error(ctx, p, lease.target, error)
                 return RejectReason.UNALIGNED
     return ""
 
 
-def _other_kind(lease: LeaseState, g: Grant, s: Sample) -> bool:
-    """Whether somebody else drives the robot by another kind of sample: those cannot be blended (mode `shared`)."""
+def _is_kind_mismatch(lease: LeaseState, g: LeaseGrant, s: Sample) -> bool:
+    """Return true when another sharer drives the robot by another kind of sample: these cannot be blended (mode
+    `shared`).
+    """
     if lease.mode != LeaseMode.SHARED or (g.engagement and g.device != s.device):
         return False
     return any(other.engagement and other is not g and other.kind != s.kind for other in lease.grants)
 
 
-def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
-    """Counts a rejected sample and rearms what its sender's device drives of the targets it names."""
-    count(ctx, p, s.device, reason)
+def reject_sample(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
+    """Count a rejected sample and rearm what its sender's device drives of the targets it names."""
+    count_rejection(ctx, p, s.device, reason)
     if reason == RejectReason.SEQ:
         return
     hold = HoldReason.UNALIGNED if reason == RejectReason.UNALIGNED else HoldReason.REJECTED
     if reason == RejectReason.UNALIGNED and p.alignment is None:
         advice = "look at an anchor sheet" if p.aligning else "start its alignment run"
-        telling.warn(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)
+        alignment.warn_wearer(ctx, p, "unaligned", f"{p.name} is not aligned and moves nothing: {advice}", same=advice)
     for t in s.targets:
-        lease = ctx.lease(t.kind, t.name)
+        lease = ctx.find_lease(t.kind, t.name)
         g = find_grant(lease, p.id, s.device) if lease is not None else None
         if lease is None or g is None:
             continue
@@ -196,11 +200,11 @@ def reject(ctx: Context, p: Participant, s: Sample, reason: str) -> None:
             if shown and not g.armed:
                 g.hold = hold
         elif g.device == s.device:
-            engagement.end(ctx, lease, g, hold)
+            engagement.end_engagement(ctx, lease, g, hold)
 
 
-def count(ctx: Context, p: Participant | None, device: str, reason: str, n: int = 1) -> None:
-    """Counts `n` rejections; an event at the first one of a kind, then at most one per report period."""
+def count_rejection(ctx: Context, p: Participant | None, device: str, reason: str, n: int = 1) -> None:
+    """Count `n` rejections; emit an event at the first one of a kind, then at most one per report period."""
     device = device if device in Device.ALL else ""
     book = ctx.state.unattributed if p is None else p.rejections
     if p is not None:

@@ -1,4 +1,4 @@
-"""Everything the authority remembers between steps, as plain mutable structs. `State` is the whole snapshot.
+"""The whole memory of the authority between steps, as plain mutable structs. `AuthorityState` is the snapshot.
 
 Nothing else in this room keeps state; caches elsewhere are derived from these structs and can be rebuilt at any time.
 """
@@ -22,7 +22,7 @@ HOST_ID: Final = "host"
 NO_CONNECTION: Final = -1
 
 
-class JointsSeen(msgspec.Struct, array_like=True):
+class JointReading(msgspec.Struct, array_like=True):
     """Newest joint positions of one device, and when they were sampled."""
 
     capture_ns: int
@@ -30,7 +30,7 @@ class JointsSeen(msgspec.Struct, array_like=True):
 
 
 class DeviceState(msgspec.Struct):
-    """Newest usable payloads of one device: what the next ones are compared with, whatever was sent in between.
+    """Newest usable payloads of one device, which the next ones are compared with, whatever was sent in between.
 
     `pose`: in the tracking frame, sampled at `pose_ns`. `joints`: by their number.
     """
@@ -38,7 +38,7 @@ class DeviceState(msgspec.Struct):
     seq: int = -1
     pose_ns: int = 0
     pose: Pose | None = None
-    joints: dict[int, JointsSeen] = {}
+    joints: dict[int, JointReading] = {}
 
 
 class Rejections(msgspec.Struct):
@@ -48,9 +48,10 @@ class Rejections(msgspec.Struct):
     reported_ns: int | None = None
 
 
-class Warned(msgspec.Struct):
-    """Warnings of one kind to one participant: the one that stands and when it was said, what was seen last, and how
-    many were left out since."""
+class WarningState(msgspec.Struct):
+    """Warnings of one kind to one participant: the one in force and when it was sent, the newest condition, and how
+    many were left out since.
+    """
 
     said: str = ""
     said_ns: int = 0
@@ -61,7 +62,8 @@ class Warned(msgspec.Struct):
 class Correction(msgspec.Struct):
     """A measured alignment (without the director's offset) that is not wholly in force yet.
 
-    `T_told`: what it was when its wearer was told; it may go on changing. `slides_ns`: when its next part may come.
+    `T_told`: its pose when it was announced to the wearer; it may change afterwards. `slides_ns`: when its next part
+    may come into force.
     """
 
     T_world_tracking: Pose
@@ -72,15 +74,15 @@ class Correction(msgspec.Struct):
     T_told: Pose | None = None
 
 
-class Placing(msgspec.Struct):
-    """A director's word that waits until the clutch of its wearer opens."""
+class Placement(msgspec.Struct):
+    """A director's placement that waits until the clutch of its wearer opens."""
 
     T_world_tracking: Pose
     offset: bool
 
 
-class Alarmed(msgspec.Struct):
-    """The last alarm about an alignment that nothing has answered yet (`AlarmKind`)."""
+class AlarmState(msgspec.Struct):
+    """The last unresolved alarm about an alignment (`AlarmKind`)."""
 
     kind: str
     anchor_id: str
@@ -92,14 +94,14 @@ class Alarmed(msgspec.Struct):
 class Participant(msgspec.Struct):
     """One member of the session. `expires_ns` is 0 while connected, else the end of the grace period.
 
-    `spared`: a gap has put off its expiry, and the gaps that follow that one at once do not put it off again.
-    `run`: value of the capability `run:<id>`; a resumed connection with the same one continues the same tracking frame.
-    `T_world_tracking_measured`: of the alignment in force, what was measured, without the director's `offset`; None for
-    one that was placed. `pivot_world`: the point at which its covariance is stated. `aligning`: its alignment run goes
-    on, `alignment_run` counts the starts. `placed`: a director's word stands, so measurements do not count. `in_use`:
-    it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that were made at
-    `proposals_from_ns` or before do not count. `told_ns`: when its wearer was last told of a correction.
-    `devices` empty: none declared, all known ones are taken.
+    `spared`: a gap has put off its expiry, and the gaps that follow that one at once do not put it off again. `run`:
+    value of the capability `run:<id>`; a resumed connection with the same one continues the same tracking frame.
+    `T_world_tracking_measured`: of the alignment in force, the measured part, without the director's `offset`; None for
+    one that was placed. `pivot_world`: the point at which its covariance is stated. `aligning`: its alignment run is
+    active, `alignment_run` counts the starts. `placed`: a director's placement is in force, so measurements do not
+    count. `in_use`: it has engaged in this run and tracking frame, first aligned in it at `aligned_ns`. Proposals that
+    were made at `proposals_from_ns` or before do not count. `told_ns`: when a correction was last announced to its
+    wearer. `devices` empty: none declared, all known ones are accepted.
     """
 
     id: str
@@ -128,22 +130,22 @@ class Participant(msgspec.Struct):
     aligned_ns: int | None = None
     proposals_from_ns: int = -1
     correction: Correction | None = None
-    placing: Placing | None = None
+    placing: Placement | None = None
     told_ns: int | None = None
-    alarm: Alarmed | None = None
+    alarm: AlarmState | None = None
     refused_ns: int | None = None
-    warnings: dict[str, Warned] = {}
+    warnings: dict[str, WarningState] = {}
     seen: dict[str, DeviceState] = {}
     rejected: dict[str, int] = {}
     rejections: dict[str, Rejections] = {}
 
 
-class Grant(msgspec.Struct):
+class LeaseGrant(msgspec.Struct):
     """The right of one participant on one target, its clutch latches and its engagement.
 
     `version`: fencing token; tokens from it up to the lease's own are valid, so a second sharer does not fence the
     first. `hand`: the only device that may use it (objects taken with `grasp`). `scale`: motion scaling (robots).
-    `armed`: devices whose clutch was seen open since the last rearm. `engagement` 0: not engaged, `hold` says why.
+    `armed`: devices whose clutch was seen open since the last rearm. `engagement` 0: not engaged, `hold` is the reason.
     """
 
     participant: str
@@ -176,7 +178,7 @@ class LeaseState(msgspec.Struct):
     kind: str
     mode: str
     version: int = 0
-    grants: list[Grant] = []
+    grants: list[LeaseGrant] = []
     override: str = ""
     override_ns: int = 0
     lead: int = 0
@@ -184,15 +186,15 @@ class LeaseState(msgspec.Struct):
     T_world_object: Pose = IDENTITY
 
 
-#: `Pending.request_id` of a place in the queue that outlived its connection: nobody waits for the answer.
-KEPT: Final = -1
+#: `Pending.request_id` of a place in the queue that outlived its connection: no reply is sent.
+NO_REPLY: Final = -1
 
 
 class Pending(msgspec.Struct):
-    """An `acquire` that has not been answered yet: it waits in the queue, or for consents.
+    """An `acquire` without an answer yet: it is queued, or waits for consents.
 
-    `consents`: consent id -> robot whose holder has not answered; `granted`: robot -> holder who gave it.
-    `expires_ns` 0: never.
+    `consents`: consent id -> robot whose holder has not answered; `granted`: robot -> holder who gave it. `expires_ns`
+    0: never.
     """
 
     participant: str
@@ -219,14 +221,14 @@ class HandoverTrack(msgspec.Struct):
 
 
 class FeedbackState(msgspec.Struct):
-    """What the holders of one robot were told last."""
+    """The last feedback sent to each holder of one robot, and when the next is due."""
 
     due_ns: int = 0
     sent: dict[str, Feedback] = {}
 
 
-class Compared(msgspec.Struct):
-    """The newest comparison of two headsets; fields as in `HeadsetsCompared`."""
+class CrossCheckState(msgspec.Struct):
+    """The newest cross-check of two headsets; fields as in `HeadsetsCompared`."""
 
     a: str
     b: str
@@ -238,12 +240,12 @@ class Compared(msgspec.Struct):
     compared_ns: int
 
 
-class State(msgspec.Struct):
+class AuthorityState(msgspec.Struct):
     """The authority's whole memory. `name_owners`: assigned name -> key that has it (policy `config`).
 
-    `scene`: None while it is the one that the session began with. `patches`: all that it has had, merged.
-    `anchors`: `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b".
-    `handovers`: objects on their way between people; `regrasps`: between two robots, of one person too.
+    `scene`: None while it is the one that the session began with. `patches`: all of its patches, merged. `anchors`:
+    `T_world_anchor` by id, as they are since `anchors_ns`. `cross_checks`: by both participants, "a b". `handovers`:
+    objects on their way between people; `regrasps`: between two robots, of one person too.
     """
 
     robots: dict[str, LeaseState]
@@ -274,4 +276,4 @@ class State(msgspec.Struct):
     name_owners: dict[str, str] = {}
     anchors: dict[str, Pose] = {}
     anchors_ns: int = -1
-    cross_checks: dict[str, Compared] = {}
+    cross_checks: dict[str, CrossCheckState] = {}

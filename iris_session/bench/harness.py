@@ -251,7 +251,7 @@ def _raise_if_stopped(session: Session) -> None:
 def _start_profiles(arena: BenchRun) -> None:
     """The moments of a profile count from the beginning of the window."""
     assert arena.proxy is not None
-    arena.proxy.post("start")
+    arena.proxy.send("start")
 
 
 class _Schedule:

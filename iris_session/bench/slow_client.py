@@ -152,7 +152,7 @@ def _end_stall(arena: BenchRun, stretch: StallInterval, link: str, resumed: dict
 
 def _post_link_command(arena: BenchRun, command: str, link: str) -> None:
     assert arena.proxy is not None
-    arena.proxy.post(f"{command} @{link}")
+    arena.proxy.send(f"{command} @{link}")
 
 
 def _make_bars(results: dict[str, Any]) -> list[Any]:

@@ -84,9 +84,9 @@ def run_allow(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome, load_public
 
     home = KeyHome()
-    given = arguments.key or home.identity().public
+    given = arguments.key or home.load_identity().public
     key = load_public(given) if _is_key_file(given) else given
-    entry = home.clients.allow(arguments.name, key, parse_roles(arguments.role))
+    entry = home.clients.allow_key(arguments.name, key, parse_roles(arguments.role))
     print(f"{entry.name} may join ({entry.fingerprint}) as {', '.join(entry.roles) or 'anything'}")
     return 0
 
@@ -99,7 +99,7 @@ def run_revoke(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
     clients = KeyHome().clients
-    entry = clients.revoke(arguments.name)
+    entry = clients.revoke_key(arguments.name)
     if entry is None:
         names = ", ".join(one.name for one in clients.read().values()) or "nobody"
         raise CommandError(f"no key {arguments.name!r} on the list, there are: {names}")
@@ -111,7 +111,7 @@ def run_show(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
     home = KeyHome()
-    server, own = home.server_key(), home.identity()
+    server, own = home.load_server_key(), home.load_identity()
     if arguments.json:
         print_json(
             {
@@ -130,8 +130,8 @@ def run_show(arguments: argparse.Namespace) -> int:
 def run_forget(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome
 
-    servers = KeyHome().servers
-    gone = servers.forget(arguments.address)
+    servers = KeyHome().known_servers
+    gone = servers.remove(arguments.address)
     if gone is None:
         known = ", ".join(one.address for one in servers.read()) or "none"
         raise CommandError(f"no key is stored for {arguments.address!r}, stored are: {known}")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli.common import CommandError, add_json_option, print_json
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
-from iris_session.security.files import KeysBusyError
+from iris_session.security.private_folder import KeysBusyError
 
 if TYPE_CHECKING:
-    from iris_session.security import JoinCode, KeyHome, KeyPair, SessionNote
+    from iris_session.security import JoinCode, KeyHome, KeyPair, RegisteredSession
 
 ANY_ROLE: Final = "any"
 POLL_S: Final = 0.2
@@ -77,10 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome, load_secret
 
     home = KeyHome()
-    key = load_secret(arguments.curve_key) if arguments.curve_key else home.server_key()
+    key = load_secret(arguments.curve_key) if arguments.curve_key else home.load_server_key()
     session, places = _find_addresses(arguments, home, key)
     roles = parse_roles(arguments.role)
-    code, made = home.codes.make(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
+    code, made = home.join_codes.create(key, minutes=arguments.minutes, roles=roles, name=arguments.name)
     try:
         uri = pairing_uri(*places[0], key.public, code, session)
         told = {
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         _print_invitation(arguments, told)
         return 0 if arguments.no_wait else _wait_until_used(home, made, arguments)
     except BaseException:
-        home.codes.cancel(made.id)  # who asked for it does not see any more what becomes of it
+        home.join_codes.cancel(made.id)  # who asked for it does not see any more what becomes of it
         raise
 
 
@@ -123,7 +123,7 @@ def _find_addresses(arguments: argparse.Namespace, home: KeyHome, key: KeyPair) 
     return found[0].name, [(host, found[0].control) for host in found[0].hosts]
 
 
-def _format_session_choice(name: str, here: list[SessionNote], found: list[SessionNote]) -> str:
+def _format_session_choice(name: str, here: list[RegisteredSession], found: list[RegisteredSession]) -> str:
     if not here:
         return (
             "no encrypted session of yours runs on this machine: start one with `iris-session serve SCENE "
@@ -166,14 +166,14 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
     """Until the code is used, void or expired."""
     seen: object = None
     while True:
-        if home.codes.signature != seen:
-            seen = home.codes.signature
+        if home.join_codes.signature != seen:
+            seen = home.join_codes.signature
             try:
-                with home.folder.locked():  # held from the use of a code until the key is on the list
-                    now = home.codes.find(made.id)
+                with home.folder.lock():  # held from the use of a code until the key is on the list
+                    now = home.join_codes.find_code(made.id)
             except KeysBusyError:  # whoever holds it has a slow disk: the code is good all the same
                 seen, now = None, made
-            if now is None or now.paired or not now.open(time.time()):
+            if now is None or now.paired or not now.is_open(time.time()):
                 break
         if time.time() >= made.expires:
             now = made

@@ -14,7 +14,7 @@ from iris_session.cli.common import CommandError, add_json_option, open_scene, p
 if TYPE_CHECKING:
     from iris_session.protocol.scene import SceneSpec
     from iris_session.scene import AssetStore
-    from iris_session.scene.compose import SceneBuilder
+    from iris_session.scene.builder import SceneBuilder
     from iris_session.scene.report import SceneReport
 
 
@@ -126,7 +126,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.assets.errors import AssetStoreError
     from iris_session.scene import SceneBuildError
     from iris_session.scene.glb import write_glb
-    from iris_session.scene.references import files_read
+    from iris_session.scene.importers.references import files_read
     from iris_session.scene.report import not_in_glb
 
     out = expand_path(arguments.out)
@@ -270,7 +270,7 @@ def find_scene_file(scene: str) -> Path | None:
     Raises `CommandError` for a folder, a file that is not there, and endings that nobody reads.
     """
     from iris_session.scene import SceneBuildError
-    from iris_session.scene.files import ENDINGS, present, xacro_advice
+    from iris_session.scene.importers.files import ENDINGS, present, xacro_advice
 
     path = expand_path(scene)
     kind = path.suffix.lower()
@@ -314,7 +314,7 @@ def check_file_options(arguments: argparse.Namespace, path: Path | None) -> None
 def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneBuilder:
     """A scene called `name` with what is in a file that MuJoCo does not read."""
     from iris_session.scene import SceneBuildError
-    from iris_session.scene.compose import SceneBuilder
+    from iris_session.scene.builder import SceneBuilder
 
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
     if (size := path.stat().st_size) > _LARGE_FILE_BYTES:

@@ -12,7 +12,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 from iris_session.client.errors import ClientError
 from iris_session.protocol.pairing import KEY_BYTES, normal_code
-from iris_session.security import KeysError, raw_key
+from iris_session.security import KeysError, decode_key
 
 DEFAULT_CONTROL_PORT: Final = 7721
 SCHEME: Final = "iris"
@@ -72,7 +72,7 @@ def is_host(host: str) -> bool:
 def pairing_uri(host: str, port: int, server_key: str, join_code: str = "", session: str = "") -> str:
     """`iris://HOST:CONTROL/?k=KEY&c=CODE&n=NAME`: what a pairing QR code says. `server_key`: Z85; in the URI its 32 raw
     bytes in base64url without padding."""
-    key = base64.urlsafe_b64encode(raw_key(server_key)).decode().rstrip("=")
+    key = base64.urlsafe_b64encode(decode_key(server_key)).decode().rstrip("=")
     fields = {"k": key, "c": join_code, "n": session}
     query = "&".join(f"{name}={quote(value, safe='')}" for name, value in fields.items() if value)
     return f"{SCHEME}://{host_port(host, port)}/?{query}"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from iris_session.client.address import Address
 from iris_session.client.errors import TrustError
-from iris_session.security import KeyHome, KeysError, KnownServer, fingerprint, raw_key
+from iris_session.security import KeyHome, KeysError, KnownServer, compute_fingerprint, decode_key
 
 
 class Trust:
@@ -17,7 +17,7 @@ class Trust:
         self._home = home
         self._address = address
         self._session = session
-        self._known = home.servers.read()
+        self._known = home.known_servers.read()
 
     @property
     def stored(self) -> str:
@@ -60,7 +60,7 @@ class Trust:
     def store(self, session: str, key: str) -> None:
         """Keeps `key` for the address. Raises `TrustError` when another one is there."""
         try:
-            self._home.servers.pin(str(self._address), session, key)
+            self._home.known_servers.pin(str(self._address), session, key)
         except KeysError as error:
             raise TrustError(str(error)) from error
 
@@ -73,12 +73,12 @@ class Trust:
 
 
 def _mark(key: str) -> str:
-    return fingerprint(raw_key(key)) if key else "none"
+    return compute_fingerprint(decode_key(key)) if key else "none"
 
 
 def known_fingerprints() -> frozenset[str]:
     """Of every session whose key this user has stored. Raises `TrustError` when the file cannot be read."""
     try:
-        return frozenset(one.fingerprint for one in KeyHome().servers.read())
+        return frozenset(one.fingerprint for one in KeyHome().known_servers.read())
     except KeysError as error:
         raise TrustError(str(error)) from error

@@ -158,7 +158,7 @@ class Meeting:
             )
         if not key:
             return None if key is None else Met(address, None, session_id, name)
-        own = home.identity()
+        own = home.load_identity()
         if code and (self._repair or not trust.familiar(key)):
             self.note = f"pairing with the session at {address}"
             yield from pair_key(address, key, own, code, key_name())

@@ -18,13 +18,13 @@ from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired, ProtocolFault, Refused
-from iris_session.security import KeyPair, raw_key
+from iris_session.security import KeyPair, decode_key
 
 ANSWER_S: Final = 5.0
 #: Where many pair at once it says so, where its disk is slow it says nothing for a while: the same is asked again, for
 #: so long. Who has paired gets the same answer again.
 AGAIN_S: Final = 1.0
-PATIENCE_S: Final = 20.0
+LOCK_TIMEOUT_S: Final = 20.0
 MAX_NAME: Final = 64  # as `protocol.common.Name`
 MAX_ANSWER_BYTES: Final = 65_536
 
@@ -45,7 +45,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
     The session must prove that it knows the code: only then its key is that of whom gave the code out. Raises
     `RefusedError` (code wrong, used or expired), `TrustError` (it does not know the code), `NotConnectedError`.
     """
-    server_public = raw_key(server_key)
+    server_public = decode_key(server_key)
     try:
         secret = pairing.stretch(code, server_public)
     except ValueError as error:
@@ -73,7 +73,7 @@ def pair_key(address: Address, server_key: str, own: KeyPair, code: str, name: s
 
 def _ask(asking: zmq.Socket[bytes], request: bytes, address: Address) -> Generator[None, None, Paired]:
     """Asks until there is an answer that stays. Raises as `pair_key`."""
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + LOCK_TIMEOUT_S
     while True:
         asking.send(request)
         try:
@@ -97,7 +97,7 @@ def _answer(asking: zmq.Socket[bytes], address: Address) -> Generator[None, None
             message = decode_server(asking.recv_multipart(zmq.NOBLOCK)[0]).message
         except zmq.Again:
             if time.monotonic() > until:
-                raise TimeoutError(f"the session at {address} did not answer within {PATIENCE_S:g} s") from None
+                raise TimeoutError(f"the session at {address} did not answer within {LOCK_TIMEOUT_S:g} s") from None
             yield
             continue
         except ProtocolError as error:

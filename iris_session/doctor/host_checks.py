@@ -115,7 +115,7 @@ def check_key_home() -> Finding:
         advice = f"chmod -R go= {folder}"
         return failed("key_home", f"others may read {', '.join(loose)} in {folder}", "these are secrets", advice)
     try:
-        clients, codes = home.clients.read(), home.codes.read()
+        clients, codes = home.clients.read(), home.join_codes.read()
     except KeysError as error:
         return failed("key_home", str(error), "", "mend or remove that file; removing it takes its entries away")
     return ok("key_home", f"{folder}: {len(clients)} keys on the list, {len(codes)} join codes")

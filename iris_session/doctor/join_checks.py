@@ -18,7 +18,7 @@ from iris_session.protocol.discovery import Introduction
 from iris_session.protocol.names import DenialReason, RefusalCode
 from iris_session.protocol.pairing import normal_code
 from iris_session.protocol.status import StatusReport, quantiles
-from iris_session.security import KeyHome, KeysError, fingerprint, raw_key
+from iris_session.security import KeyHome, KeysError, compute_fingerprint, decode_key
 
 JOIN_S: Final = 4.0
 STATE_S: Final = 3.0
@@ -47,7 +47,7 @@ def check_server_key(address: Address, introduction: Introduction | None) -> Fin
     """Whether the key that the session introduces itself with is the one known for this address."""
     home = KeyHome()
     try:
-        known, own = home.servers.by_address(str(address)), {note.server for note in home.sessions.read()}
+        known, own = home.known_servers.find_by_address(str(address)), {note.server for note in home.sessions.read()}
     except KeysError as error:
         return failed("server_key", str(error), "", "mend or remove that file")
     stored = address.server_key or ("" if known is None else known.key)
@@ -55,7 +55,7 @@ def check_server_key(address: Address, introduction: Introduction | None) -> Fin
         return Finding("server_key", "skipped", "not known: there was no introduction")
     if not introduction.server_key:
         return ok("server_key", "not encrypted, which is for one machine only")
-    mark = fingerprint(raw_key(introduction.server_key))
+    mark = compute_fingerprint(decode_key(introduction.server_key))
     if not stored and mark in own:
         return ok("server_key", f"its key {mark} is this user's own")
     if not stored:
@@ -64,7 +64,7 @@ def check_server_key(address: Address, introduction: Introduction | None) -> Fin
     if stored != introduction.server_key:
         return failed(
             "server_key",
-            f"its key is {mark}, but {fingerprint(raw_key(stored))} is known for {address}",
+            f"its key is {mark}, but {compute_fingerprint(decode_key(stored))} is known for {address}",
             "somebody else answers there, or the session's keys were made anew",
             f"ask who runs it; if they are new: iris-session keys forget {address}, then pair again",
         )
@@ -127,14 +127,14 @@ def explain_unpaired_key(target: Address, introduction: Introduction | None) -> 
     try:
         home = KeyHome()
         mark = (
-            fingerprint(raw_key(introduction.server_key))
+            compute_fingerprint(decode_key(introduction.server_key))
             if introduction is not None and introduction.server_key
             else ""
         )
         if any(note.server == mark for note in home.sessions.read()):
             why = "the session is this user's own; even so this user's key must be let in once"
             return failed("key", NOT_LISTED, why, "iris-session keys allow me")
-        before = home.servers.by_address(str(target)) is not None
+        before = home.known_servers.find_by_address(str(target)) is not None
     except KeysError as error:
         return failed("key", NOT_LISTED, str(error), pair)
     why = "it was let in before, and has been taken off since (`iris-session keys revoke`)" if before else ""

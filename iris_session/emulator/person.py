@@ -107,7 +107,7 @@ class Person:
     @property
     def next_ns(self) -> int:
         """When `step` has something to do at the latest."""
-        arrival = self._uplink.next_ns
+        arrival = self._uplink.next_arrival_ns
         return self.headset.next_sample_ns if arrival is None else min(arrival, self.headset.next_sample_ns)
 
     def step(self, now_ns: int) -> None:

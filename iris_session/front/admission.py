@@ -1,29 +1,39 @@
-"""`hello`: who may knock, as whom; and `Welcome` once the authority has let them in. Keys and tokens end here."""
+"""Answer `hello`: check identity, role and limits, and send `Welcome` once the authority has admitted the client.
+
+Keys, secrets and tokens do not go beyond this module: the authority sees key ids and participant ids.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from typing import Protocol
 
-from iris_session.front.audit import AuditTrail
-from iris_session.front.connection_guard import ConnectionGuard, HelloRateLimiter, max_connections_per_key
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, Peer, Route
-from iris_session.link.config import FrontConfig, Ports
+from iris_session.front.connection_guard import HelloRateLimiter, max_connections_per_key
+from iris_session.front.connections import FrontConnection, Peer, Route
+from iris_session.front.context import FrontContext
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.limits import Drops, RateLimiter
+from iris_session.protocol.limits import RateLimiter
 from iris_session.protocol.names import AuditKind, RefusalCode, Role
 from iris_session.protocol.server_messages import Endpoints, Refused, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.security import fingerprint
-from iris_session.security.keyring import Keyring, roles_behind
-from iris_session.security.resume_tokens import ResumeTokens
+from iris_session.security import compute_fingerprint
+from iris_session.security.keyring import select_gateway_roles
 
 SECRET_BYTES = 16  # 128 bits, made by the client
 
 
+class ClientChannel(Protocol):
+    """A channel beside control and state, which must know a client before the client gets its `Welcome`."""
+
+    def sync_clients(self) -> None:
+        """Take over which clients are admitted."""
+        ...
+
+
 class _RefusedError(Exception):
-    """Ends the handling of one hello."""
+    """End the handling of one hello with a refusal."""
 
     def __init__(self, code: str, message: str, advice: str = "") -> None:
         super().__init__(message)
@@ -31,36 +41,24 @@ class _RefusedError(Exception):
 
 
 class Admission:
-    """Accepts or refuses `hello`."""
+    """Admit or refuse clients. `channels` learn of an admitted client before it does."""
 
-    def __init__(
-        self,
-        config: FrontConfig,
-        ports: Ports,
-        clients: ConnectionTable,
-        outbox: Outbox,
-        drops: Drops,
-        tokens: ResumeTokens,
-        keyring: Keyring,
-        audit: AuditTrail,
-        guard: ConnectionGuard,
-    ) -> None:
-        self._config = config
-        self._ports = ports
-        self._clients = clients
-        self._outbox = outbox
-        self._drops = drops
-        self._tokens = tokens
-        self._keyring = keyring
-        self._audit = audit
-        self._guard = guard
-        #: Called when somebody is let in, before he is told: by then every channel must know him.
-        self.lets_in: list[Callable[[], None]] = []
-        self._hellos = HelloRateLimiter(config.limits)
+    def __init__(self, context: FrontContext, channels: Sequence[ClientChannel]) -> None:
+        self._config = context.config
+        self._ports = context.ports
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._drops = context.drops
+        self._tokens = context.tokens
+        self._keyring = context.keyring
+        self._audit = context.audit
+        self._guard = context.guard
+        self._channels = channels
+        self._hellos = HelloRateLimiter(context.config.limits)
         self._rates: dict[int, RateLimiter] = {}
 
     def handle_hello(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> Entry | None:
-        """Answers a refusal itself, and gives no entry then."""
+        """Handle a hello. Return the entry for the authority, or `None` after a refusal, which is sent here."""
         try:
             connection, join = self._accept(route, peer, hello, now_ns)
         except _RefusedError as refused:
@@ -68,7 +66,7 @@ class Admission:
             self._outbox.send_to_route(route, refused.answer)
             return None
         connection.last_heard_ns = now_ns
-        self._clients.add(connection)
+        self._connections.add(connection)
         return Entry(connection.number, connection.number, now_ns, join)
 
     def _accept(self, route: Route, peer: Peer, hello: Hello, now_ns: int) -> tuple[FrontConnection, Join]:
@@ -78,19 +76,19 @@ class Admission:
         key_id = self._make_key_id(peer, hello, gateway)
         if self._guard.is_banned(key_id, now_ns):
             raise _RefusedError(
-                RefusalCode.RATE, "this client was cut off: it sent a flood", "send less; try again soon"
+                RefusalCode.RATE, "this client was disconnected for flooding", "send less; try again soon"
             )
         roles = self._find_roles(key_id, gateway)
         address = peer_of(peer.descriptor)
         resume_of = self._find_resumed(hello, key_id, address[0], now_ns)
-        # Who comes back replaces a connection that may still be counted: as many again, so that it is bounded.
+        # A resuming client replaces a connection that may still be counted: twice the limit, so that it is bounded.
         limit = self._config.limits.connections
-        if len(self._clients) >= (2 * limit if resume_of else limit):
+        if len(self._connections) >= (2 * limit if resume_of else limit):
             raise _RefusedError(RefusalCode.FULL, f"all {limit} connections are in use", "try again later")
         share = max_connections_per_key(limit)
         if not resume_of and self._count_connections(gateway.key_id if gateway else key_id) >= share:
             raise _RefusedError(RefusalCode.FULL, f"this key has {share} connections already", "close some of them")
-        number = self._tokens.new_connection()
+        number = self._tokens.allocate_connection()
         connection = FrontConnection(number, route, peer, address, key_id, hello, gateway.number if gateway else 0)
         join = Join(
             key_id,
@@ -107,32 +105,33 @@ class Admission:
         return connection, join
 
     def _allow_hello(self, route: Route, peer: Peer, now_ns: int) -> bool:
-        """Bounds the hellos of one TCP connection (a gateway's are those of many people), of one key, and of all."""
+        """Return whether the hello is within the limits of its TCP connection, of its key, and of all. The
+        first does not apply to a gateway's, which speaks for many participants."""
         if not route.on_behalf_of:
-            knocks = self._rates.setdefault(peer.descriptor, RateLimiter())
-            if not knocks.allow(Hello, now_ns):
+            rates = self._rates.setdefault(peer.descriptor, RateLimiter())
+            if not rates.allow(Hello, now_ns):
                 return False
         return self._hellos.allow(peer.user_id or peer_of(peer.descriptor)[0], now_ns)
 
     def _count_connections(self, key_id: str) -> int:
-        """Connections of one key, people behind it included."""
-        connections = self._clients.by_number
+        """Return the number of connections of one key, those behind it included."""
+        connections = self._connections.by_number
         gateways = {number for number, one in connections.items() if one.key_id == key_id}
         return sum(one.gateway in gateways or one.key_id == key_id for one in connections.values())
 
     def remove_peer(self, descriptor: int) -> None:
-        """A TCP connection was closed: its descriptor may become another's."""
+        """Forget a TCP connection that was closed: its descriptor may be used again."""
         self._rates.pop(descriptor, None)
 
     def find_gateway(self, routing_id: bytes, peer: Peer) -> FrontConnection | None:
-        """The admitted gateway that this peer is."""
-        gateway = self._clients.find(Route(routing_id), peer)
+        """Return the admitted gateway that this peer is, or `None`."""
+        gateway = self._connections.find(Route(routing_id), peer)
         return gateway if gateway is not None and gateway.admitted and gateway.hello.role == Role.GATEWAY else None
 
     def report_forged_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
-        """Somebody who is no gateway spoke on behalf of another."""
+        """Record that a client which is no gateway spoke on behalf of another."""
         address = peer_of(peer.descriptor)[0]
-        sender = self._clients.find(Route(route.routing_id), peer)
+        sender = self._connections.find(Route(route.routing_id), peer)
         self._audit.record(
             AuditKind.GATEWAY_REFUSED,
             now_ns,
@@ -143,7 +142,7 @@ class Admission:
         )
 
     def _require_gateway(self, route: Route, peer: Peer, now_ns: int) -> FrontConnection | None:
-        """The gateway that speaks, `None` for a client of its own."""
+        """Return the gateway that speaks, `None` for a client that speaks for itself. Raises `_RefusedError`."""
         if not route.on_behalf_of:
             return None
         gateway = self.find_gateway(route.routing_id, peer)
@@ -157,6 +156,7 @@ class Admission:
         return gateway
 
     def _make_key_id(self, peer: Peer, hello: Hello, gateway: FrontConnection | None) -> str:
+        """Return the key's fingerprint, or that of the client's secret where it has no key of its own."""
         if gateway is None and peer.user_id:
             return peer.user_id
         if len(hello.secret) < SECRET_BYTES:
@@ -165,22 +165,23 @@ class Admission:
                 f"hello has a secret of {len(hello.secret)} bytes, at least {SECRET_BYTES} are needed",
                 "make 16 random bytes once, keep them, and send them in every hello",
             )
-        return fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
+        return compute_fingerprint((gateway.key_id.encode() if gateway else b"") + hello.secret, b"iris-secret")
 
     def _find_roles(self, key_id: str, gateway: FrontConnection | None) -> tuple[str, ...]:
-        """What the key may join as, empty for any role."""
-        entry = self._keyring.find(gateway.key_id if gateway else key_id)
-        if self._tokens.revoked(key_id) or (entry is None and self._keyring.key is not None):
+        """Return the roles that the key may join with, empty for any role. Raises `_RefusedError`."""
+        entry = self._keyring.find_key(gateway.key_id if gateway else key_id)
+        if self._tokens.is_revoked(key_id) or (entry is None and self._keyring.key is not None):
             raise _RefusedError(
                 RefusalCode.UNPAIRED, "this key is not on the session's list (any more)", "pair anew with a join code"
             )
         roles = () if entry is None else entry.roles
-        return roles if gateway is None else roles_behind(roles)
+        return roles if gateway is None else select_gateway_roles(roles)
 
     def _find_resumed(self, hello: Hello, key_id: str, address: str, now_ns: int) -> str:
+        """Return the participant that a resume token names, empty without a token. Raises `_RefusedError`."""
         if not hello.resume_token:
             return ""
-        participant_id = self._tokens.find(hello.resume_token, key_id)
+        participant_id = self._tokens.find_participant(hello.resume_token, key_id)
         if participant_id is None:
             self._audit.record(
                 AuditKind.TOKEN_REFUSED, now_ns, subject=key_id, name=hello.name, address=address, detail=hello.role
@@ -191,20 +192,20 @@ class Admission:
         return participant_id
 
     def send_welcome(self, admitted: Admitted, now_ns: int, tick_period_ns: int) -> None:
-        """Sends `Welcome` with a fresh resume token. Connections that are gone are passed over. `tick_period_ns`: of
-        the present scene."""
-        connection = self._clients.by_number.get(admitted.connection)
+        """Send `Welcome` with a fresh resume token, unless the connection has ended. `tick_period_ns`: of the present
+        scene."""
+        connection = self._connections.by_number.get(admitted.connection)
         if connection is None:
             return
         config = self._config
-        gateway = self._clients.by_number.get(connection.gateway)
+        gateway = self._connections.by_number.get(connection.gateway)
         behind = gateway.key_id if gateway is not None else ""
         token = self._tokens.issue(connection.key_id, admitted.participant_id, connection.hello.resume_token, behind)
         connection.admitted = True
-        self._keyring.welcomed(connection.key_id)
+        self._keyring.record_join(connection.key_id)
         connection.participant_id = admitted.participant_id
-        for let_in in self.lets_in:
-            let_in()
+        for channel in self._channels:
+            channel.sync_clients()
         self._outbox.send(
             connection,
             Welcome(
@@ -232,10 +233,10 @@ class Admission:
         )
 
     def expire_tokens(self, participant_id: str) -> None:
-        """A participant is gone for good: its tokens open nothing any more."""
-        self._tokens.left(participant_id)
+        """Invalidate the tokens of a participant that has left for good."""
+        self._tokens.remove_participant(participant_id)
 
     def confirm(self, connection: FrontConnection) -> None:
-        """The client has proved that it has its `Welcome`: the token that it resumed with is used up."""
+        """Retire the token that a client resumed with: the client has proved that it has its `Welcome`."""
         if connection.hello.resume_token:
-            self._tokens.retire(connection.hello.resume_token)
+            self._tokens.use_up(connection.hello.resume_token)

@@ -7,10 +7,9 @@ It makes pauses instead, whenever the front's loop is late.
 
 from __future__ import annotations
 
-import sys
+import logging
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -25,9 +24,11 @@ from iris_session.protocol.assets import AssetChunk, AssetRefused
 from iris_session.protocol.codec import decode_asset_request, encode_asset_header
 from iris_session.protocol.errors import ProtocolError, VersionError
 from iris_session.protocol.names import PROTOCOL_VERSION, AssetRefusal
-from iris_session.security import KeyPair, fingerprint
-from iris_session.security.zap import ZAP_ENDPOINT, answer_zap, asks_with_curve
+from iris_session.security import KeyPair, compute_fingerprint
+from iris_session.security.zap import ZAP_ENDPOINT, answer_zap_requests, is_curve_request
 from iris_session.system.priority import run_at_low_priority
+
+log = logging.getLogger(__name__)
 
 IDLE_MS: Final = 50
 #: Requests taken, and chunks sent, before the rest is looked at.
@@ -152,8 +153,7 @@ class AssetServer:
         self._count_reasons(["assets_fault"])
         if repr(error) != self._reported_fault:
             self._reported_fault = repr(error)
-            text = f"iris-session: a fault in the thread of assets, which goes on: {self._reported_fault}\n"
-            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+            log.error("fault in the thread of assets, which continues: %s", self._reported_fault, exc_info=error)
         time.sleep(FAULT_S)
 
     def _serve(self) -> None:
@@ -165,7 +165,7 @@ class AssetServer:
             poller.poll(self._poll_timeout_ms())
             self._apply_access()
             if self._sockets.zap is not None:
-                answer_zap(self._sockets.zap, self._authenticate)
+                answer_zap_requests(self._sockets.zap, self._authenticate)
             self._read_connection_events()
             self._count_reasons(self._guard.tick(self._now_ns()))
             self._receive_requests()
@@ -191,7 +191,7 @@ class AssetServer:
             self._guard.evict(descriptor, "")
 
     def _authenticate(self, request: list[bytes]) -> str:
-        mark = fingerprint(request[6]) if asks_with_curve(request) else ""
+        mark = compute_fingerprint(request[6]) if is_curve_request(request) else ""
         if mark in self._applied.marks:
             return mark
         self._count_reasons(["assets_unknown_key"])

@@ -1,51 +1,42 @@
-"""Who may have which assets: the front's side of the assets channel. Tells its thread whenever something changed."""
+"""Access to assets: which clients may fetch which assets. Updates the thread of `asset_server` on every change."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import Final
 
 from iris_session.front.asset_server import AssetAccess, AssetFolder, AssetServer
-from iris_session.front.connections import ConnectionTable, FrontConnection
-from iris_session.front.state_publisher import StatePublisher
+from iris_session.front.context import FrontContext
 from iris_session.link.config import MILLISECOND, SceneInfo
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import AssetsReport
-from iris_session.security.keyring import Keyring
 
 PERIOD_NS: Final = 250 * MILLISECOND
-#: State that left so long after its tick is late: the bar for its whole way to a client is 3 ms.
+#: State sent so long after its tick is late: the limit for its whole way to a client is 3 ms.
 LATE_NS: Final = 2 * MILLISECOND
-#: Between two turns of the loop, which come every 10 ms.
+#: A tick of the loop that is so long after the one before is late: they come every 10 ms.
 LATE_TICK_NS: Final = 25 * MILLISECOND
-#: How long assets hold back then.
+#: How long assets yield then.
 YIELD_NS: Final = 20 * MILLISECOND
-#: Specifications of scenes before those two are served for so long after they were replaced, so that whoever hears of
-#: them over a slow network gets one, however often the scene is patched; and so many of them.
+#: Specifications of earlier scenes are served for so long after they were replaced, so that a client on a slow network
+#: gets one however often the scene is patched; and so many of them.
 REPLACED_NS: Final = 5_000 * MILLISECOND
 MAX_REPLACED: Final = 64
 
 
 class AssetService:
-    """A `Service`. Served is what the publisher's scene and the one before it name, and specifications that were
-    replaced lately. `revoked(key)`: may do nothing."""
+    """Decide which assets are served to whom. A `Service`.
 
-    def __init__(
-        self,
-        server: AssetServer,
-        clients: ConnectionTable,
-        keyring: Keyring,
-        drops: Drops,
-        publisher: StatePublisher,
-        revoked: Callable[[str], bool],
-    ) -> None:
+    Served are the assets of the present scene and of the one before, and specifications that were replaced lately.
+    """
+
+    def __init__(self, context: FrontContext, server: AssetServer) -> None:
+        self._context = context
+        self._connections = context.connections
+        self._keyring = context.keyring
+        self._drops = context.drops
+        self._publisher = context.publisher
+        self._tokens = context.tokens
         self._server = server
-        self._clients = clients
-        self._keyring = keyring
-        self._drops = drops
-        self._publisher = publisher
-        self._revoked = revoked
         self._previous: SceneInfo | None = None
         self._present: SceneInfo | None = None
         self._folders: tuple[AssetFolder, ...] = ()  # the present one is the last
@@ -56,7 +47,7 @@ class AssetService:
         server.start()
 
     def tick(self, now_ns: int) -> None:
-        """Lets in who came and out who left, at once; gives the state its way."""
+        """Take over which clients are admitted, and let assets yield to late state."""
         self._yield_to_state(now_ns)
         due = now_ns >= self._next_ns
         if due:
@@ -66,10 +57,12 @@ class AssetService:
         self.sync_clients(keys=due)
 
     def sync_clients(self, *, keys: bool = False) -> None:
-        """Tells the thread who is there, and which scene. `keys`: also when only the allow-list may have changed."""
+        """Update the thread's clients and scene. `keys`: also if only the allow-list may have changed."""
         if self._publisher.scene is not self._present:
             self._change_scene(self._publisher.scene)
-        listeners = {n: self._user_of(one) for n, one in self._clients.by_number.items() if one.admitted}
+        listeners = {
+            n: self._context.find_channel_key(one) for n, one in self._connections.by_number.items() if one.admitted
+        }
         if keys or listeners != self._published.listeners or self._folders is not self._published.stores:
             self._publish_access(listeners)
 
@@ -77,18 +70,18 @@ class AssetService:
         self._server.close()
 
     def report(self) -> AssetsReport:
-        """For the status."""
-        tallied = self._server.read_counters()
+        """Return the counters for the status."""
+        counters = self._server.read_counters()
         return AssetsReport(
             sum(len(addresses) for _, addresses in self._folders[-1:]),
-            tallied.bytes,
-            tallied.requests,
-            sum(tallied.reasons.values()),
-            tallied.waiting,
+            counters.bytes,
+            counters.requests,
+            sum(counters.reasons.values()),
+            counters.waiting,
         )
 
     def _yield_to_state(self, now_ns: int) -> None:
-        """When state was late since the last turn, or this turn is."""
+        """Let assets yield if state was late since the last tick, or this tick is."""
         late = 0 < self._ticked_ns < now_ns - LATE_TICK_NS
         if self._publisher.frames != self._frames:
             late |= self._publisher.newest_delay_ns > LATE_NS
@@ -97,7 +90,7 @@ class AssetService:
             self._server.late_until_ns = now_ns + YIELD_NS
 
     def _change_scene(self, scene: SceneInfo) -> None:
-        """Another scene: what only the one before the last named is served no more, but for its specification."""
+        """Serve another scene. Assets of the scene before the last are served no longer, except its specification."""
         before, present = self._previous, self._present
         if before is not None and before.scene_hash in before.assets:
             self._replaced.append((self._ticked_ns + REPLACED_NS, (before.asset_root, (before.scene_hash,))))
@@ -105,7 +98,7 @@ class AssetService:
         self._update_folders()
 
     def _expire_replaced(self, now_ns: int) -> None:
-        """Specifications that were replaced long enough ago."""
+        """Stop serving specifications that were replaced long enough ago."""
         n = len(self._replaced)
         while self._replaced and self._replaced[0][0] < now_ns:
             self._replaced.popleft()
@@ -118,11 +111,13 @@ class AssetService:
 
     def _publish_access(self, listeners: dict[int, str]) -> None:
         keyring = self._keyring
-        marks = frozenset() if keyring.key is None else frozenset(m for m in keyring.marks if not self._revoked(m))
-        table = AssetAccess(listeners, marks, self._folders)
-        if table != self._published:
-            self._published = table
-            self._server.set_access(table)
+        keys: frozenset[str] = frozenset()
+        if keyring.key is not None:
+            keys = frozenset(key for key in keyring.fingerprints if not self._tokens.is_revoked(key))
+        access = AssetAccess(listeners, keys, self._folders)
+        if access != self._published:
+            self._published = access
+            self._server.set_access(access)
 
     def _count_drops(self) -> None:
         for reason, count in self._server.read_counters().reasons.items():
@@ -130,10 +125,3 @@ class AssetService:
             if more:
                 self._drops.count(reason, n=more)
                 self._counted[reason] = count
-
-    def _user_of(self, connection: FrontConnection) -> str:
-        """The key of the TCP connections by which this connection may ask: of people behind a gateway, its."""
-        if self._keyring.key is None:
-            return ""
-        gateway = self._clients.by_number.get(connection.gateway)
-        return connection.key_id if gateway is None else gateway.key_id

@@ -13,17 +13,20 @@ from typing import Final, NamedTuple
 import msgspec
 import zmq
 
-from iris_session.link.config import FrontLimits
+from iris_session.link.config import SECOND, FrontLimits
 from iris_session.link.sockets import tcp_counts
 from iris_session.protocol.client_messages import Hello
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.limits import Drops, RateLimiter, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION
 from iris_session.protocol.server_messages import ServerMessage
+from iris_session.protocol.status import ClientReport
 
 _encoder = msgspec.msgpack.Encoder()
 #: Disconnected connections that may still stop the session.
 MAX_KEPT: Final = 256
+#: A client's report that is older says nothing about the present.
+REPORT_EXPIRY_NS: Final = 3 * SECOND
 #: ZMTP 3: flags and length before a frame, the length in one byte or eight.
 _SHORT: Final = 255
 _SHORT_HEADER: Final = 2
@@ -57,6 +60,7 @@ class FrontConnection:
         flood_last_ns, flood_since_ns: When a rate limit was last exceeded, and since when without a pause.
         late_epoch: The newest tracking epoch that came above its rate limit.
         prefix: Encoded start of every `ServerEnvelope` to this connection.
+        report: The client's newest report, and `reported_ns` when it came.
     """
 
     __slots__ = (
@@ -78,6 +82,8 @@ class FrontConnection:
         "peer",
         "prefix",
         "rates",
+        "report",
+        "reported_ns",
         "route",
     )
 
@@ -102,6 +108,12 @@ class FrontConnection:
         self.late_epoch: Entry | None = None
         self.rates = RateLimiter()
         self.prefix = encode_envelope_prefix(number)
+        self.report: ClientReport | None = None
+        self.reported_ns = 0
+
+    def recent_report(self, now_ns: int) -> ClientReport | None:
+        """Return the client's newest report, `None` if it is older than `REPORT_EXPIRY_NS`."""
+        return self.report if now_ns - self.reported_ns <= REPORT_EXPIRY_NS else None
 
 
 class ConnectionTable:

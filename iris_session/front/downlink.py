@@ -1,20 +1,21 @@
-"""What comes from the authority: state to the PUB socket first, then welcomes, answers and events to clients."""
+"""From the authority to clients: state to the state socket first, then welcomes, replies and events."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Final
 
 import msgspec
 import zmq
 
 from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, encode_message
+from iris_session.front.asset_service import AssetService
+from iris_session.front.connections import encode_message
+from iris_session.front.context import FrontContext
+from iris_session.front.disconnects import DisconnectHandler
 from iris_session.front.revocation import RevocationService
-from iris_session.front.state_publisher import StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.sockets import readable
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import FaultCode
 from iris_session.protocol.server_messages import (
     Event,
@@ -24,70 +25,59 @@ from iris_session.protocol.server_messages import (
     ServerMessage,
     Snapshot,
 )
-from iris_session.protocol.steps import Outgoing
+from iris_session.protocol.steps import OutgoingMessage
 
-_MAX_MESSAGES = 64  # messages taken at once
-#: Why a director ends a participation: nobody joins again by itself after that.
-REMOVALS = ("removed", "revoked")
+_MAX_MESSAGES: Final = 64  # read at once
+#: Reasons by which a director ends a participation: the client does not join again by itself after them.
+REMOVALS: Final = ("removed", "revoked")
 
 
 class Downlink:
-    """Drains the link. `forget` is called with connections that the authority is done with, and why.
-
-    `heard_ns`: session time of the last word of the authority, 0 before its first. `acknowledged`: batches taken by
-    it since the start. `report`: the newest status report of the authority, encoded. `ended`: the session is over.
-    `on_scene`: called with another scene before anybody hears of it.
-    """
+    """Read the link and pass on what it carries."""
 
     def __init__(
         self,
+        context: FrontContext,
         socket: zmq.Socket[bytes],
-        clients: ConnectionTable,
-        outbox: Outbox,
         admission: Admission,
-        publisher: StatePublisher,
-        drops: Drops,
-        session_ns: Callable[[], int],
-        forget: Callable[[FrontConnection, str], None],
+        disconnects: DisconnectHandler,
         revocation: RevocationService,
         alignment: AlignmentService,
-        on_scene: Callable[[], None],
+        assets: AssetService,
     ) -> None:
         self._socket = socket
-        self._clients = clients
-        self._outbox = outbox
+        self._authority = context.authority
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._publisher = context.publisher
+        self._drops = context.drops
+        self._now_ns = context.now_ns
         self._admission = admission
-        self._publisher = publisher
-        self._drops = drops
-        self._session_ns = session_ns
-        self._forget = forget
+        self._disconnects = disconnects
         self._revocation = revocation
         self._alignment = alignment
-        self._on_scene = on_scene
-        self.heard_ns = 0
-        self.acknowledged = 0
-        self.report = b""
-        self.ended = False
+        self._assets = assets
 
     def drain(self) -> None:
-        """Takes what waits. Of several states only the newest is sent: they would fill the subscribers' queues."""
+        """Handle pending messages. Of several states only the newest is published: more would fill the subscribers'
+        queues."""
         if not readable(self._socket):
             return
-        waiting = [self._socket.recv_multipart()]
-        while len(waiting) < _MAX_MESSAGES and readable(self._socket):
-            waiting.append(self._socket.recv_multipart())
-        self.heard_ns = self._session_ns()
-        states = [i for i, frames in enumerate(waiting) if frames[0] == link.STATE]
+        pending = [self._socket.recv_multipart()]
+        while len(pending) < _MAX_MESSAGES and readable(self._socket):
+            pending.append(self._socket.recv_multipart())
+        self._authority.heard_ns = self._now_ns()
+        states = [i for i, frames in enumerate(pending) if frames[0] == link.STATE]
         if states:
-            # First of all, unless the scene changes before it.
+            # State goes first, unless the scene changes before it.
             newest = states[-1]
-            first = 0 if all(frames[0] != link.SCENE for frames in waiting[:newest]) else newest
-            state = waiting.pop(newest)
-            waiting.insert(first, state)
+            first = 0 if all(frames[0] != link.SCENE for frames in pending[:newest]) else newest
+            state = pending.pop(newest)
+            pending.insert(first, state)
             if len(states) > 1:
                 self._drops.count("state_superseded", n=len(states) - 1)
-                waiting = [frames for frames in waiting if frames[0] != link.STATE or frames is state]
-        for frames in waiting:
+                pending = [frames for frames in pending if frames[0] != link.STATE or frames is state]
+        for frames in pending:
             self._handle(frames)
 
     def _handle(self, frames: list[bytes]) -> None:
@@ -96,29 +86,29 @@ class Downlink:
             if not self._publisher.publish(frames[1], frames[2]):
                 self._drops.count("state_of_other_scene")
         elif kind == link.ACK:
-            self.acknowledged += frames[1][0]
+            self._authority.acknowledged += frames[1][0]
         elif kind == link.DECIDED:
             try:
                 decided = link.decode_decided(frames[1])
-            except msgspec.ValidationError:  # beyond a limit of the protocol: no client would have taken it either
+            except msgspec.ValidationError:  # exceeds a limit of the protocol: a client would not accept it either
                 self._drops.count("decision_invalid")
                 return
             self._handle_decision(decided)
         elif kind == link.PRESENCE:
-            self._publisher.publish_presence(self.heard_ns, frames[1])
+            self._publisher.publish_presence(self._authority.heard_ns, frames[1])
         elif kind == link.SCENE:
             self._publisher.set_scene(link.decode_scene(frames[1]))
-            self._on_scene()
+            self._assets.sync_clients()  # before a client hears of the scene
         elif kind == link.REPORT:
-            self.report = frames[1]
+            self._authority.report = frames[1]
         elif kind == link.END:
-            self.ended = True
+            self._authority.ended = True
 
     def _handle_decision(self, decided: link.Decided) -> None:
-        """Welcomes, answers, events, then snapshots: those are of the end of the step, with its events. Who takes part
-        already gets the events first, because a client passes over those that its snapshot contains."""
+        """Send welcomes, replies, events, then snapshots: those are of the end of the step, with its events.
+        Participants get the events first, because a client skips those that its snapshot contains."""
         for admitted in decided.admitted:
-            self._admission.send_welcome(admitted, self._session_ns(), self._publisher.scene.tick_period_ns)
+            self._admission.send_welcome(admitted, self._now_ns(), self._publisher.scene.tick_period_ns)
         snapshots = [outgoing for outgoing in decided.outgoing if isinstance(outgoing.message, Snapshot)]
         for outgoing in decided.outgoing:
             if not isinstance(outgoing.message, Snapshot):
@@ -130,26 +120,27 @@ class Downlink:
                 self._admission.expire_tokens(event.body.participant)
         for outgoing in snapshots:
             self._send_outgoing(outgoing)
+        heard_ns = self._authority.heard_ns
         for dropped in decided.dropped:
-            connection = self._clients.by_number.get(dropped.connection)
+            connection = self._connections.by_number.get(dropped.connection)
             if dropped.reason in REMOVALS and connection is not None:
                 text = f"a director {dropped.reason} this participant"
-                self._revocation.disconnect(connection, text, self.heard_ns, dropped.reason)
-                self._forget(connection, dropped.reason)
+                self._revocation.disconnect(connection, text, heard_ns, dropped.reason)
+                self._disconnects.remove(connection, dropped.reason)
             elif connection is not None:
                 text = f"the session let this connection go: {dropped.reason}"
                 self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, dropped.reason))
-                self._forget(connection, dropped.reason)
+                self._disconnects.remove(connection, dropped.reason)
             if dropped.key_id:
-                self._revocation.revoke(dropped.key_id, self.heard_ns)
+                self._revocation.revoke(dropped.key_id, heard_ns)
 
-    def _send_outgoing(self, outgoing: Outgoing) -> None:
+    def _send_outgoing(self, outgoing: OutgoingMessage) -> None:
         message: ServerMessage = outgoing.message
-        connection = self._clients.by_number.get(outgoing.connection)
+        connection = self._connections.by_number.get(outgoing.connection)
         if connection is None:
             return
         if isinstance(message, Snapshot):
-            # What only the front knows: the scene, and the poses of the newest state frame.
+            # The front adds what only it knows: the scene, and the poses of the newest state frame.
             self._alignment.process_snapshot(message.participants)
             state_seq, poses = self._publisher.read_keyframe()
             scene = self._publisher.scene
@@ -160,11 +151,11 @@ class Downlink:
             return
         self._outbox.send(connection, message)
         if isinstance(message, Refused):
-            self._forget(connection, "refused")
+            self._disconnects.remove(connection, "refused")
 
     def broadcast(self, message: Event | ProtocolFault) -> None:
-        """To every admitted connection; encoded once."""
+        """Send a message to every admitted connection, encoded once."""
         encoded = encode_message(message)
-        for connection in self._clients.by_number.values():
+        for connection in self._connections.by_number.values():
             if connection.admitted:
                 self._outbox.send_encoded(connection, encoded)

@@ -1,22 +1,20 @@
-"""From a frame of a client to an entry: decode, limit, dispatch. Nothing that a client sends raises past here."""
+"""From a frame of a client to an entry: decode, limit, dispatch. Nothing that a client sends raises out of here."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import msgspec
 import zmq
 
 from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
-from iris_session.front.audit import AuditTrail
-from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import BEFORE_HELLO, ConnectionGuard
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox, Peer, Route
+from iris_session.front.connection_guard import BEFORE_HELLO
+from iris_session.front.connections import FrontConnection, Peer, Route
+from iris_session.front.context import FrontContext
 from iris_session.front.pairing import PairingService
 from iris_session.front.status import StatusService
-from iris_session.link.config import FrontConfig
 from iris_session.link.sockets import peer_of
 from iris_session.protocol.client_messages import (
     ClientEnvelope,
@@ -38,19 +36,42 @@ from iris_session.protocol.limits import LIMITS, Drops, TokenBucket
 from iris_session.protocol.names import PROTOCOL_VERSION, AuditKind, DenialReason, FaultCode, RefusalCode
 from iris_session.protocol.server_messages import ClockPong, ProtocolFault, Refused, Reply
 from iris_session.protocol.status import ClientReport, GetStatus
-from iris_session.security import fingerprint, raw_key
-from iris_session.security.keyring import stranger_key
+from iris_session.security import compute_fingerprint, decode_key
+from iris_session.security.keyring import parse_pairing_key
 
-#: Faults to strangers, per second: they have no connection to count on.
+#: Faults per second to peers without a connection, on which they could be limited.
 _UNKNOWN_PEER_FAULTS: Final = 20
 _RECORDER_HWM: Final = 20_000
-#: Who is above a rate limit for longer floods.
+#: A client above a rate limit for longer is reported as flooding.
 FLOOD_NS: Final = 2_000_000_000
 _encode = msgspec.msgpack.Encoder().encode
 
 
+class _RawEnvelope(msgspec.Struct, array_like=True):
+    """`ClientEnvelope` with its message as received."""
+
+    version: int
+    connection_epoch: int
+    on_behalf_of: str
+    message: msgspec.Raw
+
+
+class _RawSamples(msgspec.Struct, array_like=True):
+    """`Samples` with each sample as received."""
+
+    tag: str
+    samples: list[msgspec.Raw]
+
+
+_decode_raw_envelope = msgspec.msgpack.Decoder(_RawEnvelope).decode
+_decode_raw_samples = msgspec.msgpack.Decoder(_RawSamples).decode
+
+
 class RawFeed:
-    """Raw samples and observations to the recorder, `[connection, receive_ns, message bytes]`. Never blocks."""
+    """Forward samples and observations to the recorder as received: `[connection, receive_ns, message bytes]`.
+
+    Never blocks. Without an endpoint nothing is forwarded.
+    """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, drops: Drops) -> None:
         self._drops = drops
@@ -60,54 +81,59 @@ class RawFeed:
             self._socket.setsockopt(zmq.LINGER, 200)
             self._socket.connect(endpoint)
 
-    def send(self, connection: int, receive_ns: int, message: ClientMessage) -> None:
+    def split(self, frame: memoryview, *, together: bool) -> Sequence[Any]:
+        """Return the bytes of the message in a valid frame, or of each sample in it (`together`); nothing if they are
+        not forwarded."""
+        if self._socket is None:
+            return ()
+        message = _decode_raw_envelope(frame).message
+        return _decode_raw_samples(message).samples if together else (message,)
+
+    def send(self, connection: int, receive_ns: int, message: msgspec.Raw) -> None:
+        """Forward one message."""
         if self._socket is None:
             return
         try:
-            self._socket.send(_encode((connection, receive_ns, _encode(message))), zmq.DONTWAIT)
+            self._socket.send(_encode((connection, receive_ns, bytes(message))), zmq.DONTWAIT)
         except zmq.Again:
             self._drops.count("recorder_queue_full", connection)
 
 
 class Intake:
-    """Takes what arrives on the control socket. `entries` go to `coalescer`."""
+    """Handle messages of the control socket and offer entries to the coalescer.
+
+    Attributes:
+        replaced: Connections replaced by a new hello or another peer on their route. The loop disconnects them.
+    """
 
     def __init__(
         self,
-        config: FrontConfig,
-        clients: ConnectionTable,
-        outbox: Outbox,
+        context: FrontContext,
         admission: Admission,
-        coalescer: Coalescer,
-        raw: RawFeed,
-        drops: Drops,
-        session_ns: Callable[[], int],
-        status: StatusService,
         pairing: PairingService,
-        audit: AuditTrail,
-        guard: ConnectionGuard,
+        status: StatusService,
         alignment: AlignmentService,
+        raw: RawFeed,
     ) -> None:
-        self._config = config
-        self._clients = clients
-        self._outbox = outbox
+        self._config = context.config
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._coalescer = context.coalescer
+        self._drops = context.drops
+        self._audit = context.audit
+        self._guard = context.guard
+        self._now_ns = context.now_ns
         self._admission = admission
-        self._coalescer = coalescer
-        self._raw = raw
-        self._drops = drops
-        self._session_ns = session_ns
-        self._status = status
         self._pairing = pairing
-        self._audit = audit
-        self._guard = guard
+        self._status = status
         self._alignment = alignment
+        self._raw = raw
         self._unknown_peer_faults = TokenBucket(_UNKNOWN_PEER_FAULTS, _UNKNOWN_PEER_FAULTS)
-        #: Connections replaced by a new hello or peer on the same route; the loop takes leave of them.
         self.replaced: list[FrontConnection] = []
 
     def handle_message(self, routing_id: bytes, peer: Peer, data: memoryview, extra_frames: int) -> None:
-        """One message from the socket."""
-        now_ns = self._session_ns()
+        """Handle one message of the socket."""
+        now_ns = self._now_ns()
         route = Route(routing_id)
         try:
             if extra_frames:
@@ -119,27 +145,27 @@ class Intake:
         if envelope.on_behalf_of:
             route = Route(routing_id, envelope.on_behalf_of)
             self._touch_gateway(Route(routing_id), peer, now_ns)
-        self._dispatch(route, peer, envelope, now_ns)
+        self._dispatch(route, peer, envelope, data, now_ns)
 
     def _touch_gateway(self, route: Route, peer: Peer, now_ns: int) -> None:
-        gateway = self._clients.find(route, peer)
+        gateway = self._connections.find(route, peer)
         if gateway is not None:
             gateway.last_heard_ns = now_ns
 
-    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
+    def _dispatch(self, route: Route, peer: Peer, envelope: ClientEnvelope, data: memoryview, now_ns: int) -> None:
         message = envelope.message
         if isinstance(message, Pair):
             self._guard.touch(peer.descriptor, now_ns)
             self._count_rejection(peer, None, now_ns)
             self._pairing.handle_pair(route, peer, message, now_ns)
             return
-        if stranger_key(peer.user_id):
+        if parse_pairing_key(peer.user_id):
             self._reject_unpaired(route, peer, message, now_ns)
             return
-        connection = self._clients.by_route.get(route)
+        connection = self._connections.by_route.get(route)
         if connection is not None and (connection.peer != peer or isinstance(message, Hello)):
             self.replaced.append(connection)
-            self._clients.remove(connection)
+            self._connections.remove(connection)
             connection = None
         if connection is None and isinstance(message, EStop):
             self._forward_late_estop(route, peer, envelope, now_ns)
@@ -155,23 +181,22 @@ class Intake:
             self._send_fault(route, None, FaultCode.HELLO, "only a gateway speaks on behalf of others", now_ns)
         elif connection is None:
             self._count_rejection(peer, None, now_ns)
-            self._send_fault(
-                route, None, FaultCode.HELLO, "this connection has not said hello: say hello (again)", now_ns
-            )
+            text = "this connection has not said hello: say hello (again)"
+            self._send_fault(route, None, FaultCode.HELLO, text, now_ns)
         else:
-            self._handle_from_connection(connection, envelope, now_ns)
+            self._handle_from_connection(connection, envelope, data, now_ns)
 
     def _forward_late_estop(self, route: Route, peer: Peer, envelope: ClientEnvelope, now_ns: int) -> None:
-        """An e-stop of somebody who was given up, and does not know it yet, counts."""
-        lost = self._clients.find_kept(route, peer)
-        if lost is not None:
-            self._coalescer.offer(Entry(lost.number, envelope.connection_epoch, now_ns, envelope.message))  # type: ignore[arg-type]
+        """Forward the e-stop of a client that was disconnected and does not know it yet."""
+        kept = self._connections.find_kept(route, peer)
+        if kept is not None:
+            self._coalescer.offer(Entry(kept.number, envelope.connection_epoch, now_ns, envelope.message))  # type: ignore[arg-type]
 
     def _reject_unpaired(self, route: Route, peer: Peer, message: ClientMessage, now_ns: int) -> None:
-        """A key that is not on the list said something else than `Pair`."""
+        """Reject a message other than `Pair` of a key that is not on the list."""
         self._drops.count("unpaired")
         self._count_rejection(peer, None, now_ns)
-        mark, name = fingerprint(raw_key(stranger_key(peer.user_id))), getattr(message, "name", "")
+        mark, name = compute_fingerprint(decode_key(parse_pairing_key(peer.user_id))), getattr(message, "name", "")
         address = peer_of(peer.descriptor)[0]
         self._audit.record(
             AuditKind.KEY_REFUSED, now_ns, subject=mark, name=name, address=address, detail=tag_of(type(message))
@@ -180,7 +205,9 @@ class Intake:
             text, advice = "this key is not on the session's list", "run `iris-session pair` there, join with its code"
             self._outbox.send_to_route(route, Refused(RefusalCode.UNPAIRED, text, advice))
 
-    def _handle_from_connection(self, connection: FrontConnection, envelope: ClientEnvelope, now_ns: int) -> None:
+    def _handle_from_connection(
+        self, connection: FrontConnection, envelope: ClientEnvelope, data: memoryview, now_ns: int
+    ) -> None:
         message = envelope.message
         connection.last_heard_ns = now_ns
         if not connection.admitted and not isinstance(message, (GetStatus, EStop)):  # anyone may stop, however early
@@ -211,60 +238,72 @@ class Intake:
             self._status.send_report(connection, message, now_ns)
             return
         if isinstance(message, ClientReport):
-            self._status.record_report(connection.number, message, now_ns)
+            self._status.record_report(connection, message, now_ns)
+            return
+        if isinstance(message, Samples):
+            self._handle_samples(connection, envelope.connection_epoch, message, data, now_ns)
+            return
+        if isinstance(message, ClockPing):
+            self._outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._now_ns()))
             return
         if isinstance(message, Sample):
+            self._forward_raw(connection, data, now_ns)
             self._observe_sample(connection, message, now_ns)
-        elif isinstance(message, Samples):
-            self._handle_samples(connection, envelope.connection_epoch, message, now_ns)
-            return
-        elif isinstance(message, ClockPing):
-            self._outbox.send(connection, ClockPong(message.t0_ns, now_ns, self._session_ns()))
-            return
         elif isinstance(message, Observation):
-            self._raw.send(connection.number, now_ns, message)
+            self._forward_raw(connection, data, now_ns)
             self._alignment.process_observation(connection, message, now_ns)
             if not self._config.forward_observations:
                 return
         entry = Entry(connection.number, envelope.connection_epoch, now_ns, message)  # type: ignore[arg-type]
         if not self._coalescer.offer(entry) and not isinstance(message, Sample):
-            text = f"{tag_of(kind)}: the session does not keep up with what this client sends"
+            text = f"{tag_of(kind)}: queue to the session full: send less"
             if not self._send_denial(connection, message, text, now_ns):
                 self._send_fault(connection.route, connection, FaultCode.RATE, text, now_ns)
 
     def _send_denial(self, connection: FrontConnection, message: ClientMessage, text: str, now_ns: int) -> bool:
-        """Answers a request that is not taken, at a bounded rate: somebody waits for it. False: it is none."""
+        """Deny a request that was rejected, at a bounded rate, because its client waits for a reply.
+
+        Returns whether the message is a request.
+        """
         request_id = getattr(message, "request_id", 0)
         if request_id and connection.denials.take(now_ns):
             denial = Denial(DenialReason.QUOTA, text, "send less, or the same again in a moment")
             self._outbox.send(connection, Reply(request_id, False, denial))
         return bool(request_id)
 
-    def _handle_samples(self, connection: FrontConnection, epoch: int, samples: Samples, now_ns: int) -> None:
-        """Each within the rate of single samples."""
-        for sample in samples.samples:
+    def _handle_samples(
+        self, connection: FrontConnection, epoch: int, samples: Samples, data: memoryview, now_ns: int
+    ) -> None:
+        """Handle each sample within the rate limit of single samples."""
+        raw = self._raw.split(data, together=True)
+        for index, sample in enumerate(samples.samples):
             if connection.rates.allow(Sample, now_ns):
+                if raw:
+                    self._raw.send(connection.number, now_ns, raw[index])
                 self._observe_sample(connection, sample, now_ns)
                 self._coalescer.offer(Entry(connection.number, epoch, now_ns, sample))
             else:
                 self._drops.count(FaultCode.RATE, connection.number)
                 self._count_flood(connection, "sample", now_ns)
 
+    def _forward_raw(self, connection: FrontConnection, data: memoryview, now_ns: int) -> None:
+        for message in self._raw.split(data, together=False):
+            self._raw.send(connection.number, now_ns, message)
+
     def _observe_sample(self, connection: FrontConnection, sample: Sample, now_ns: int) -> None:
-        """What is done with every sample as it came, before samples are coalesced."""
-        self._raw.send(connection.number, now_ns, sample)
+        """Pass every sample on to status and alignment, before samples are coalesced."""
         self._status.record_sample(connection.number, sample, now_ns)
         self._alignment.process_sample(connection, sample, now_ns)
 
     def _count_rejection(
-        self, peer: Peer, connection: FrontConnection | None, now_ns: int, what: str = BEFORE_HELLO
+        self, peer: Peer, connection: FrontConnection | None, now_ns: int, detail: str = BEFORE_HELLO
     ) -> None:
-        """Counts towards being cut off."""
-        if self._guard.rate_limit(peer, connection, what, now_ns) and connection is not None:
+        """Count a rejected message. Too many of them close the TCP connection."""
+        if self._guard.rate_limit(peer, connection, detail, now_ns) and connection is not None:
             self._outbox.failed.setdefault(connection.number, "flood")
 
     def _count_flood(self, connection: FrontConnection, tag: str, now_ns: int) -> None:
-        """Above its limits for seconds: no slip any more."""
+        """Count a message above a rate limit, and report a client that is above it for seconds."""
         self._count_rejection(connection.peer, connection, now_ns, tag)
         if now_ns - connection.flood_last_ns > FLOOD_NS:
             connection.flood_since_ns = now_ns
@@ -273,8 +312,8 @@ class Intake:
             self._guard.report_flood(connection.address[0], tag, now_ns, connection)
 
     def _reject_unreadable(self, route: Route, peer: Peer, error: ProtocolError, now_ns: int) -> None:
-        """Before `hello` this is the answer to it, so it is a refusal."""
-        connection = self._clients.find(route, peer)
+        """Reject a message that cannot be decoded; before `hello` with a refusal, as the answer to it."""
+        connection = self._connections.find(route, peer)
         self._count_rejection(peer, connection, now_ns, error.code if connection is not None else BEFORE_HELLO)
         if connection is not None:
             self._send_fault(route, connection, error.code, str(error), now_ns)
@@ -287,7 +326,7 @@ class Intake:
             self._outbox.send_to_route(route, Refused(error.code, str(error), advice))
 
     def _send_fault(self, route: Route, connection: FrontConnection | None, code: str, text: str, now_ns: int) -> None:
-        """Counts, and says so at a bounded rate."""
+        """Count a fault, and send it at a bounded rate."""
         fault = ProtocolFault(code, text)
         if connection is None:
             self._drops.count(f"stranger_{code}")

@@ -14,11 +14,13 @@ import msgspec
 from iris_session.front.loop import ENDED, ORPHANED, Front
 from iris_session.link.config import FrontError, FrontStart
 from iris_session.link.sockets import raise_descriptor_limit
+from iris_session.system.log import configure_logging
 from iris_session.system.process import die_with_parent, is_parent, wait_for_parent_exit
 
 
 def main() -> int:
-    """Serves one session. Exit status 1 when the front could not start; the link has told why."""
+    """Serve one session. The exit status is 1 if the front cannot start; the authority was notified over the link."""
+    configure_logging()
     start = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=FrontStart)
     raise_descriptor_limit()
     try:
@@ -35,7 +37,7 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, on_signal)
     die_with_parent(signal.SIGHUP)
-    # Everything made so far lives as long as the process; the loop collects the rest when it is idle.
+    # All objects made so far live as long as the process; the loop collects the rest when it is idle.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -44,7 +46,7 @@ def main() -> int:
     finally:
         front.close()
         if (front.cut_off or front.ended == ORPHANED) and wait_for_parent_exit(start.parent_pid):
-            # Killed: nobody else removes the folder of the link.
+            # The parent was killed, so the folder of the link is removed here.
             shutil.rmtree(Path(start.link_endpoint.removeprefix("ipc://")).parent, ignore_errors=True)
     return 0
 

@@ -1,21 +1,21 @@
-"""Revoked keys: their connections end at once, and those behind them; their participants are removed.
+"""Revocation of keys: closes their connections and those behind them at once, and removes their participants.
 
 libzmq cannot drop one subscriber. So, if the key may have one, the state socket is closed and opened again on the same
-port: everyone else connects again within a fraction of a second, the revoked key is not let in.
+port: all other clients connect again within a fraction of a second, and the revoked key is refused.
 """
 
 from __future__ import annotations
 
-import sys
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Final
 
 import zmq
 
-from iris_session.front.audit import AuditTrail
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox
-from iris_session.front.state_publisher import StatePublisher
+from iris_session.front.connections import FrontConnection
+from iris_session.front.context import FrontContext
+from iris_session.front.disconnects import DisconnectHandler
 from iris_session.link.config import MILLISECOND, SECOND, FrontError
 from iris_session.link.sockets import close_tcp
 from iris_session.protocol.client_messages import RemoveParticipant
@@ -23,14 +23,15 @@ from iris_session.protocol.entries import HOST, Entry
 from iris_session.protocol.names import AuditKind, FaultCode
 from iris_session.protocol.server_messages import ProtocolFault
 from iris_session.security import AllowList, KeysBusyError, KeysError
-from iris_session.security.file_worker import PATIENCE_S
-from iris_session.security.keyring import Keyring, roles_behind
-from iris_session.security.resume_tokens import ResumeTokens
+from iris_session.security.keyring import select_gateway_roles
+from iris_session.system.file_worker import LOCK_TIMEOUT_S
+
+log = logging.getLogger(__name__)
 
 CHECK_PERIOD_NS: Final = 100 * MILLISECOND
 #: Between the fault and the end of the TCP connection, so that the fault arrives.
 FAREWELL_NS: Final = 100 * MILLISECOND
-#: libzmq frees a port some milliseconds after its socket was closed; later than this somebody else has it.
+#: libzmq frees a port some milliseconds after its socket was closed; later than this another process has it.
 PORT_FREE_NS: Final = 5 * SECOND
 SEEN_NS: Final = 60 * SECOND
 REVOKED: Final = "this key was taken off the session's list"
@@ -39,99 +40,92 @@ ROLE_TAKEN: Final = "its key lost the role"
 
 
 class RevocationService:
-    """A `Service`. `lose` tells the authority that a connection is gone; `open_state` opens the state socket, and
-    raises `FrontError` while its port is not free yet."""
+    """Apply changes of the allow-list, and write those of a director. A `Service`.
+
+    `open_state` opens the state socket, and raises `FrontError` while its port is not free yet.
+    """
 
     def __init__(
-        self,
-        keyring: Keyring,
-        clients: ConnectionTable,
-        outbox: Outbox,
-        tokens: ResumeTokens,
-        audit: AuditTrail,
-        publisher: StatePublisher,
-        offer: Callable[[Entry], bool],
-        lose: Callable[[FrontConnection, str], None],
-        open_state: Callable[[], zmq.Socket[bytes]],
+        self, context: FrontContext, disconnects: DisconnectHandler, open_state: Callable[[], zmq.Socket[bytes]]
     ) -> None:
-        self._keyring = keyring
-        self._clients = clients
-        self._outbox = outbox
-        self._tokens = tokens
-        self._audit = audit
-        self._publisher = publisher
-        self._offer = offer
-        self._lose = lose
+        self._keyring = context.keyring
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._tokens = context.tokens
+        self._audit = context.audit
+        self._publisher = context.publisher
+        self._coalescer = context.coalescer
+        self._disconnects = disconnects
         self._open_state = open_state
         self._closing: list[tuple[int, FrontConnection]] = []
         self._writing = False
-        self._reported_error = ""  # what went wrong with the list last
+        self._reported_error = ""  # of the allow-list, logged last
         self._state_due_ns = 0  # while the state socket is closed: when its port should have been free
-        self._next_look_ns = self._next_seen_ns = 0
+        self._next_check_ns = self._next_seen_ns = 0
 
     def revoke(self, key_id: str, now_ns: int) -> None:
-        """A director's word: ends the key here, and takes it off the list."""
-        self._keyring.revoking[key_id] = None
+        """Revoke a key on request of a director: disconnect it, and take it off the list."""
+        self._keyring.pending_revocations[key_id] = None
         self._disconnect_key(key_id, now_ns, "a director revoked this key")
 
     def disconnect(self, connection: FrontConnection, text: str, now_ns: int, reason: str = "revoked") -> None:
-        """The authority has removed a participant: told, then disconnected."""
+        """Send a fault to a participant that was removed, and close its TCP connection a moment later."""
         self._outbox.send(connection, ProtocolFault(FaultCode.REVOKED, text, reason))
-        if not connection.gateway:  # one of many on the TCP connection of a gateway
+        if not connection.gateway:  # else it is one of many on the TCP connection of its gateway
             self._closing.append((now_ns + FAREWELL_NS, connection))
 
     def tick(self, now_ns: int) -> None:
-        """Looks at the list, ends what has to end, opens what is closed."""
+        """Read the allow-list, disconnect revoked keys, reopen the state socket."""
         while self._closing and now_ns >= self._closing[0][0]:
             _, gone = self._closing.pop(0)
             close_tcp(gone.peer.descriptor, gone.address)
-        if now_ns >= self._next_look_ns:
-            self._next_look_ns = now_ns + CHECK_PERIOD_NS
+        if now_ns >= self._next_check_ns:
+            self._next_check_ns = now_ns + CHECK_PERIOD_NS
             self._write_allow_list(now_ns)
-            self._keyring.look()
-        if self._keyring.gone:
-            gone_keys, self._keyring.gone = self._keyring.gone, {}
+            self._keyring.reload_if_changed()
+        if self._keyring.removed:
+            gone_keys, self._keyring.removed = self._keyring.removed, {}
             for mark, old in gone_keys.items():
-                now = self._keyring.find(mark)
-                if now is None and self._tokens.revoked(mark):
-                    continue  # a director did it: all is done
+                now = self._keyring.find_key(mark)
+                if now is None and self._tokens.is_revoked(mark):
+                    continue  # a director revoked it: all is done
                 if now is None:
                     self._audit.record(AuditKind.KEY_REVOKED, now_ns, subject=mark, name=old.name)
                     self._disconnect_key(mark, now_ns, REVOKED)
                 else:
                     self._apply_roles(mark, now.roles, now_ns)
-        while self._keyring.come:
-            self._tokens.forgive(self._keyring.come.popitem()[0])
+        while self._keyring.added:
+            self._tokens.reinstate_key(self._keyring.added.popitem()[0])
         if self._state_due_ns:
             self._reopen_state(now_ns)
 
     def close(self) -> None:
-        """Closes the connections that were told to go."""
+        """Close the connections that got their fault."""
         for _, gone in self._closing:
             close_tcp(gone.peer.descriptor, gone.address)
 
     def _disconnect_key(self, key_id: str, now_ns: int, text: str) -> None:
         for connection in self._list_connections(key_id):
-            for one in self._clients.list_behind(connection):
+            for one in self._connections.list_behind(connection):
                 self.disconnect(one, GATEWAY_REVOKED, now_ns)
             self.disconnect(connection, text, now_ns)
-            self._lose(connection, "revoked")  # and those behind it
-        for participant in self._tokens.revoke(key_id):
+            self._disconnects.report_lost(connection, "revoked")  # and those behind it
+        for participant in self._tokens.revoke_key(key_id):
             self._remove_participant(participant, "key revoked", now_ns)
-        if key_id in self._keyring.watching and not self._state_due_ns:
+        if key_id in self._keyring.state_subscribers and not self._state_due_ns:
             self._publisher.replace_socket(None)
-            self._keyring.watching.clear()
+            self._keyring.state_subscribers.clear()
             self._state_due_ns = now_ns + PORT_FREE_NS
 
     def _apply_roles(self, key_id: str, roles: tuple[str, ...], now_ns: int) -> None:
-        """A key has other roles now: whoever is here in a role that it lost, itself or behind it, is removed, and
-        refused when it comes back."""
+        """Apply the present roles of a key: connections in a role that it lost, its own or behind it, are removed, and
+        refused when they join again."""
         for connection in self._list_connections(key_id):
-            behind = self._clients.list_behind(connection)
+            behind = self._connections.list_behind(connection)
             if roles and connection.hello.role not in roles:
                 lost = [*behind, connection]
             else:
-                left = roles_behind(roles)
+                left = select_gateway_roles(roles)
                 lost = [one for one in behind if left and one.hello.role not in left]
             for one in lost:
                 self._disconnect_role(one, now_ns)
@@ -141,18 +135,18 @@ class RevocationService:
         if connection.gateway:
             text = f"the session let this connection go: its gateway may speak for no {role} any more"
             self._outbox.send(connection, ProtocolFault(FaultCode.DROPPED, text, "role"))
-        self._lose(connection, "role")
+        self._disconnects.report_lost(connection, "role")
         if not connection.gateway:
             close_tcp(connection.peer.descriptor, connection.address)
         if participant:
-            self._tokens.left(participant)
+            self._tokens.remove_participant(participant)
             self._remove_participant(participant, ROLE_TAKEN, now_ns)
 
     def _list_connections(self, key_id: str) -> list[FrontConnection]:
-        return [c for c in self._clients.by_number.values() if c.key_id == key_id]
+        return [c for c in self._connections.by_number.values() if c.key_id == key_id]
 
     def _remove_participant(self, participant: str, reason: str, now_ns: int) -> None:
-        self._offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
+        self._coalescer.offer(Entry(HOST, HOST, now_ns, RemoveParticipant(0, participant, reason=reason)))
 
     def _reopen_state(self, now_ns: int) -> None:
         try:
@@ -160,41 +154,41 @@ class RevocationService:
         except FrontError as error:
             if now_ns >= self._state_due_ns:
                 self._state_due_ns = now_ns + PORT_FREE_NS
-                print(f"iris-session: nobody gets state after a key was revoked: {error}", file=sys.stderr, flush=True)
+                log.warning("cannot reopen the state socket after a revocation, so no client gets state: %s", error)
             return
         self._state_due_ns = 0
 
     def _write_allow_list(self, now_ns: int) -> None:
-        """Has the list changed. What it says is decided already: nobody waits for the file."""
+        """Write changes to the list. They are in force already, so nothing waits for the file."""
         keyring = self._keyring
         if keyring.home is None:
-            keyring.revoking.clear()
+            keyring.pending_revocations.clear()
             return
-        due = bool(keyring.seen) and now_ns >= self._next_seen_ns
-        if self._writing or not (keyring.revoking or due):
+        due = bool(keyring.last_seen) and now_ns >= self._next_seen_ns
+        if self._writing or not (keyring.pending_revocations or due):
             return
-        marks, seen = tuple(keyring.revoking), keyring.seen if due else {}
+        marks, seen = tuple(keyring.pending_revocations), keyring.last_seen if due else {}
         job = partial(_change_allow_list, keyring.home.clients, marks, seen)
         self._writing = keyring.files.submit(job, partial(self._on_written, marks, seen))
         if self._writing and due:
             self._next_seen_ns = now_ns + SEEN_NS
-            keyring.seen = {}
+            keyring.last_seen = {}
 
     def _on_written(self, marks: tuple[str, ...], seen: dict[str, str], outcome: KeysError | None, now_ns: int) -> None:
         self._writing = False
         keyring = self._keyring
         if outcome is None:
             for mark in marks:
-                keyring.revoking.pop(mark, None)
+                keyring.pending_revocations.pop(mark, None)
             return
-        keyring.seen = {**seen, **keyring.seen}
+        keyring.last_seen = {**seen, **keyring.last_seen}
         if not isinstance(outcome, KeysBusyError) and str(outcome) != self._reported_error:
             self._reported_error = str(outcome)  # the key stays out of this session; its file is tried again
-            print(f"iris-session: the allow-list cannot be changed: {outcome}", file=sys.stderr, flush=True)
+            log.warning("cannot change the allow-list: %s", outcome)
 
 
 def _change_allow_list(clients: AllowList, marks: tuple[str, ...], seen: dict[str, str]) -> None:
     for mark in marks:
-        clients.revoke(mark, PATIENCE_S)
+        clients.revoke_key(mark, LOCK_TIMEOUT_S)
     if seen:
-        clients.seen(seen, PATIENCE_S)
+        clients.record_last_seen(seen, LOCK_TIMEOUT_S)

@@ -1,41 +1,37 @@
-"""Answers `GetStatus`: the authority's half of the report, which comes about once a second, and what the front sees.
+"""Answer `GetStatus`: the authority's half of the report, which comes about once a second, and the front's half.
 
-Whoever may say `hello` may ask, also while the authority stands still and lets nobody in: that is when people ask.
-Memory is bounded: fixed rings per connection, and nothing of connections that are gone.
+Every client that has said `hello` may ask, also while the authority is stalled and admits none: that is when users
+need the status. Memory is bounded: fixed rings per connection, which end with it.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox
-from iris_session.link.config import FrontConfig
+from iris_session.alignment.service import AlignmentService
+from iris_session.front.asset_service import AssetService
+from iris_session.front.connections import FrontConnection
+from iris_session.front.context import FrontContext
+from iris_session.front.media.service import MediaService
 from iris_session.protocol.client_messages import Sample
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.status import (
-    AlignmentReport,
-    AssetsReport,
     ClientReport,
     GetStatus,
-    MediaStreamReport,
     ParticipantReport,
     Quantiles,
     StatusReport,
     quantiles,
 )
 
-#: Samples of one connection whose way is remembered: five devices at 90 Hz for a second, one for six.
+#: Samples of one connection whose delay is kept: five devices at 90 Hz for a second, one for six.
 DELAYS: Final = 512
 ROLL_NS: Final = 1_000_000_000
-#: A report of a client that is older says nothing about now.
-STALE_REPORT_NS: Final = 3_000_000_000
-#: Of fewer frames of state than this in some seconds no 99th percentile is told: it would be the latest one, and of a
-#: scene that stands still, whose state is sent again four times a second, one that was late would be blamed for long.
+#: With fewer state frames in the last seconds no 99th percentile is reported: it would be the latest frame, and in a
+#: scene at rest, whose state is sent again four times a second, one late frame would be reported for long.
 MIN_DELAYS: Final = 25
 #: A report is made at most this often, however many ask.
 REUSE_NS: Final = 200_000_000
@@ -44,58 +40,34 @@ _decode_report = msgspec.msgpack.Decoder(StatusReport).decode
 
 
 class _ConnectionStats:
-    """What the front measures of one connection."""
+    """Measurements of one connection."""
 
-    __slots__ = ("delays_ns", "report", "reported_ns", "samples", "samples_per_s")
+    __slots__ = ("delays_ns", "samples", "samples_per_s")
 
     def __init__(self) -> None:
         self.delays_ns: deque[int] = deque(maxlen=DELAYS)
         self.samples = 0
         self.samples_per_s = 0.0
-        self.report: ClientReport | None = None
-        self.reported_ns = 0
-
-    def recent_report(self, now_ns: int) -> ClientReport | None:
-        """The newest report of the client, unless it is too old."""
-        return self.report if now_ns - self.reported_ns <= STALE_REPORT_NS else None
-
-
-class Telling(NamedTuple):
-    """What the rest of the front tells the desk: numbers that live elsewhere, asked for when somebody asks us.
-
-    `publish_delays_ns`: end of tick to the state socket, of the frames of the last seconds. `heard_ns`: session time of
-    the authority's last word, 0 before it. `authority`: its newest half of the report, encoded; empty before it.
-    """
-
-    publish_delays_ns: Sequence[int] = ()
-    heard_ns: int = 0
-    authority: bytes = b""
-    stalled: bool = False
-    entries: int = 0  # sent to the authority since the start
-    warnings: tuple[str, ...] = ()  # of the front
-    media: tuple[MediaStreamReport, ...] = ()
-    assets: AssetsReport | None = None
 
 
 class StatusService:
-    """One per front. A `Service`: `turn` rolls the rates."""
+    """Measure connections and answer `GetStatus`. A `Service`: `tick` updates the rates."""
 
     def __init__(
-        self, config: FrontConfig, clients: ConnectionTable, outbox: Outbox, drops: Drops, tell: Callable[[], Telling]
+        self, context: FrontContext, media: MediaService, assets: AssetService, alignment: AlignmentService
     ) -> None:
-        self._config = config
-        self._clients = clients
-        self._outbox = outbox
-        self._drops = drops
-        self._tell = tell
-        #: What a participant gets of media, as fields of its row.
-        self.media_row: Callable[[int], dict[str, Any]] = lambda _number: {}
-        #: The authority's half of a participant's alignment report with that of the front: connection, half, now.
-        self.alignment_report: Callable[[int, AlignmentReport | None, int], AlignmentReport | None] = (
-            lambda _number, half, _now_ns: half
-        )
+        self._config = context.config
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._drops = context.drops
+        self._authority = context.authority
+        self._publisher = context.publisher
+        self._guard = context.guard
+        self._media = media
+        self._assets = assets
+        self._alignment = alignment
         self._stats: dict[int, _ConnectionStats] = {}
-        self._lost: dict[str, str] = {}  # participant id -> why its connection was lost
+        self._disconnected: dict[str, str] = {}  # participant id -> reason
         self._rolled_ns = 0
         self._entries = 0
         self._entries_per_s = 0.0
@@ -103,97 +75,90 @@ class StatusService:
         self._made_ns = 0
 
     def record_sample(self, connection: int, sample: Sample, now_ns: int) -> None:
-        """A sample has come in."""
-        line = self._find_stats(connection)
-        line.samples += 1
-        line.delays_ns.append(now_ns - sample.capture_ns)
+        """Record a sample that was received."""
+        stats = self._find_stats(connection)
+        stats.samples += 1
+        stats.delays_ns.append(now_ns - sample.capture_ns)
 
-    def record_report(self, connection: int, report: ClientReport, now_ns: int) -> None:
-        """A client tells how state arrives."""
-        line = self._find_stats(connection)
+    def record_report(self, connection: FrontConnection, report: ClientReport, now_ns: int) -> None:
+        """Record a client's report of how state arrives."""
         numbers = [value for value in msgspec.structs.astuple(report) if isinstance(value, float)]
         if all(map(math.isfinite, numbers)):
-            line.report, line.reported_ns = report, now_ns
+            connection.report, connection.reported_ns = report, now_ns
         else:
-            self._drops.count("report_not_finite", connection)
-
-    def find_report(self, connection: int, now_ns: int) -> ClientReport | None:
-        """The newest report of a client, `None` without one of the last seconds."""
-        line = self._stats.get(connection)
-        return None if line is None else line.recent_report(now_ns)
+            self._drops.count("report_not_finite", connection.number)
 
     def record_disconnect(self, connection: FrontConnection, reason: str) -> None:
-        """The front lost a connection: its participant may wait in the roster for a while."""
+        """Record why a connection was disconnected: its participant may stay in the roster for a while."""
         self._stats.pop(connection.number, None)
         if connection.participant_id:
-            self._lost.pop(connection.participant_id, None)
-            self._lost[connection.participant_id] = reason
-            while len(self._lost) > self._config.limits.connections:
-                del self._lost[next(iter(self._lost))]
+            self._disconnected.pop(connection.participant_id, None)
+            self._disconnected[connection.participant_id] = reason
+            while len(self._disconnected) > self._config.limits.connections:
+                del self._disconnected[next(iter(self._disconnected))]
 
     def send_report(self, connection: FrontConnection, question: GetStatus, now_ns: int) -> None:
-        """Answers. Rates are limited as those of every message; many who ask get one and the same report."""
+        """Send the report. Many requests at once get the same one."""
         if self._made is None or now_ns - self._made_ns > REUSE_NS:
             self._made, self._made_ns = self._make_report(now_ns), now_ns
         report = msgspec.structs.replace(self._made, request_id=question.request_id, session_time=now_ns)
         self._outbox.send(connection, report)
 
     def tick(self, now_ns: int) -> None:
-        """Once a second: rates."""
+        """Update the rates once a second."""
         elapsed_ns = now_ns - self._rolled_ns
         if elapsed_ns < ROLL_NS:
             return
         self._rolled_ns = now_ns
-        entries = self._tell().entries
+        entries = self._authority.entries
         self._entries_per_s = (entries - self._entries) / elapsed_ns * 1e9
         self._entries = entries
-        for number in [n for n in self._stats if n not in self._clients.by_number]:
+        for number in [n for n in self._stats if n not in self._connections.by_number]:
             del self._stats[number]
-        for line in self._stats.values():
-            line.samples_per_s = line.samples / elapsed_ns * 1e9
-            line.samples = 0
-            if not line.samples_per_s:
-                line.delays_ns.clear()  # what was measured is not of now
+        for stats in self._stats.values():
+            stats.samples_per_s = stats.samples / elapsed_ns * 1e9
+            stats.samples = 0
+            if not stats.samples_per_s:
+                stats.delays_ns.clear()  # measured too long ago
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Do nothing: nothing was opened."""
 
     def _find_stats(self, connection: int) -> _ConnectionStats:
-        line = self._stats.get(connection)
-        if line is None:
-            line = self._stats[connection] = _ConnectionStats()
-        return line
+        stats = self._stats.get(connection)
+        if stats is None:
+            stats = self._stats[connection] = _ConnectionStats()
+        return stats
 
     def _make_report(self, now_ns: int) -> StatusReport:
-        telling = self._tell()
-        config = self._config
-        half = _decode_report(telling.authority) if telling.authority else StatusReport(0, "", "", 0)
-        drops, delays = dict(half.drops), telling.publish_delays_ns
+        authority, config = self._authority, self._config
+        half = _decode_report(authority.report) if authority.report else StatusReport(0, "", "", 0)
+        drops, delays = dict(half.drops), self._publisher.read_recent_delays_ns()
         for reason, count in self._drops.by_reason.items():
             drops[reason] = drops.get(reason, 0) + count
-        by_participant = {c.participant_id: c for c in self._clients.by_number.values() if c.participant_id}
+        by_participant = {c.participant_id: c for c in self._connections.by_number.values() if c.participant_id}
         return msgspec.structs.replace(
             half,
             session_id=config.session_id,
             session_name=config.session_name,
-            stalled=telling.stalled,
+            stalled=authority.stalled,
             step_to_publish=quantiles(delays) if len(delays) >= MIN_DELAYS else None,
             participants=tuple(self._merge_row(row, by_participant.get(row.id), now_ns) for row in half.participants),
             drops=drops,
-            warnings=(*half.warnings, *telling.warnings),
-            connections=len(self._clients),
+            warnings=(*half.warnings, *self._guard.list_warnings(now_ns)),
+            connections=len(self._connections),
             entries_per_s=self._entries_per_s,
-            authority_silent_ns=now_ns - telling.heard_ns if telling.heard_ns else -1,
-            media=telling.media,
-            assets=telling.assets,
+            authority_silent_ns=now_ns - authority.heard_ns if authority.heard_ns else -1,
+            media=self._media.report_streams(),
+            assets=self._assets.report(),
         )
 
     def _merge_row(self, row: ParticipantReport, connection: FrontConnection | None, now_ns: int) -> ParticipantReport:
-        """The authority's row of a participant with what the front knows of its connection."""
+        """Return the authority's row of a participant, completed with its connection."""
         if connection is None:
-            return msgspec.structs.replace(row, connected=False, lost=self._lost.get(row.id, ""))
-        line = self._stats.get(connection.number) or _ConnectionStats()
-        report = line.recent_report(now_ns)
+            return msgspec.structs.replace(row, connected=False, lost=self._disconnected.get(row.id, ""))
+        stats = self._stats.get(connection.number) or _ConnectionStats()
+        report = connection.recent_report(now_ns)
         host, port = connection.address
         measured = {} if report is None else _client_fields(report)
         return msgspec.structs.replace(
@@ -201,19 +166,19 @@ class StatusService:
             address=f"{host}:{port}" if host else "",
             software=connection.hello.software,
             heard_ns=now_ns - connection.last_heard_ns,
-            samples_per_s=line.samples_per_s,
-            capture_to_receive=quantiles(line.delays_ns),
+            samples_per_s=stats.samples_per_s,
+            capture_to_receive=quantiles(stats.delays_ns),
             drops=self._drops.by_connection.get(connection.number, 0),
             reported=report is not None,
-            alignment_report=self.alignment_report(connection.number, row.alignment_report, now_ns),
+            alignment_report=self._alignment.complete_report(connection.number, row.alignment_report, now_ns),
             **measured,
-            **self.media_row(connection.number),
+            **self._media.report_participant(connection.number),
         )
 
 
 def _client_fields(report: ClientReport) -> dict[str, Any]:
     expected = report.delivered + report.missed
-    measured = report.delivered > 0 and report.age_ms_p99 > 0.0  # 0: what came was sent again, and has no age
+    measured = report.delivered > 0 and report.age_ms_p99 > 0.0  # 0: all frames were sent again, and have no age
     return {
         "state_age": Quantiles(report.age_ms_p50, report.age_ms_p99) if measured else None,
         "missed_share": report.missed / expected if expected else 0.0,

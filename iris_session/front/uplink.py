@@ -1,69 +1,53 @@
-"""From the front to the authority: entries within their credit, signs of life, counters. Never waits."""
+"""From the front to the authority: entries within their credit, heartbeats of the front, counters. Never waits."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import zmq
 
-from iris_session.front.coalescer import Coalescer
-from iris_session.front.connections import ConnectionTable
-from iris_session.front.downlink import Downlink
-from iris_session.front.state_publisher import StatePublisher
+from iris_session.front.context import FrontContext
 from iris_session.link import messages as link
 from iris_session.link.config import MILLISECOND
 from iris_session.protocol.entries import Entry, encode_entries
-from iris_session.protocol.limits import Drops
-from iris_session.security.resume_tokens import ResumeTokens
 
-STATUS_NS = 500 * MILLISECOND
+STATUS_NS: Final = 500 * MILLISECOND
 
 
 class Uplink:
-    """`stalled`: the authority does not step; `stalls`: how often that was so."""
+    """Send pending entries over the link."""
 
-    def __init__(
-        self,
-        socket: zmq.Socket[bytes],
-        unacknowledged: int,
-        coalescer: Coalescer,
-        downlink: Downlink,
-        tokens: ResumeTokens,
-        clients: ConnectionTable,
-        drops: Drops,
-        publisher: StatePublisher,
-    ) -> None:
+    def __init__(self, context: FrontContext, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
-        self._unacknowledged = unacknowledged
-        self._coalescer = coalescer
-        self._downlink = downlink
-        self._tokens = tokens
-        self._clients = clients
-        self._drops = drops
-        self._publisher = publisher
-        self.stalled = False
-        self.stalls = 0
-        self.entries = 0
+        self._authority = context.authority
+        self._max_unacknowledged = context.config.limits.unacknowledged
+        self._coalescer = context.coalescer
+        self._tokens = context.tokens
+        self._connections = context.connections
+        self._drops = context.drops
+        self._publisher = context.publisher
         self._batches = 0
         self._reported = (-1, -1, -1)
         self._next_beat_ns = self._next_status_ns = 0
 
     def flush(self) -> None:
-        """Sends what waits, as far as credit goes; urgent entries have credits of their own."""
-        limit = self._unacknowledged
-        used = self._batches - self._downlink.acknowledged
+        """Send pending entries as far as credit goes. Urgent entries have credits of their own."""
+        limit = self._max_unacknowledged
+        used = self._batches - self._authority.acknowledged
         batch: list[Entry] = []
         if used < limit:
             batch = self._coalescer.take_batch() if self._coalescer else []
         elif self._coalescer.urgent and used < 2 * limit:
             batch = self._coalescer.take_batch(urgent_only=True)
         if self._tokens.changed and (batch or self._is_authority_listening):
-            self._socket.send_multipart((link.HANDBACK, self._tokens.blob()), zmq.DONTWAIT)
+            self._socket.send_multipart((link.HANDBACK, self._tokens.encode()), zmq.DONTWAIT)
         if batch:
             self._socket.send_multipart((link.ENTRIES, encode_entries(batch)), zmq.DONTWAIT)
             self._batches += 1
-            self.entries += len(batch)
+            self._authority.entries += len(batch)
 
     def tick(self, now_ns: int) -> None:
-        """Says that the front lives, and what it counted."""
+        """Send the front's heartbeat and its counters when they are due."""
         if now_ns >= self._next_beat_ns and self._is_authority_listening:
             self._next_beat_ns = now_ns + link.BEAT_NS
             self._socket.send_multipart((link.BEAT, b""), zmq.DONTWAIT)
@@ -73,22 +57,22 @@ class Uplink:
 
     @property
     def _is_authority_listening(self) -> bool:
-        """Whether the authority takes what is sent, as far as we know."""
-        return self._downlink.heard_ns > 0 and not self.stalled
+        """Whether the authority reads the link, as far as the front knows."""
+        return self._authority.heard_ns > 0 and not self._authority.stalled
 
     def _report(self) -> None:
-        """Counters to the authority, while it listens."""
-        drops = self._drops
-        now = (drops.version, len(self._clients), self.entries)
-        if now == self._reported or self.stalled:
+        """Send the counters if they have changed and the authority is not stalled."""
+        drops, authority = self._drops, self._authority
+        now = (drops.version, len(self._connections), authority.entries)
+        if now == self._reported or authority.stalled:
             return
         self._reported = now
         status = link.FrontStatus(
-            len(self._clients),
+            len(self._connections),
             drops.by_reason,
             drops.by_connection,
-            self.stalls,
+            authority.stalls,
             self._publisher.frames,
-            self.entries,
+            authority.entries,
         )
         self._socket.send_multipart((link.STATUS, link.encoder.encode(status)), zmq.DONTWAIT)

@@ -15,7 +15,7 @@ import msgspec
 from iris_session.link.config import Ports, SceneInfo
 from iris_session.protocol.codec import decoder
 from iris_session.protocol.server_messages import Event
-from iris_session.protocol.steps import Admitted, Dropped, Outgoing
+from iris_session.protocol.steps import Admitted, Dropped, OutgoingMessage
 
 # front -> authority
 READY: Final = b"R"  # Ports
@@ -46,7 +46,7 @@ class Decided(msgspec.Struct, frozen=True, array_like=True):
 
     step: int
     admitted: tuple[Admitted, ...] = ()
-    outgoing: tuple[Outgoing, ...] = ()
+    outgoing: tuple[OutgoingMessage, ...] = ()
     events: tuple[Event, ...] = ()
     dropped: tuple[Dropped, ...] = ()
 

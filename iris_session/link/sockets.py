@@ -16,13 +16,8 @@ from iris_session.link.config import FrontConfig, FrontError, PortInUseError
 from iris_session.protocol.assets import MAX_ASSET_REQUESTS
 from iris_session.protocol.limits import MAX_CLIENT_BYTES, MAX_MEDIA_FRAME_BYTES
 from iris_session.security import KeyPair
+from iris_session.security.zap import ZAP_ASSETS, ZAP_CONTROL, ZAP_MEDIA, ZAP_STATE
 
-#: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
-#: when a key is revoked that came in there.
-ZAP_CONTROL = b"iris-control"
-ZAP_STATE = b"iris-state"
-ZAP_MEDIA = b"iris-media"
-ZAP_ASSETS = b"iris-assets"
 #: State sockets: two frames may wait for a client that is slow, then the newest is lost, not the oldest (libzmq).
 STATE_HWM = 2
 STATE_BUFFER_BYTES = 32_768

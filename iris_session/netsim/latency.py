@@ -42,7 +42,7 @@ class DelayLine(Generic[T]):
         """Sends an item at `now_ns`."""
         model = self.model
         arrives = now_ns + int((model.latency_s + self._rng.exponential(1.0) * model.jitter_s) * 1e9)
-        arrives = max(arrives, self._last_ns, self._stalled_until(now_ns))
+        arrives = max(arrives, self._last_ns, self._compute_stall_end_ns(now_ns))
         self._last_ns = arrives
         self._items.append((arrives, item))
 
@@ -54,23 +54,23 @@ class DelayLine(Generic[T]):
         return arrived
 
     @property
-    def next_ns(self) -> int | None:
+    def next_arrival_ns(self) -> int | None:
         """When the next item arrives."""
         return self._items[0][0] if self._items else None
 
-    def _stalled_until(self, now_ns: int) -> int:
+    def _compute_stall_end_ns(self, now_ns: int) -> int:
         model = self.model
         if model.stall_every_s <= 0.0:
             return 0
         if self._next_stall_ns is None:
-            self._next_stall_ns = now_ns + self._wait_ns()
+            self._next_stall_ns = now_ns + self._draw_wait_ns()
         if now_ns < self._next_stall_ns:
             return 0
         end = self._next_stall_ns + int(model.stall_s * 1e9)
         if now_ns >= end:
-            self._next_stall_ns = now_ns + self._wait_ns()
+            self._next_stall_ns = now_ns + self._draw_wait_ns()
             self.stalls += 1
         return end
 
-    def _wait_ns(self) -> int:
+    def _draw_wait_ns(self) -> int:
         return int(self._rng.exponential(self.model.stall_every_s) * 1e9)

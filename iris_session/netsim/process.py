@@ -24,10 +24,10 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from iris_session.netsim.profiles import Profile, ProfileError, load_profile
-from iris_session.netsim.proxy import Link
+from iris_session.netsim.proxy import ImpairedLink
 from iris_session.system.process import PIPE, ChildProcess
 
-ANSWER_S: Final = 10.0
+ANSWER_TIMEOUT_S: Final = 10.0
 #: A real link takes no processor time from those it connects. Below the tick loop's priority, above all else.
 REALTIME_PRIORITY: Final = 2
 
@@ -57,7 +57,7 @@ class ImpairmentProcess:
         self._process = ChildProcess(__name__, command, stdout=PIPE, stderr=PIPE, own_session=True)
         self._unanswered = 1
         try:
-            self._answer("start")
+            self._read_answer("start")
         except BaseException:
             self.close()
             raise
@@ -66,14 +66,14 @@ class ImpairmentProcess:
     def pid(self) -> int:
         return self._process.pid
 
-    def do(self, command: str) -> dict[str, Any]:
+    def execute(self, command: str) -> dict[str, Any]:
         """One command, and its answer once it is done."""
-        self.post(command)
+        self.send(command)
         while self._unanswered > 1:
-            self._answer("an earlier command")
-        return self._answer(command)
+            self._read_answer("an earlier command")
+        return self._read_answer(command)
 
-    def post(self, command: str) -> None:
+    def send(self, command: str) -> None:
         """One command, without waiting for it."""
         self._unanswered += 1
         try:
@@ -93,11 +93,11 @@ class ImpairmentProcess:
     ) -> None:
         self.close()
 
-    def _answer(self, command: str) -> dict[str, Any]:
+    def _read_answer(self, command: str) -> dict[str, Any]:
         try:
-            line = self._process.read_line(ANSWER_S)
+            line = self._process.read_line(ANSWER_TIMEOUT_S)
         except TimeoutError:
-            raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_S:g} s") from None
+            raise ImpairmentError(f"the proxy did not answer {command!r} within {ANSWER_TIMEOUT_S:g} s") from None
         except EOFError:
             messages = self._process.read_stderr().strip().splitlines()
             raise ImpairmentError(messages[-1] if messages else f"the proxy ended at {command!r}") from None
@@ -108,7 +108,7 @@ class ImpairmentProcess:
         return answer
 
 
-def obey(links: Sequence[Link], line: str) -> dict[str, Any]:
+def run_command(links: Sequence[ImpairedLink], line: str) -> dict[str, Any]:
     """Does one command of standard input; see the module docstring. Raises `ProfileError` for what it does not know."""
     words = line.split()
     command = words[0] if words else ""
@@ -118,19 +118,19 @@ def obey(links: Sequence[Link], line: str) -> dict[str, Any]:
     if len(chosen) < len(named):
         raise ProfileError(f"no link {' '.join(named)}: there are {', '.join(link.address for link in links)}")
     if command == "stats":
-        return {"links": [link.stats() for link in chosen]}
+        return {"links": [link.collect_stats() for link in chosen]}
     for link in chosen:
         if command in ("stall", "resume"):
-            link.held = command == "stall"
-            link.changed()
+            link.stalled_by_command = command == "stall"
+            link.update_stalls()
         elif command in ("cut", "reset"):
-            link.break_all(reset=command == "reset")
+            link.close_connections(reset=command == "reset")
         elif command == "roam" and len(rest) == 1:
             link.roam(rest[0])
         elif command == "start":
-            link.begin(link.profile)
+            link.start_profile(link.profile)
         elif command == "profile" and len(rest) == 1:
-            link.begin(load_profile(rest[0]))
+            link.start_profile(load_profile(rest[0]))
         else:
             raise ProfileError(
                 f"{line!r} is no command: stall, resume, cut, reset, roam ADDRESS, profile NAME, start, stats, quit"
@@ -144,7 +144,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
     done = asyncio.Event()
     made = []
     for number, (address, profile) in enumerate(links):
-        link = Link(address, options.target, profile, options.seed + number)
+        link = ImpairedLink(address, options.target, profile, options.seed + number)
         try:
             link.listen(options.ports, options.udp)
         except OSError as error:
@@ -168,7 +168,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
                 done.set()
                 return
             try:
-                answer = {"ok": True, **obey(made, line.decode(errors="replace"))}
+                answer = {"ok": True, **run_command(made, line.decode(errors="replace"))}
             except ProfileError as error:
                 answer = {"ok": False, "error": str(error)}
             print(json.dumps(answer), flush=True)
@@ -181,7 +181,7 @@ async def serve(links: Sequence[tuple[str, Profile]], options: argparse.Namespac
     await done.wait()
 
 
-def port_list(text: str) -> list[int]:
+def parse_ports(text: str) -> list[int]:
     """Type of options that take ports: `7720-7725`, `7721,7722`, nothing."""
     ports: list[int] = []
     for part in filter(None, text.split(",")):
@@ -192,13 +192,13 @@ def port_list(text: str) -> list[int]:
     return ports
 
 
-def parser(prog: str | None = None, description: str | None = __doc__) -> argparse.ArgumentParser:
+def build_parser(prog: str | None = None, description: str | None = __doc__) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     made.add_argument("--target", default="127.0.0.1", metavar="ADDR", help="where the session is (%(default)s)")
-    made.add_argument("--ports", type=port_list, default=port_list("7720-7726"), help="TCP (default: 7720-7726)")
-    made.add_argument("--udp", type=port_list, default=[], metavar="PORTS", help="UDP ports (default: none)")
+    made.add_argument("--ports", type=parse_ports, default=parse_ports("7720-7726"), help="TCP (default: 7720-7726)")
+    made.add_argument("--udp", type=parse_ports, default=[], metavar="PORTS", help="UDP ports (default: none)")
     made.add_argument(
         "--link", action="append", metavar="ADDR[=PROFILE]", help="address of a link, repeatable (127.0.0.2)"
     )
@@ -210,7 +210,7 @@ def parser(prog: str | None = None, description: str | None = __doc__) -> argpar
 
 def main(argv: Sequence[str] | None = None, prog: str | None = None, description: str | None = __doc__) -> int:
     """Exit status 0 after an orderly end, 2 for unusable input."""
-    options = parser(prog, description).parse_args(argv)
+    options = build_parser(prog, description).parse_args(argv)
     try:
         parts = [text.partition("=") for text in options.link or ["127.0.0.2"]]
         links = [(address, load_profile(profile or options.profile)) for address, _, profile in parts]

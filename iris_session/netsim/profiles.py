@@ -52,7 +52,7 @@ class Direction(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     reorder_ms: float = 20.0
 
 
-class Phase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ProfilePhase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A stretch of time of a profile. Its own fields are for both directions; `up`, `down` replace all of them.
 
     `seconds`: 0 for ever. `at_start`: `cut` closes every connection, `reset` breaks them off (RST). `burst_*`: mean
@@ -70,7 +70,7 @@ class Phase(Direction, frozen=True, kw_only=True, forbid_unknown_fields=True):
     up: Direction | None = None
     down: Direction | None = None
 
-    def direction(self, name: str) -> Direction:
+    def get_direction(self, name: str) -> Direction:
         """What holds for `up` or `down`."""
         return (self.up if name == UP else self.down) or self
 
@@ -82,7 +82,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     the sender is held back beyond. It is how much stale data a stall can leave on the way.
     """
 
-    phases: tuple[Phase, ...]
+    phases: tuple[ProfilePhase, ...]
     repeat: bool = False
     window_kib: int = 256
 
@@ -90,14 +90,14 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         if not self.phases:
             raise ProfileError("a profile needs a phase, for example {delay_ms = 8, jitter_ms = 3, rate_mbit = 40}")
         for phase in self.phases:
-            _check(phase)
+            _validate_phase(phase)
         if any(not p.seconds for p in self.phases if self.repeat or p is not self.phases[-1]):
             raise ProfileError("seconds = 0 (for ever) is for the last phase of a profile that does not repeat")
         if not 4 <= self.window_kib <= 16_384:
             raise ProfileError(f"window_kib {self.window_kib} is out of range: 4 to 16384")
 
 
-def _check(phase: Phase) -> None:
+def _validate_phase(phase: ProfilePhase) -> None:
     if phase.at_start not in ("", "cut", "reset"):
         raise ProfileError(f"at_start {phase.at_start!r} is not known: '', 'cut' or 'reset'")
     for part in (phase, *(d for d in (phase.up, phase.down) if d is not None)):
@@ -110,8 +110,8 @@ def _check(phase: Phase) -> None:
                 raise ProfileError(f"{field} {value} is out of range: 0 to {'1' if top == 1.0 else 'any number'}")
 
 
-_GOOD: Final = Phase(delay_ms=2.0, jitter_ms=1.0, rate_mbit=300.0, loss=0.001)
-_BUSY: Final = Phase(
+_GOOD: Final = ProfilePhase(delay_ms=2.0, jitter_ms=1.0, rate_mbit=300.0, loss=0.001)
+_BUSY: Final = ProfilePhase(
     delay_ms=8.0,
     jitter_ms=12.0,
     rate_mbit=40.0,
@@ -126,9 +126,9 @@ _BUSY: Final = Phase(
 )
 #: Profiles by name. `none` forwards as fast as it can: what the proxy itself costs.
 PROFILES: Final[dict[str, Profile]] = {
-    "none": Profile(phases=(Phase(),)),
-    "lan": Profile(phases=(Phase(delay_ms=0.2, jitter_ms=0.05, rate_mbit=1000.0),)),
-    "wan": Profile(phases=(Phase(delay_ms=40.0, jitter_ms=2.0, rate_mbit=100.0, loss=0.001),), window_kib=1024),
+    "none": Profile(phases=(ProfilePhase(),)),
+    "lan": Profile(phases=(ProfilePhase(delay_ms=0.2, jitter_ms=0.05, rate_mbit=1000.0),)),
+    "wan": Profile(phases=(ProfilePhase(delay_ms=40.0, jitter_ms=2.0, rate_mbit=100.0, loss=0.001),), window_kib=1024),
     "good-wifi": Profile(phases=(_GOOD,)),
     "busy-wifi": Profile(phases=(_BUSY,), window_kib=128),
     "blackout": Profile(
@@ -141,9 +141,9 @@ PROFILES: Final[dict[str, Profile]] = {
 }
 
 
-def latency_profile(latency_ms: float) -> Profile:
+def make_latency_profile(latency_ms: float) -> Profile:
     """A link that delays by `latency_ms` each way and does nothing else."""
-    return Profile(phases=(Phase(delay_ms=latency_ms),), window_kib=1024)
+    return Profile(phases=(ProfilePhase(delay_ms=latency_ms),), window_kib=1024)
 
 
 def load_profile(name: str) -> Profile:
@@ -154,7 +154,7 @@ def load_profile(name: str) -> Profile:
     if name in PROFILES:
         return PROFILES[name]
     if delay := re.fullmatch(r"(\d+(?:\.\d+)?)ms", name):
-        return latency_profile(float(delay[1]))
+        return make_latency_profile(float(delay[1]))
     path = Path(name)
     if path.suffix not in (".toml", ".json"):
         raise ProfileError(f"no profile {name!r}: give one of {', '.join(PROFILES)}, 40ms, or a .toml or .json file")
@@ -167,25 +167,25 @@ def load_profile(name: str) -> Profile:
         raise ProfileError(f"profile {name}: {error}") from error
 
 
-class Spells:
+class RandomIntervals:
     """Stretches of time that come at random: mean time between them, length. Asked for times that never go back."""
 
     def __init__(self, rng: random.Random, every_s: float, length_s: float, start_ns: int) -> None:
         self._rng, self._every_s, self._length_ns = rng, every_s, round(length_s * SECOND)
         self.begin_ns = self.end_ns = start_ns
-        self._next()
+        self._draw_next()
 
-    def covers(self, t_ns: int) -> bool:
+    def is_active(self, t_ns: int) -> bool:
         """Whether one is on at `t_ns`."""
         while t_ns >= self.end_ns and self._every_s > 0.0:
-            self._next()
+            self._draw_next()
         return self.begin_ns <= t_ns < self.end_ns
 
-    def change_ns(self, t_ns: int) -> int:
+    def find_change_ns(self, t_ns: int) -> int:
         """When `covers` changes next after `t_ns`."""
-        return self.end_ns if self.covers(t_ns) else self.begin_ns
+        return self.end_ns if self.is_active(t_ns) else self.begin_ns
 
-    def _next(self) -> None:
+    def _draw_next(self) -> None:
         if self._every_s <= 0.0:
             self.begin_ns = self.end_ns = 2**63 - 1
             return
@@ -193,7 +193,7 @@ class Spells:
         self.end_ns = self.begin_ns + self._length_ns
 
 
-class Weather:
+class LinkConditions:
     """The weather of one link. All times are nanoseconds since its start and never go back by more than a phase."""
 
     def __init__(self, profile: Profile, seed: int = 0) -> None:
@@ -202,51 +202,51 @@ class Weather:
         self._number = -1
         self._phase_end_ns = 0
         self.phase = profile.phases[0]
-        self._bursts = self._stalls = Spells(random.Random(0), 0.0, 0.0, 0)
-        self._move_on(0)
+        self._bursts = self._stalls = RandomIntervals(random.Random(0), 0.0, 0.0, 0)
+        self._enter_next_phase(0)
 
-    def move_on(self, t_ns: int, at_start: Callable[[str], None] = lambda _: None) -> None:
+    def advance(self, t_ns: int, at_start: Callable[[str], None] = lambda _: None) -> None:
         """Enters the phase of `t_ns`; `at_start` is called with `cut` or `reset` for each phase that begins so."""
         while t_ns >= self._phase_end_ns:
-            self._move_on(self._phase_end_ns)
+            self._enter_next_phase(self._phase_end_ns)
             if self.phase.at_start:
                 at_start(self.phase.at_start)
 
-    def delay_ns(self, direction: str, t_ns: int) -> int:
+    def compute_delay_ns(self, direction: str, t_ns: int) -> int:
         """One-way delay of what is sent at `t_ns`, without rate and stalls."""
-        part = self.phase.direction(direction)
+        part = self.phase.get_direction(direction)
         slot = t_ns // SLOT_NS
         delay_ms = part.delay_ms
         if part.jitter_ms:
-            delay_ms += part.jitter_ms * _NORMAL.inv_cdf(self._uniform(direction, slot, 0))
-        if self.phase.burst_ms and self._bursts.covers(t_ns):
-            delay_ms += self.phase.burst_ms * self._uniform(direction, slot, 1)
+            delay_ms += part.jitter_ms * _NORMAL.inv_cdf(self._draw_uniform(direction, slot, 0))
+        if self.phase.burst_ms and self._bursts.is_active(t_ns):
+            delay_ms += self.phase.burst_ms * self._draw_uniform(direction, slot, 1)
         return round(max(0.0, delay_ms) * 1e6)
 
-    def stalled(self, direction: str, t_ns: int) -> bool:
+    def is_stalled(self, direction: str, t_ns: int) -> bool:
         """Whether nothing passes at `t_ns`."""
-        return self.phase.direction(direction).stalled or self._stalls.covers(t_ns)
+        return self.phase.get_direction(direction).stalled or self._stalls.is_active(t_ns)
 
-    def next_change_ns(self, t_ns: int) -> int:
+    def find_next_change_ns(self, t_ns: int) -> int:
         """When `stalled` or the phase changes next after `t_ns`."""
-        return min(self._phase_end_ns, self._stalls.change_ns(t_ns))
+        return min(self._phase_end_ns, self._stalls.find_change_ns(t_ns))
 
-    def chance(self, direction: str, number: int, what: int) -> float:
+    def draw(self, direction: str, number: int, event: int) -> float:
         """A number in (0, 1) for datagram `number`: the same in every run with this seed. `what`: of its fates."""
-        return self._uniform(direction, number, 16 + what)
+        return self._draw_uniform(direction, number, 16 + event)
 
-    def _move_on(self, begin_ns: int) -> None:
+    def _enter_next_phase(self, begin_ns: int) -> None:
         phases = self.profile.phases
         self._number += 1
         self.phase = phases[self._number % len(phases) if self.profile.repeat else self._number]
         self._phase_end_ns = begin_ns + round(self.phase.seconds * SECOND) if self.phase.seconds else 2**63 - 1
         phase, key = self.phase, f"{self._seed}/{self._number}"
-        self._bursts = Spells(random.Random(f"{key}/bursts"), phase.burst_every_s, phase.burst_s, begin_ns)
-        self._stalls = Spells(random.Random(f"{key}/stalls"), phase.stall_every_s, phase.stall_s, begin_ns)
+        self._bursts = RandomIntervals(random.Random(f"{key}/bursts"), phase.burst_every_s, phase.burst_s, begin_ns)
+        self._stalls = RandomIntervals(random.Random(f"{key}/stalls"), phase.stall_every_s, phase.stall_s, begin_ns)
 
-    def _uniform(self, direction: str, number: int, what: int) -> float:
+    def _draw_uniform(self, direction: str, number: int, event: int) -> float:
         """Uniform in (0, 1), by hashing (splitmix64): any moment can be asked for without those before it."""
-        x = (self._seed * 0x9E3779B97F4A7C15 + number * 64 + what * 2 + (direction == UP)) & _MASK
+        x = (self._seed * 0x9E3779B97F4A7C15 + number * 64 + event * 2 + (direction == UP)) & _MASK
         for _ in range(2):
             x = (x + 0x9E3779B97F4A7C15) & _MASK
             x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & _MASK

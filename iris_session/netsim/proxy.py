@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from iris_session.netsim.datagrams import DatagramPort
-from iris_session.netsim.profiles import DIRECTIONS, DOWN, UP, Profile, Weather
+from iris_session.netsim.profiles import DIRECTIONS, DOWN, UP, LinkConditions, Profile
 
 CHUNK: Final = 16_384
 #: Kernel buffers of our own sockets; they come on top of what the profile lets be under way.
@@ -29,17 +29,17 @@ OWN_DELAYS_KEPT: Final = 20_000
 _RESET: Final = struct.pack("ii", 1, 0)  # SO_LINGER 0: close sends RST
 
 
-class Link:
+class ImpairedLink:
     """One radio link: its weather, its rate, its connections. All times are CLOCK_MONOTONIC in nanoseconds."""
 
     def __init__(self, address: str, target: str, profile: Profile, seed: int) -> None:
         self.address, self.target, self.seed = address, target, seed
         self.profile = profile
-        self.held = False  # a stall by command
+        self.stalled_by_command = False  # a stall by command
         self.source = ""  # address from which the session is reached; empty: the system's choice
-        self.orphans: deque[socket.socket] = deque()
-        self.lanes: set[_Lane] = set()
-        self.pairs: set[_Pair] = set()
+        self.abandoned: deque[socket.socket] = deque()
+        self.pipes: set[_Pipe] = set()
+        self.connections: set[_Connection] = set()
         self.ports: list[DatagramPort] = []
         self.accepted = self.refused = 0
         self.bytes = dict.fromkeys(DIRECTIONS, 0)
@@ -48,7 +48,7 @@ class Link:
         self._change: asyncio.TimerHandle | None = None
         self._was_stalled: dict[str, bool] = {}
         self._listening: list[socket.socket] = []
-        self.begin(profile)
+        self.start_profile(profile)
 
     @property
     def window(self) -> int:
@@ -64,70 +64,70 @@ class Link:
             self._loop.add_reader(listening.fileno(), self._accept, listening, port)
         self.ports += [DatagramPort(self, port) for port in udp_ports]
 
-    def begin(self, profile: Profile) -> None:
+    def start_profile(self, profile: Profile) -> None:
         """The profile begins now."""
         self.profile = profile
-        self.weather = Weather(profile, self.seed)
+        self.conditions = LinkConditions(profile, self.seed)
         self._start_ns = time.monotonic_ns()
         self._free_ns = dict.fromkeys(DIRECTIONS, 0)
-        self.changed()
+        self.update_stalls()
 
-    def changed(self) -> None:
+    def update_stalls(self) -> None:
         """Looks whether stalls began or ended, and when to look again."""
         now_ns = time.monotonic_ns()
         t_ns = now_ns - self._start_ns
-        self.weather.move_on(t_ns, lambda how: self.break_all(reset=how == "reset"))
+        self.conditions.advance(t_ns, lambda how: self.close_connections(reset=how == "reset"))
         for direction in DIRECTIONS:
-            stalled = self.stalled(direction, now_ns)
+            stalled = self.is_stalled(direction, now_ns)
             if self._was_stalled.get(direction) and not stalled:
                 self._free_ns[direction] = now_ns
-                for lane in [lane for lane in self.lanes if lane.direction == direction]:
-                    lane.retime(now_ns)
+                for lane in [lane for lane in self.pipes if lane.direction == direction]:
+                    lane.reschedule(now_ns)
             self._was_stalled[direction] = stalled
         if self._change is not None:
             self._change.cancel()
-        wait_ns = min(self.weather.next_change_ns(t_ns) - t_ns, 3_600_000_000_000)
-        self._change = self._loop.call_later(wait_ns * 1e-9 + 1e-4, self.changed)
+        wait_ns = min(self.conditions.find_next_change_ns(t_ns) - t_ns, 3_600_000_000_000)
+        self._change = self._loop.call_later(wait_ns * 1e-9 + 1e-4, self.update_stalls)
 
-    def stalled(self, direction: str, now_ns: int) -> bool:
-        return self.held or self.weather.stalled(direction, now_ns - self._start_ns)
+    def is_stalled(self, direction: str, now_ns: int) -> bool:
+        return self.stalled_by_command or self.conditions.is_stalled(direction, now_ns - self._start_ns)
 
-    def arrival_ns(self, direction: str, size: int, now_ns: int) -> int:
+    def schedule_arrival_ns(self, direction: str, size: int, now_ns: int) -> int:
         """When `size` bytes that are sent now are there."""
-        rate = self.weather.phase.direction(direction).rate_mbit
+        rate = self.conditions.phase.get_direction(direction).rate_mbit
         sent_ns = max(now_ns, self._free_ns[direction])
         if rate:
             sent_ns += round(size * 8e3 / rate)
             self._free_ns[direction] = sent_ns
-        return sent_ns + self.weather.delay_ns(direction, now_ns - self._start_ns)
+        return sent_ns + self.conditions.compute_delay_ns(direction, now_ns - self._start_ns)
 
-    def break_all(self, *, reset: bool) -> None:
+    def close_connections(self, *, reset: bool) -> None:
         """Closes every connection, in order or by RST."""
-        for pair in list(self.pairs):
+        for pair in list(self.connections):
             pair.close(reset=reset)
 
     def roam(self, source: str) -> None:
         """The clients' network has changed: their connections are gone, though the session hears nothing of that,
         and new ones come from address `source`."""
         self.source = source or self.source
-        for pair in list(self.pairs):
-            self.orphans.append(pair.abandon())
-            if len(self.orphans) > MAX_CONNECTIONS:
-                self.orphans.popleft().close()
+        for pair in list(self.connections):
+            self.abandoned.append(pair.abandon())
+            if len(self.abandoned) > MAX_CONNECTIONS:
+                self.abandoned.popleft().close()
 
-    def stats(self) -> dict[str, Any]:
+    def collect_stats(self) -> dict[str, Any]:
         """Counters, and by how much deliveries came later than they should [ms]."""
         own = sorted(self.own_ns)
         p50, p99 = (own[int(q * (len(own) - 1))] / 1e6 if own else 0.0 for q in (0.5, 0.99))
         lost, dropped = (sum(getattr(port, name) for port in self.ports) for name in ("lost", "dropped"))
         return {
             "link": self.address,
-            "connections": len(self.pairs),
+            "connections": len(self.connections),
             "accepted": self.accepted,
             "refused": self.refused,
             "bytes_up": self.bytes[UP],
             "bytes_down": self.bytes[DOWN],
-            "held_bytes": sum(lane.size for lane in self.lanes),
+            "held_bytes": sum(lane.size for lane in self.pipes),
             "own_delay_ms_p50": round(p50, 3),
             "own_delay_ms_p99": round(p99, 3),
             "datagrams_lost": lost,
@@ -137,22 +137,22 @@ class Link:
     def _accept(self, listening: socket.socket, port: int) -> None:
         with contextlib.suppress(OSError):
             near, _ = listening.accept()
-            if len(self.pairs) >= MAX_CONNECTIONS:
+            if len(self.connections) >= MAX_CONNECTIONS:
                 self.refused += 1
                 _close(near, reset=True)
                 return
             self.accepted += 1
-            self._loop.create_task(_Pair(self, near).connect(port))
+            self._loop.create_task(_Connection(self, near).connect(port))
 
 
-class _Pair:
+class _Connection:
     """One TCP connection: the client's end (`near`), the session's (`far`), a lane each way."""
 
-    def __init__(self, link: Link, near: socket.socket) -> None:
+    def __init__(self, link: ImpairedLink, near: socket.socket) -> None:
         self.link, self._near = link, near
         self._far = socket.socket(socket.AF_INET6 if ":" in link.target else socket.AF_INET)
-        self._lanes: list[_Lane] = []
-        link.pairs.add(self)
+        self._pipes: list[_Pipe] = []
+        link.connections.add(self)
         for end in (self._near, self._far):
             end.setblocking(False)
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -168,107 +168,107 @@ class _Pair:
         except OSError:
             self.close(reset=True)
             return
-        if self in self.link.pairs:
-            self._lanes = [_Lane(self, UP, self._near, self._far), _Lane(self, DOWN, self._far, self._near)]
+        if self in self.link.connections:
+            self._pipes = [_Pipe(self, UP, self._near, self._far), _Pipe(self, DOWN, self._far, self._near)]
 
     def close(self, *, reset: bool = False) -> None:
         """Closes both ends at once; what is under way is gone."""
-        self.link.pairs.discard(self)
-        for lane in self._lanes:
+        self.link.connections.discard(self)
+        for lane in self._pipes:
             lane.stop()
         for end in (self._near, self._far):
             _close(end, reset=reset)
 
     def abandon(self) -> socket.socket:
         """Closes the client's end only. Returns the other, which the session still takes for a connection."""
-        self.link.pairs.discard(self)
-        for lane in self._lanes:
+        self.link.connections.discard(self)
+        for lane in self._pipes:
             lane.stop()
         _close(self._near, reset=True)
         return self._far
 
-    def ended(self) -> None:
+    def on_pipe_ended(self) -> None:
         """One direction has ended in order; both: the connection is over."""
-        if all(lane.ended for lane in self._lanes):
+        if all(lane.ended for lane in self._pipes):
             self.close()
 
 
-class _Lane:
+class _Pipe:
     """One direction of a connection: bytes with the time at which they arrive, in order."""
 
-    def __init__(self, pair: _Pair, direction: str, source: socket.socket, sink: socket.socket) -> None:
+    def __init__(self, pair: _Connection, direction: str, source: socket.socket, sink: socket.socket) -> None:
         self.direction, self.size, self.ended = direction, 0, False
-        self._pair, self._link, self._source, self._sink = pair, pair.link, source, sink
+        self._connection, self._link, self._source, self._sink = pair, pair.link, source, sink
         self._loop = asyncio.get_running_loop()
         self._items: deque[tuple[int, bytes]] = deque()  # empty bytes: the end
         self._last_ns = 0
         self._timer: asyncio.TimerHandle | None = None
         self._reading = self._writing = False
         self._ending = False
-        self._link.lanes.add(self)
-        self._read_on()
+        self._link.pipes.add(self)
+        self._resume_reading()
 
-    def retime(self, now_ns: int) -> None:
+    def reschedule(self, now_ns: int) -> None:
         """A stall has ended: everything that waited leaves now, at the link's rate."""
         self._last_ns = 0
         waiting, self._items = self._items, deque()
         for _, data in waiting:
-            self._last_ns = max(self._last_ns, self._link.arrival_ns(self.direction, len(data), now_ns))
+            self._last_ns = max(self._last_ns, self._link.schedule_arrival_ns(self.direction, len(data), now_ns))
             self._items.append((self._last_ns, data))
-        self._deliver()
+        self._deliver_due()
 
     def stop(self) -> None:
         """Lets go of both sockets."""
-        self._link.lanes.discard(self)
-        self._pause()
+        self._link.pipes.discard(self)
+        self._pause_reading()
         self._stop_writing()
         if self._timer is not None:
             self._timer.cancel()
 
-    def _readable(self) -> None:
+    def _on_readable(self) -> None:
         room = self._link.window - self.size
         if room <= 0:  # another profile, with a smaller window
-            self._pause()
+            self._pause_reading()
             return
         try:
             data = self._source.recv(min(CHUNK, room))
         except BlockingIOError:
             return
         except OSError:
-            self._pair.close(reset=True)
+            self._connection.close(reset=True)
             return
         now_ns = time.monotonic_ns()
-        self._last_ns = max(self._last_ns, self._link.arrival_ns(self.direction, len(data), now_ns))
+        self._last_ns = max(self._last_ns, self._link.schedule_arrival_ns(self.direction, len(data), now_ns))
         self._items.append((self._last_ns, data))
         self.size += len(data)
         self._link.bytes[self.direction] += len(data)
         self._ending = not data
         if self._ending or self.size >= self._link.window:
-            self._pause()
+            self._pause_reading()
         if len(self._items) == 1:  # else a timer for the first one runs already
-            self._deliver()
+            self._deliver_due()
 
-    def _deliver(self, *, held_up: bool = False) -> None:
+    def _deliver_due(self, *, held_up: bool = False) -> None:
         """Hands on what has arrived; sets the timer for what has not. `held_up`: the sink did not take it earlier."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         now_ns = time.monotonic_ns()
-        if self._writing or self._link.stalled(self.direction, now_ns):
+        if self._writing or self._link.is_stalled(self.direction, now_ns):
             return  # goes on when the sink takes more, or by `retime`
         while self._items and self._items[0][0] <= now_ns:
             arrived_ns, data = self._items.popleft()
             if not data:
-                self._end()
+                self._shut_down()
                 return
             if not held_up:
                 self._link.own_ns.append(now_ns - arrived_ns)
             if not self._send(arrived_ns, data):
                 return
         if self._items:
-            self._timer = self._loop.call_at(self._items[0][0] * 1e-9, self._deliver)
+            self._timer = self._loop.call_at(self._items[0][0] * 1e-9, self._deliver_due)
         if not self._reading and not self._ending and self.size < self._link.window:
-            self._read_on()
+            self._resume_reading()
 
     def _send(self, arrived_ns: int, data: bytes) -> bool:
         """False when the sink took less than all: the rest goes when it can."""
@@ -277,31 +277,31 @@ class _Lane:
         except BlockingIOError:
             taken = 0
         except OSError:
-            self._pair.close(reset=True)
+            self._connection.close(reset=True)
             return False
         self.size -= taken
         if taken == len(data):
             return True
         self._items.appendleft((arrived_ns, data[taken:]))
         self._writing = True
-        self._loop.add_writer(self._sink.fileno(), self._writable)
+        self._loop.add_writer(self._sink.fileno(), self._on_writable)
         return False
 
-    def _writable(self) -> None:
+    def _on_writable(self) -> None:
         self._stop_writing()
-        self._deliver(held_up=True)
+        self._deliver_due(held_up=True)
 
-    def _end(self) -> None:
+    def _shut_down(self) -> None:
         self.ended = True
         with contextlib.suppress(OSError):
             self._sink.shutdown(socket.SHUT_WR)
-        self._pair.ended()
+        self._connection.on_pipe_ended()
 
-    def _read_on(self) -> None:
+    def _resume_reading(self) -> None:
         self._reading = True
-        self._loop.add_reader(self._source.fileno(), self._readable)
+        self._loop.add_reader(self._source.fileno(), self._on_readable)
 
-    def _pause(self) -> None:
+    def _pause_reading(self) -> None:
         if self._reading:
             self._reading = False
             self._loop.remove_reader(self._source.fileno())

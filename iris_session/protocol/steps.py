@@ -65,7 +65,7 @@ class ObjectCommand(msgspec.Struct, frozen=True, array_like=True):
     T_world_object: Pose
 
 
-class Outgoing(msgspec.Struct, frozen=True, array_like=True):
+class OutgoingMessage(msgspec.Struct, frozen=True, array_like=True):
     """A message for one connection."""
 
     connection: Count
@@ -101,7 +101,7 @@ class Decision(msgspec.Struct, frozen=True):
 
     commands: tuple[Command, ...]
     objects: tuple[ObjectCommand, ...] = ()
-    outgoing: tuple[Outgoing, ...] = ()
+    outgoing: tuple[OutgoingMessage, ...] = ()
     admitted: tuple[Admitted, ...] = ()
     dropped: tuple[Dropped, ...] = ()
     events: tuple[Event, ...] = ()
@@ -201,7 +201,7 @@ __all__ = [
     "FixedView",
     "ObjectCommand",
     "ObjectContact",
-    "Outgoing",
+    "OutgoingMessage",
     "Quat",
     "Vec3",
     "WorldView",

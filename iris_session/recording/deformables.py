@@ -16,7 +16,7 @@ from iris_session.protocol.scene import Deformable
 from iris_session.recording.scene_geometry import WORLD, Pixels, Rgba8, to_rgba8
 from iris_session.scene import AssetDecodeError
 from iris_session.scene.arrays import require
-from iris_session.scene.simplify import unit
+from iris_session.scene.mesh_processing import unit
 from iris_session.streams.deformable import DeformableDecoder
 from iris_session.streams.deformable_topology import DeformableTopology
 from iris_session.streams.errors import StreamError

@@ -23,9 +23,8 @@ from iris_session.protocol.server_messages import BodyInfo
 from iris_session.recording.journal import unpack_model
 from iris_session.recording.messages import SceneAssets
 from iris_session.scene import AssetStore, EncodeOptions, MeshArrays, decode_arrays, decode_image, decode_mesh
-from iris_session.scene.coordinates import on_deformable, with_coordinates
-from iris_session.scene.cubes import Atlas, Cubes, baked, direction_scale
-from iris_session.scene.shapes import height_field, primitive
+from iris_session.scene.cube_maps import Atlas, Cubes, baked, direction_scale
+from iris_session.scene.shapes import height_field, on_deformable, primitive, with_coordinates
 
 WORLD: Final = "world"
 #: Half edge [m] at which an infinite plane is drawn, and half its drawn thickness.

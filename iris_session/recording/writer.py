@@ -77,7 +77,7 @@ class RrdWriter:
         self.path = str(path)
         self._stream = RrdStream(self.path, paths.APPLICATION, recording_id)
         self._rec = self._stream.recording
-        self._rec.send_build_blueprint(_build_blueprint())
+        self._rec.send_blueprint(_build_blueprint())
         self._picture = ScenePicture(self._rec)
         self._pending = Batch()
         self._samples: list[tuple[int, int, bytes]] = []

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from iris_session.protocol.assets import ARRAYS_MAGIC, MAX_ARRAY_BYTES, MAX_ARRAY_HEADER_BYTES, ArrayHeader, ArrayInfo
 from iris_session.protocol.codec import decoder
 from iris_session.protocol.names import ArrayCodec, ArrayFilter
-from iris_session.scene.errors import AssetDecodeError
+from iris_session.scene.errors import AssetDecodeError, SceneBuildError
 
 Array = NDArray[Any]
 _DTYPES: Final = {name: np.dtype(f"<{name}") for name in ("u1", "i1", "u2", "u4", "f4")}
@@ -220,3 +220,11 @@ def _scaled(info: ArrayInfo, stored: Array) -> Array:
             np.multiply(stored[..., k], np.float32(info.scale[k]), out=values[..., k], dtype=np.float32)
             values[..., k] += np.float32(info.offset[k])
     return values
+
+
+def array_of(values: Any, what: str) -> NDArray[Any]:
+    """What a caller gave, as an array. Raises `SceneBuildError` for what is none, as rows of different lengths."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise SceneBuildError(f"{what}: no array: {error}") from None

@@ -1,21 +1,29 @@
-"""What a `SceneBuilder` makes: a specification with its assets in a store, and what is needed to move its things.
+"""Result of a `SceneBuilder`: a specification with its assets in a store, and what is needed to move its bodies.
 
 Publishing code reads this; nothing here knows files, sessions or clocks. Body 0 is the world; moving bodies have the
-ids 1..n in the order of `ComposedScene.moving` and no parent but the world; bodies that stand still come after them.
+ids 1..n in the order of `ComposedScene.moving` and no parent but the world; static bodies come after them.
+
+`Articulation` is a tree of rigid bodies on joints. It computes with plain floats: a robot of ten joints takes some tens
+of microseconds at every published tick.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.protocol.common import Pose
+from anchors.pose import compose, quat_from_rotvec
+from iris_session.protocol.common import IDENTITY, Pose, Vec3
 from iris_session.protocol.scene import SceneSpec, asset_addresses
-from iris_session.scene.articulation import Articulation
+from iris_session.scene.errors import SceneBuildError
 from iris_session.streams.deformable_topology import DeformableTopology
+
+_NONE: Final[Mapping[str, Pose]] = {}
 
 
 @dataclass(frozen=True)
@@ -58,3 +66,113 @@ class ComposedScene:
     def addresses(self) -> tuple[str, ...]:
         """All assets in the order in which they show something: to be held in the store, and served."""
         return (self.scene_hash, *asset_addresses(self.spec))
+
+
+# --- articulations ----------------------------------------------------------------------------------------------------
+
+
+class Joint(NamedTuple):
+    """One that is set. `kind`: revolute, continuous or prismatic. `low`, `high`: limits [rad] or [m], infinite for
+    none; beyond them is drawn as it is told. `rest`: what stands until it is set, the nearest to 0 within the limits.
+    """
+
+    name: str
+    kind: str
+    low: float
+    high: float
+    rest: float
+
+
+class Part(NamedTuple):
+    """One moving body on its joint. `parent`: an earlier part by its place, -1 for the root, which is part 0.
+
+    `T_parent_joint`: of the joint in the parent's frame; at position 0 the body's frame is there. `axis`: unit vector
+    in the joint's frame. `sliding`: along the axis, else around it; a `joint` of -1 is fixed. The position is that of
+    `joint` (by its place in `Articulation.joints`) times `multiplier` plus `offset`: 1 and 0 unless it mimics another.
+    """
+
+    body: str
+    parent: int = -1
+    T_parent_joint: Pose = IDENTITY
+    axis: Vec3 = (0.0, 0.0, 1.0)
+    sliding: bool = False
+    joint: int = -1
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Articulation:
+    """`name`: as it was added; the root is moved under it. `T_world_root`: its first pose.
+
+    `parts`: parents first. `joints`: those that can be set. `mimics`: joints that follow another, by name, and which:
+    they cannot be set. `loose`: floating and planar joints, and the body on each: it stands where the file has it until
+    somebody says where it is.
+    """
+
+    name: str
+    T_world_root: Pose
+    parts: tuple[Part, ...]
+    joints: tuple[Joint, ...]
+    mimics: Mapping[str, str]
+    loose: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the moving bodies, the root's first."""
+        return tuple(part.body for part in self.parts)
+
+    def poses(self, q: Mapping[str, float]) -> dict[str, Pose]:
+        """T_articulation_body of every body, for positions of joints by name [rad] or [m].
+
+        Joints that are not in `q` are at rest. Raises `SceneBuildError` for names that cannot be set, and for
+        positions that are no finite numbers.
+        """
+        return self.placed(IDENTITY, q)
+
+    def placed(self, T_world_root: Pose, q: Mapping[str, float], loose: Mapping[str, Pose] = _NONE) -> dict[str, Pose]:
+        """T_world_body of every body, as `poses`. `loose`: T_world_body of bodies on floating and planar joints, by
+        name; what is below moves with them, whatever is above."""
+        self.check(q)
+        at = [float(q.get(joint.name, joint.rest)) for joint in self.joints]
+        placed: list[tuple[Vec3, tuple[float, float, float, float]]] = []
+        for part in self.parts:
+            above = placed[part.parent] if part.parent >= 0 else (T_world_root.p, T_world_root.q)
+            T_world_body = compose(above, (part.T_parent_joint.p, part.T_parent_joint.q))
+            if part.joint >= 0:
+                T_world_body = compose(T_world_body, _moved(part, at[part.joint]))
+            elif part.body in loose:
+                T_world_body = (loose[part.body].p, loose[part.body].q)
+            placed.append(T_world_body)
+        return {part.body: Pose(*T) for part, T in zip(self.parts, placed, strict=True)}
+
+    def check(self, q: Mapping[str, float]) -> None:
+        """Raises `SceneBuildError` unless every name is one of `joints` with a finite position."""
+        known = {joint.name for joint in self.joints}
+        for name, value in q.items():
+            if name in self.mimics:
+                raise SceneBuildError(f"joint {name!r} of {self.name!r} follows {self.mimics[name]!r}: set that one")
+            if name in self.loose:
+                body = self.loose[name]
+                raise SceneBuildError(
+                    f"joint {name!r} of {self.name!r} has no position: set_pose({body!r}, ...) moves it"
+                )
+            if name not in known:
+                names = ", ".join(joint.name for joint in self.joints) or "none"
+                raise SceneBuildError(f"{self.name!r} has no joint {name!r} that can be set. Joints: {names}")
+            try:
+                finite = math.isfinite(value)
+            except TypeError:
+                finite = False
+            if not finite:
+                raise SceneBuildError(f"joint {name!r} of {self.name!r} at {value!r}: a finite number is needed")
+
+
+def _moved(part: Part, position: float) -> tuple[Vec3, tuple[float, float, float, float]]:
+    """T_joint_body."""
+    along = part.multiplier * position + part.offset
+    x, y, z = part.axis
+    step = (along * x, along * y, along * z)
+    if part.sliding:
+        return step, (1.0, 0.0, 0.0, 0.0)
+    return (0.0, 0.0, 0.0), quat_from_rotvec(step)

@@ -17,8 +17,8 @@ from iris_session.protocol.common import Vec3
 from iris_session.protocol.names import ArrayKind, GeometryKind
 from iris_session.protocol.scene import Geometry, SceneSpec, Visual
 from iris_session.scene.arrays import decode_arrays
+from iris_session.scene.elements import matrix_of, vec3
 from iris_session.scene.meshes import decode_mesh
-from iris_session.scene.parts import matrix_of, vec3
 
 #: No part and no robot is larger, few rooms are; a part of a centimetre whose file counts in millimetres is.
 LARGEST_M: Final = 10.0

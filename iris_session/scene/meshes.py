@@ -1,4 +1,4 @@
-"""Meshes as assets: indexed corners, exact or quantised, and back.
+"""Meshes and deformables as assets: indexed corners, exact or quantised, and back.
 
 A corner is a vertex with its normal and texture coordinate as they are drawn; corners that agree in all bits are one.
 """
@@ -6,7 +6,7 @@ A corner is a vertex with its normal and texture coordinate as they are drawn; c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,15 @@ from iris_session.protocol.assets import MAX_ARRAY_BYTES
 from iris_session.protocol.names import ArrayFilter, ArrayKind, ArrayName
 from iris_session.scene.arrays import Stored, decode_arrays, encode_arrays, require
 from iris_session.scene.errors import AssetDecodeError
+from iris_session.streams.deformable_topology import DeformableTopology
 
 #: Steps of a quantised coordinate, and of a component of a normal.
 _POSITION_STEPS: Final = 65_535
 _NORMAL_STEPS: Final = 127
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+#: Below this many vertices their numbers fit 16 bits.
+_SHORT: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -155,3 +158,30 @@ def _rounding(values: Floats) -> float:
 def _quantised(name: str, values: Floats, low: NDArray[np.float64], step: NDArray[np.float64]) -> Stored:
     stored = np.clip(np.rint((values - low) / step), 0, _POSITION_STEPS).astype(np.uint16)
     return Stored(name, stored, ArrayFilter.SHUFFLE, tuple(step.tolist()), tuple(low.tolist()))
+
+
+# --- deformables ------------------------------------------------------------------------------------------------------
+
+
+def encode_deformable(
+    elements: NDArray[np.uint32],
+    uv: NDArray[np.float32] | None,
+    rest: NDArray[np.float32],
+    topology: DeformableTopology,
+    numbers: NDArray[Any] | None = None,
+) -> bytes:
+    """`elements`: edges (m, 2) or triangles (m, 3); `uv` (m, corners, 2). `rest`: vertices (n, 3) [m], world frame.
+
+    `topology`: bare, its triangles are `elements`. `numbers`: of the vertices in the simulator, if some are left out.
+    """
+    narrow = elements.astype(np.uint16) if len(rest) <= _SHORT else elements
+    arrays = [
+        Stored(ArrayName.ELEMENTS, narrow, ArrayFilter.DELTA),
+        Stored(ArrayName.POSITION, rest, ArrayFilter.SHUFFLE),
+        Stored(ArrayName.PLAN, np.frombuffer(topology.to_bytes(), np.uint8)),
+    ]
+    if numbers is not None:
+        arrays.append(Stored(ArrayName.VERTEX, numbers.astype(np.uint32), ArrayFilter.DELTA))
+    if uv is not None:
+        arrays.append(Stored(ArrayName.UV, uv, ArrayFilter.SHUFFLE))
+    return encode_arrays(ArrayKind.DEFORMABLE, arrays)

@@ -26,12 +26,19 @@ from iris_session.protocol.scene import (
     asset_addresses,
     encode_scene,
 )
-from iris_session.scene.build import Builder, EncodeOptions
-from iris_session.scene.mujoco_assets import hfields, meshes, textures
-from iris_session.scene.mujoco_deformables import deformables
-from iris_session.scene.mujoco_looks import cameras, drawn_rgba, environment, lights, materials, pose, tracked
-from iris_session.scene.mujoco_names import label
-from iris_session.scene.totals import with_totals
+from iris_session.scene.asset_builder import Builder, EncodeOptions
+from iris_session.scene.budget import with_totals
+from iris_session.scene.mujoco_appearance import (
+    cameras,
+    drawn_rgba,
+    environment,
+    label,
+    lights,
+    materials,
+    pose,
+    tracked,
+)
+from iris_session.scene.mujoco_assets import deformables, hfields, meshes, textures
 
 _KINDS: Final = {
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind

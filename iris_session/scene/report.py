@@ -10,11 +10,10 @@ import msgspec
 
 from iris_session.protocol.names import AssetEncoding, GeometryKind, LightKind
 from iris_session.protocol.scene import Body, SceneSpec, Totals
-from iris_session.scene.budget import QUEST_3, Choice, choose_levels
-from iris_session.scene.cubes import CUBE_SIDE, cube_texture
+from iris_session.scene.budget import QUEST_3, Choice, choose_levels, texture_memory, triangles
+from iris_session.scene.cube_maps import CUBE_SIDE, cube_texture
 from iris_session.scene.extent import Extent
 from iris_session.scene.shapes import ENDLESS
-from iris_session.scene.totals import texture_memory, triangles
 
 #: How many heavy things are listed.
 HEAVIEST: Final = 8

@@ -8,19 +8,24 @@ from typing import Final
 import msgspec
 
 from iris_session.protocol.names import Role
-from iris_session.security.curve import fingerprint, raw_key
-from iris_session.security.files import PATIENCE_S, KeysBusyError, KeysError, PrivateFolder
-from iris_session.security.lines import line_of
+from iris_session.security.curve import compute_fingerprint, decode_key
+from iris_session.security.private_folder import (
+    LOCK_TIMEOUT_S,
+    KeysBusyError,
+    KeysError,
+    PrivateFolder,
+    find_entry_line,
+)
 
 FILE: Final = "clients.json"
 MAX_KEYS: Final = 1024
-#: What a new key may join as unless somebody says otherwise: everything but to command others, or to speak for them.
+#: Default roles of a new key: everything except commanding other participants or speaking for them.
 DEFAULT_ROLES: Final = (Role.OPERATOR, Role.OBSERVER, Role.AGENT, Role.LEADER)
 MAX_NAME: Final = 64  # as `protocol.common.Name`
 
 
 class AllowedKey(msgspec.Struct, frozen=True):
-    """One key. `key`: public, Z85. `roles`: what it may join as, empty for any. Times: UTC, ISO 8601."""
+    """One allowed key. `key`: public, Z85. `roles`: roles it may join in, empty for any. Times: UTC, ISO 8601."""
 
     name: str
     key: str
@@ -30,16 +35,16 @@ class AllowedKey(msgspec.Struct, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint(raw_key(self.key))
+        return compute_fingerprint(decode_key(self.key))
 
 
-def utc_now() -> str:
-    """Now, as it stands in the files."""
+def format_utc_now() -> str:
+    """Return the present time as written in the files (UTC, ISO 8601)."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
-def checked_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
-    """`roles` without doubles. Raises `KeysError` for one that there is not."""
+def validate_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
+    """Return `roles` without duplicates. Raises `KeysError` for an unknown one."""
     for role in roles:
         if role not in Role.ALL:
             raise KeysError(f"unknown role {role!r}: {', '.join(sorted(Role.ALL))}")
@@ -54,69 +59,67 @@ class AllowList:
 
     @property
     def signature(self) -> tuple[int, ...] | None:
-        """Differs after every change of the file: for who watches it."""
+        """A value that differs after every change of the file, for polling."""
         return self._folder.signature(FILE)
 
     def read(self) -> dict[str, AllowedKey]:
-        """Allowed keys by fingerprint, in the order in which they were added."""
+        """Return the allowed keys by fingerprint, in the order in which they were added."""
         entries = self._folder.read_json(FILE, list[AllowedKey]) or []
         if len(entries) > MAX_KEYS:
-            raise KeysError(
-                f"{self._folder.path / FILE} has {len(entries)} keys, at most {MAX_KEYS} can be: revoke some"
-            )
+            raise KeysError(f"{self._folder.path / FILE} has {len(entries)} keys, the limit is {MAX_KEYS}: revoke some")
         keys: dict[str, AllowedKey] = {}
         for index, entry in enumerate(entries):
-            wrong = _wrong(entry, keys)
+            wrong = _find_fault(entry, keys)
             if wrong:
                 text = (self._folder.read(FILE) or b"").decode(errors="replace")
-                where = f"{self._folder.path / FILE} is damaged (line {line_of(text, index)}"
-                raise KeysError(f"{where}: {wrong}): repair it, or move it away")
+                where = f"{self._folder.path / FILE} is damaged (line {find_entry_line(text, index)}"
+                raise KeysError(f"{where}: {wrong}): repair it or move it away")
             keys[entry.fingerprint] = entry
         return keys
 
-    def allow(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
-        """Puts `key` (Z85) on the list, or renames it and sets its roles. Raises `KeysError` for a taken name."""
-        with self._folder.locked():
-            return self.put(name, key, roles, rename=False)
+    def allow_key(self, name: str, key: str, roles: tuple[str, ...] = ()) -> AllowedKey:
+        """Add `key` (Z85) to the list, or rename it and set its roles. Raises `KeysError` for a taken name."""
+        with self._folder.lock():
+            return self.put_locked(name, key, roles, rename=False)
 
-    def put(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
-        """As `allow`, for who holds the lock. `rename`: a taken name gets a number, `ann-2`."""
-        entry, entries = self.with_key(name, key, roles, rename=rename)
-        self.replace(entries)
+    def put_locked(self, name: str, key: str, roles: tuple[str, ...], *, rename: bool) -> AllowedKey:
+        """Do `allow_key` while the lock is held. `rename`: a taken name gets a number, `ann-2`."""
+        entry, entries = self.plan_entry(name, key, roles, rename=rename)
+        self.replace_all(entries)
         return entry
 
-    def replace(self, entries: list[AllowedKey]) -> None:
-        """Writes the whole list, for who holds the lock."""
+    def replace_all(self, entries: list[AllowedKey]) -> None:
+        """Write the whole list. The lock must be held."""
         self._folder.write_json(FILE, entries)
 
-    def with_key(
+    def plan_entry(
         self, name: str, key: str, roles: tuple[str, ...], *, rename: bool
     ) -> tuple[AllowedKey, list[AllowedKey]]:
-        """The entry that `put` would make, and the list with it. Nothing is written."""
+        """Return the entry that `put_locked` would add, and the list with it. Nothing is written."""
         if not _is_name(name):
-            raise KeysError(f"{name!r} is no name for a key: 1 to {MAX_NAME} printable characters")
+            raise KeysError(f"{name!r} is not a valid key name: expected 1 to {MAX_NAME} printable characters")
         entries = self.read()
-        mark = fingerprint(raw_key(key))
+        mark = compute_fingerprint(decode_key(key))
         names = {entry.name for other, entry in entries.items() if other != mark}
         if name in names:
             if not rename:
-                raise KeysError(f"the name {name!r} is taken by another key: revoke that one, or choose another name")
-            name = _numbered(name, names)
+                raise KeysError(f"the name {name!r} is taken by another key: revoke that key or choose another name")
+            name = _add_number(name, names)
         if mark not in entries and len(entries) >= MAX_KEYS:
             raise KeysError(f"the allow-list is full ({MAX_KEYS} keys): revoke some")
         old = entries.get(mark)
         entry = AllowedKey(
-            name, key, checked_roles(roles), old.added if old else utc_now(), old.last_seen if old else ""
+            name, key, validate_roles(roles), old.added if old else format_utc_now(), old.last_seen if old else ""
         )
         entries[mark] = entry
         return entry, list(entries.values())
 
-    def revoke(self, name_or_fingerprint: str, patience_s: float = PATIENCE_S) -> AllowedKey | None:
-        """Takes one key off the list; `None` when it was not on it. Sessions that run notice within half a second."""
-        with self._folder.locked(patience_s):
+    def revoke_key(self, name_or_fingerprint: str, timeout_s: float = LOCK_TIMEOUT_S) -> AllowedKey | None:
+        """Remove one key and return it, `None` when it was not listed. Running sessions notice within half a second."""
+        with self._folder.lock(timeout_s):
             entries = self.read()
             named = (mark for mark, entry in entries.items() if entry.name == name_or_fingerprint)
-            # A fingerprint first: somebody may have been listed under a name that looks like one.
+            # Fingerprints first: a key may be listed under a name that looks like one.
             mark = name_or_fingerprint if name_or_fingerprint in entries else next(named, "")
             if mark:
                 entry = entries.pop(mark)
@@ -124,28 +127,28 @@ class AllowList:
                 return entry
         return None
 
-    def seen(self, fingerprints: dict[str, str], patience_s: float = PATIENCE_S) -> None:
-        """Notes when keys were last here: UTC by fingerprint. Keys that are off the list are passed over."""
-        with self._folder.locked(patience_s):
+    def record_last_seen(self, utc_by_fingerprint: dict[str, str], timeout_s: float = LOCK_TIMEOUT_S) -> None:
+        """Record when keys last joined. Keys that are not listed any more are skipped."""
+        with self._folder.lock(timeout_s):
             before, entries = self.signature, self.read()
-            noted = {mark: utc for mark, utc in fingerprints.items() if mark in entries}
+            noted = {mark: utc for mark, utc in utc_by_fingerprint.items() if mark in entries}
             for mark, utc in noted.items():
                 entries[mark] = msgspec.structs.replace(entries[mark], last_seen=utc)
-            if self.signature != before:  # an editor knows no lock: what it took off the list must stay off
-                raise KeysBusyError(f"{self._folder.path / FILE} was edited just now: try again")
+            if self.signature != before:  # an editor holds no lock: what it removed must stay removed
+                raise KeysBusyError(f"{self._folder.path / FILE} was edited meanwhile: try again")
             if noted:
                 self._folder.write_json(FILE, list(entries.values()), durable=False)
 
 
-def _wrong(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
-    """What is wrong with an entry that somebody may have written by hand, empty for nothing."""
+def _find_fault(entry: AllowedKey, others: dict[str, AllowedKey]) -> str:
+    """Return why an entry, which may be written by hand, is invalid; empty when it is valid."""
     try:
         mark = entry.fingerprint
-        checked_roles(entry.roles)
+        validate_roles(entry.roles)
     except KeysError as error:
         return str(error)
     if not _is_name(entry.name):
-        return f"{entry.name[:MAX_NAME]!r} is no name for a key: 1 to {MAX_NAME} printable characters"
+        return f"{entry.name[:MAX_NAME]!r} is not a valid key name: expected 1 to {MAX_NAME} printable characters"
     return f"this key is listed as {others[mark].name!r} already" if mark in others else ""
 
 
@@ -153,6 +156,6 @@ def _is_name(name: str) -> bool:
     return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
-def _numbered(name: str, taken: set[str]) -> str:
+def _add_number(name: str, taken: set[str]) -> str:
     numbers = (f"{name[: MAX_NAME - 5]}-{n}" for n in range(2, MAX_KEYS + 2))
     return next(numbered for numbered in numbers if numbered not in taken)

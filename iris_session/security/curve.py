@@ -1,4 +1,4 @@
-"""CURVE key pairs: made, read from and written as ZeroMQ certificates, named by fingerprints."""
+"""CURVE key pairs: generated, read from and written as ZeroMQ certificates, identified by fingerprints."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from iris_session.security.files import KeysError, PrivateFolder, check_private
+from iris_session.security.private_folder import KeysError, PrivateFolder, check_private
 
 Z85_CHARACTERS: Final = 40
 MAX_CERTIFICATE_BYTES: Final = 65_536
@@ -30,14 +30,14 @@ curve
 """
 
 
-def fingerprint(key: bytes, person: bytes = b"iris-key") -> str:
-    """Name of a key (raw 32 bytes) that tells nothing about it: 128-bit BLAKE2b in base32, lower case."""
+def compute_fingerprint(key: bytes, person: bytes = b"iris-key") -> str:
+    """Return a public identifier of a key (raw 32 bytes): 128-bit BLAKE2b in base32, lower case."""
     digest = hashlib.blake2b(key, digest_size=16, person=person).digest()
     return base64.b32encode(digest).decode().rstrip("=").lower()
 
 
-def raw_key(text: str) -> bytes:
-    """The 32 raw bytes of a CURVE key in Z85 (40 characters). Raises `KeysError`."""
+def decode_key(text: str) -> bytes:
+    """Return the 32 raw bytes of a CURVE key in Z85 (40 characters). Raises `KeysError`."""
     if len(text) == Z85_CHARACTERS and text.isascii():
         try:
             key = z85.decode(text.encode())
@@ -45,7 +45,7 @@ def raw_key(text: str) -> bytes:
             key = b""
         if len(key) == 32:
             return bytes(key)
-    raise KeysError(f"{text[:50]!r} is not a CURVE key: {Z85_CHARACTERS} characters of Z85, as in a *.key file")
+    raise KeysError(f"{text[:50]!r} is not a CURVE key: expected {Z85_CHARACTERS} Z85 characters, as in a *.key file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,55 +56,58 @@ class KeyPair:
     secret: str
 
     def __repr__(self) -> str:
-        return f"KeyPair({self.fingerprint})"  # never the secret, in no log and no traceback
+        return f"KeyPair({self.fingerprint})"  # the secret must not reach a log or traceback
 
     @property
     def raw_public(self) -> bytes:
-        return raw_key(self.public)
+        return decode_key(self.public)
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint(self.raw_public)
+        return compute_fingerprint(self.raw_public)
 
     @classmethod
-    def new(cls) -> KeyPair:
+    def generate(cls) -> KeyPair:
         public, secret = zmq.curve_keypair()
         return cls(public.decode(), secret.decode())
 
 
 def load_public(path: str | os.PathLike[str]) -> str:
-    """The public key (Z85) in a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
-    return _load(Path(path))[0]
+    """Return the public key (Z85) of a ZeroMQ certificate, `*.key` or `*.key_secret`. Raises `KeysError`."""
+    return _read_certificate(Path(path))[0]
 
 
 def load_secret(path: str | os.PathLike[str]) -> KeyPair:
-    """The key pair in a `*.key_secret` certificate that its owner alone can read. Raises `KeysError`."""
+    """Return the key pair of a `*.key_secret` certificate that only its owner can read. Raises `KeysError`."""
     path = Path(path)
-    public, secret = _load(path, private=True)
+    public, secret = _read_certificate(path, private=True)
     if not secret:
         raise KeysError(f"{path} holds no secret key: give the *.key_secret file")
     try:
-        raw_key(secret)
-    except KeysError:  # whose text would show it
-        raise KeysError(f"the secret key in {path} {_wrong(secret)}: make the pair anew") from None
+        decode_key(secret)
+    except KeysError:  # its message would show the key
+        raise KeysError(f"the secret key in {path} {_describe_bad_key(secret)}: generate a new pair") from None
     if zmq.curve_public(secret.encode()) != public.encode():
-        raise KeysError(f"the two keys in {path} do not belong together: take the file as it was made")
+        raise KeysError(f"the two keys in {path} do not belong together: use the file as it was generated")
     return KeyPair(public, secret)
 
 
-def pair_in(folder: PrivateFolder, name: str) -> KeyPair:
-    """The key pair in a file of a private folder, made on first use."""
-    if folder.read(name) is None:  # also checks who may read it
-        with folder.locked():
+def load_or_create_pair(folder: PrivateFolder, name: str) -> KeyPair:
+    """Return the key pair in a file of a private folder, generated on first use."""
+    if folder.read(name) is None:  # also checks the permissions
+        with folder.lock():
             if folder.read(name) is None:
-                pair = KeyPair.new()
+                pair = KeyPair.generate()
                 folder.write(name, _CERTIFICATE.format(public=pair.public, secret=pair.secret).encode())
     return load_secret(folder.path / name)
 
 
-def _load(path: Path, *, private: bool = False) -> tuple[str, str]:
-    """Both keys of a certificate, the secret one empty when it has none. `private`: it must be this user's alone if it
-    has one; what is checked is the file that is read, whatever has its name by then."""
+def _read_certificate(path: Path, *, private: bool = False) -> tuple[str, str]:
+    """Return both keys of a certificate, the secret one empty when it has none.
+
+    `private`: a file with a secret key must be readable by this user alone. The check is of the file that was opened,
+    not of the one that has its name later.
+    """
     try:
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
@@ -113,7 +116,7 @@ def _load(path: Path, *, private: bool = False) -> tuple[str, str]:
         raise KeysError(f"key file {path} cannot be read: its owner has to run chmod u+r {path}") from None
     except OSError as error:
         raise KeysError(f"key file {path} cannot be used: {error.strerror}") from None
-    keys = dict(reversed(_KEY.findall(text)))  # of two the first
+    keys = dict(reversed(_KEY.findall(text)))  # the first of two
     public, secret = keys.get("public", ""), keys.get("secret", "")
     if private and secret:
         check_private(path, status, f"chmod 600 {path}")
@@ -121,14 +124,14 @@ def _load(path: Path, *, private: bool = False) -> tuple[str, str]:
         text = 'a ZeroMQ certificate with a line public-key = "..."'
         raise KeysError(f"key file {path} cannot be used: it should be {text}")
     try:
-        raw_key(public)
+        decode_key(public)
     except KeysError:
-        raise KeysError(f"key file {path} cannot be used: its public key {_wrong(public)}") from None
+        raise KeysError(f"key file {path} cannot be used: its public key {_describe_bad_key(public)}") from None
     return public, secret
 
 
-def _wrong(key: str) -> str:
-    """What is wrong with a key, without showing it."""
+def _describe_bad_key(key: str) -> str:
+    """Return what is wrong with a key without showing it."""
     if len(key) != Z85_CHARACTERS:
         return f"has {len(key)} characters, a CURVE key has {Z85_CHARACTERS} of Z85"
     return f"is not {Z85_CHARACTERS} characters of Z85"

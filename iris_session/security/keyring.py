@@ -1,4 +1,4 @@
-"""The server's key and the keys that may come in, as the front sees them: read anew whenever their files change."""
+"""The server's key pair and the allowed client keys, reloaded whenever their files change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final
 
-from iris_session.link.config import FrontConfig, FrontError
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import Role
 from iris_session.security import (
@@ -17,36 +16,40 @@ from iris_session.security import (
     KeyHome,
     KeyPair,
     KeysError,
-    fingerprint,
+    compute_fingerprint,
+    decode_key,
     load_public,
     load_secret,
-    raw_key,
 )
-from iris_session.security.allow_list import utc_now
-from iris_session.security.file_worker import FileWorker
+from iris_session.security.allow_list import format_utc_now
+from iris_session.system.file_worker import FileWorker
 
-#: User-Id of a connection whose key is not on the list: this and the key in Z85. Never equal to a fingerprint.
-STRANGER: Final = "pair:"
-
-
-def stranger_key(user_id: str) -> str:
-    """The key (Z85) of a connection that may only pair, empty for any other."""
-    return user_id.removeprefix(STRANGER) if user_id.startswith(STRANGER) else ""
+#: User-Id of a connection whose key is not listed: this prefix and the key in Z85. Never equal to a fingerprint.
+PAIRING_PREFIX: Final = "pair:"
 
 
-def roles_behind(roles: tuple[str, ...]) -> tuple[str, ...]:
-    """What people may join as behind a gateway whose key has `roles` (empty: any): the others of them; where there is
-    no other, what a new key may."""
+def parse_pairing_key(user_id: str) -> str:
+    """Return the key (Z85) of a connection that may only pair, empty for any other."""
+    return user_id.removeprefix(PAIRING_PREFIX) if user_id.startswith(PAIRING_PREFIX) else ""
+
+
+def select_gateway_roles(roles: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the roles that clients of a gateway may join in, given the `roles` of its key (empty: any).
+
+    These are its other roles, or those of a new key when it has no other.
+    """
     return tuple(role for role in roles if role != Role.GATEWAY) or (DEFAULT_ROLES if roles else ())
 
 
 class Keyring:
-    """A `Service`. `key`: the server's, `None` on plain loopback. `home`: where unknown keys may pair, else `None`;
-    its files are changed by `files` only.
+    """The keys of a session and their changes, all by fingerprint. A `Service` of the front.
 
-    Since somebody emptied them: `gone`: keys that were taken off the list, or got other roles; `come`: keys that were
-    put on it; `seen`: keys that joined, with the time in UTC. `revoking`: keys that a director revoked and that are
-    still in the file. `watching`: keys that were let in to the state socket since it was opened.
+    `key`: key pair of the server, `None` on plain loopback. `home`: the key home where unknown keys may pair, else
+    `None`. `files`: the worker that makes every change of its files.
+
+    Collected until the front takes them: `removed`, keys that were removed from the list or got other roles; `added`,
+    new keys; `last_seen`, UTC at which keys joined. `pending_revocations`: keys that a director revoked and that are
+    still in the file. `state_subscribers`: keys admitted to the state socket since it was opened.
     """
 
     def __init__(
@@ -62,102 +65,109 @@ class Keyring:
         self._read = read
         self._signature = signature
         self._drops = drops or Drops()
-        self._seen = signature()
-        self._said: object = None  # what was wrong with the list last
+        self._read_signature = signature()
+        self._reported: object = None  # the fault of the list that was reported last
         self._keys = read()
-        self.gone: dict[str, AllowedKey] = {}
-        self.come: dict[str, AllowedKey] = {}
-        self.seen: dict[str, str] = {}
-        self.revoking: dict[str, None] = {}
-        self.watching: set[str] = set()
-        self.files = FileWorker()
+        self.removed: dict[str, AllowedKey] = {}
+        self.added: dict[str, AllowedKey] = {}
+        self.last_seen: dict[str, str] = {}
+        self.pending_revocations: dict[str, None] = {}
+        self.state_subscribers: set[str] = set()
+        self.files = FileWorker(KeysError)
 
     def tick(self, now_ns: int) -> None:
-        """Tells those who had files changed."""
-        self.files.turn(now_ns)
+        """Report finished changes of files to their callers."""
+        self.files.tick(now_ns)
 
     def close(self) -> None:
-        """What was asked for is still written."""
+        """Wait for queued changes of files."""
         self.files.close()
 
     @property
-    def marks(self) -> Collection[str]:
+    def fingerprints(self) -> Collection[str]:
         """Fingerprints of all allowed keys."""
         return self._keys.keys()
 
-    def find(self, mark: str) -> AllowedKey | None:
-        """The allowed key with that fingerprint."""
+    def find_key(self, mark: str) -> AllowedKey | None:
+        """Return the allowed key with that fingerprint."""
         return self._keys.get(mark)
 
-    def welcomed(self, mark: str) -> None:
-        """A key has joined."""
+    def record_join(self, mark: str) -> None:
+        """Record that a key has joined."""
         if self.home is not None and mark in self._keys:
-            self.seen[mark] = utc_now()
+            self.last_seen[mark] = format_utc_now()
 
-    def paired(self, mark: str) -> bool:
-        """A key was put on the list by the session itself. True: it still is, and may join whatever it was before; also
-        where the file cannot be read just now: it is known a moment later."""
-        self.look()  # the file decides: somebody may have taken the key off again since
+    def confirm_pairing(self, mark: str) -> bool:
+        """Return whether a key that the session itself added is still listed, and forget that it was revoked.
+
+        Also True while the file cannot be read: a later reload decides.
+        """
+        self.reload_if_changed()  # the file decides: the key may have been removed again since
         entry = self._keys.get(mark)
         if entry is not None:
-            self.come[mark] = entry
-        return entry is not None or self._signature() != self._seen
+            self.added[mark] = entry
+        return entry is not None or self._signature() != self._read_signature
 
-    def look(self) -> None:
-        """Reads the list again if its file has changed. One that is damaged changes nothing, and is said.
+    def reload_if_changed(self) -> None:
+        """Reload the list if its file has changed. A damaged file changes nothing and is reported.
 
-        One that the system does not let us read just now (no descriptor free, a network disk) is tried again.
+        A file that cannot be opened now (no free descriptor, a network disk) is tried again.
         """
         signature = self._signature()
-        if signature == self._seen:
+        if signature == self._read_signature:
             return
         try:
             keys = self._read()
         except KeysError as error:
             if not isinstance(error.__cause__, OSError):
-                self._seen = signature
-            if (signature, str(error)) != self._said:
-                self._said = signature, str(error)
+                self._read_signature = signature
+            if (signature, str(error)) != self._reported:
+                self._reported = signature, str(error)
                 self._drops.count("allow_list_unreadable")
-                print(f"iris-session: the allow-list stays as it was: {error}", file=sys.stderr, flush=True)
+                print(f"iris-session: the allow-list is unchanged: {error}", file=sys.stderr, flush=True)
             return
-        self._seen, self._said = signature, None
+        self._read_signature, self._reported = signature, None
         for mark, old in self._keys.items():
             new = keys.get(mark)
             if new is None or new.roles != old.roles:
-                self.gone[mark] = old
-        self.come.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
+                self.removed[mark] = old
+        self.added.update((mark, new) for mark, new in keys.items() if mark not in self._keys)
         self._keys = keys
 
 
-def open_keyring(config: FrontConfig, drops: Drops) -> Keyring:
-    """The keyring of a session. Off loopback everything is encrypted. Raises `FrontError`."""
-    if not (config.curve or config.curve_secret_file or not config.loopback):
-        return Keyring(drops=drops)
-    home = KeyHome(config.key_home)
-    try:
-        key = load_secret(config.curve_secret_file) if config.curve_secret_file else home.server_key()
-        if not config.curve_clients_dir:
-            return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
-        folder = Path(config.curve_clients_dir)
-        if not folder.is_dir():
-            raise FrontError(f"{folder} is no folder with the public keys (*.key) of the clients that may connect")
-        certificates = _Certificates(folder, drops)
-        return Keyring(key, None, certificates.read, certificates.signature, drops)
-    except KeysError as error:
-        raise FrontError(str(error)) from error
+def open_keyring(key_home: str, secret_file: str, clients_dir: str, drops: Drops) -> Keyring:
+    """Return the keyring of an encrypted session.
+
+    Args:
+        key_home: Folder of the server's key and the allow-list; empty for that of the user.
+        secret_file: Certificate of the server (`*.key_secret`) instead of the one in the key home, or empty.
+        clients_dir: Folder of public certificates (`*.key`) instead of the allow-list, or empty.
+        drops: Counts files that cannot be read.
+
+    Raises:
+        KeysError: A key or the allow-list cannot be used.
+    """
+    home = KeyHome(key_home)
+    key = load_secret(secret_file) if secret_file else home.load_server_key()
+    if not clients_dir:
+        return Keyring(key, home, home.clients.read, lambda: home.clients.signature, drops)
+    folder = Path(clients_dir)
+    if not folder.is_dir():
+        raise KeysError(f"{folder} is not a folder: it has to hold the public keys (*.key) of the allowed clients")
+    certificates = _CertificateFolder(folder, drops)
+    return Keyring(key, None, certificates.read, certificates.signature, drops)
 
 
-class _Certificates:
-    """The public keys of a folder. A certificate that is damaged lets nobody in, keeps nobody else out, and is said."""
+class _CertificateFolder:
+    """A folder of public keys. A damaged certificate admits no key, does not affect others, and is reported once."""
 
     def __init__(self, folder: Path, drops: Drops) -> None:
         self._folder = folder
         self._drops = drops
-        self._said: dict[str, str] = {}  # what is wrong, by file
+        self._reported: dict[str, str] = {}  # fault, by file name
 
     def read(self) -> dict[str, AllowedKey]:
-        """Every `*.key` certificate by fingerprint. Raises `KeysError`."""
+        """Return the key of every `*.key` certificate by fingerprint. Raises `KeysError`."""
         keys: dict[str, AllowedKey] = {}
         wrong: dict[str, str] = {}
         try:
@@ -172,21 +182,21 @@ class _Certificates:
             except KeysError as error:
                 wrong[path.name] = str(error)
                 continue
-            keys[fingerprint(raw_key(public))] = AllowedKey(path.stem[:64], public)
+            keys[compute_fingerprint(decode_key(public))] = AllowedKey(path.stem[:64], public)
         for name, text in wrong.items():
-            if self._said.get(name) != text:
+            if self._reported.get(name) != text:
                 self._drops.count("certificate_unusable")
-                print(f"iris-session: nobody is let in by {name}: {text}", file=sys.stderr, flush=True)
-        self._said = wrong
+                print(f"iris-session: certificate {name} admits no key: {text}", file=sys.stderr, flush=True)
+        self._reported = wrong
         return keys
 
     def signature(self) -> object:
-        """Changes with every file that comes, goes or is written, whatever time it is given."""
+        """Return a value that differs after every added, removed or written file, with any modification time."""
         try:
-            return tuple(sorted((entry.name, *_identity(entry.stat())) for entry in self._folder.iterdir()))
+            return tuple(sorted((entry.name, *_get_signature(entry.stat())) for entry in self._folder.iterdir()))
         except OSError:
             return None
 
 
-def _identity(status: os.stat_result) -> tuple[int, ...]:
+def _get_signature(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_ctime_ns, status.st_size, status.st_mode

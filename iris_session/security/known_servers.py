@@ -1,4 +1,4 @@
-"""`known_servers.json`: the keys of sessions that this user has paired with, or has trusted at first sight."""
+"""`known_servers.json`: keys of servers that this user has paired with or has trusted on first use."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Final
 
 import msgspec
 
-from iris_session.security.allow_list import utc_now
-from iris_session.security.curve import fingerprint, raw_key
-from iris_session.security.files import KeysError, PrivateFolder
+from iris_session.security.allow_list import format_utc_now
+from iris_session.security.curve import compute_fingerprint, decode_key
+from iris_session.security.private_folder import KeysError, PrivateFolder
 
 FILE: Final = "known_servers.json"
 MAX_SERVERS: Final = 1024
@@ -32,40 +32,40 @@ class KnownServers:
         self._folder = folder
 
     def read(self) -> list[KnownServer]:
-        """All of them, oldest first. Raises `KeysError` for a key that does not fit its fingerprint."""
+        """Return all servers, oldest first. Raises `KeysError` for a key that does not match its fingerprint."""
         servers = self._folder.read_json(FILE, list[KnownServer]) or []
         for server in servers:
-            if fingerprint(raw_key(server.key)) != server.fingerprint:
+            if compute_fingerprint(decode_key(server.key)) != server.fingerprint:
                 path = self._folder.path / FILE
-                raise KeysError(f"{path} is damaged: key and fingerprint of {server.address} do not fit")
+                raise KeysError(f"{path} is damaged: key and fingerprint of {server.address} do not match")
         return servers
 
-    def by_address(self, address: str) -> KnownServer | None:
+    def find_by_address(self, address: str) -> KnownServer | None:
         return next((one for one in self.read() if one.address == address), None)
 
-    def by_session(self, session: str) -> list[KnownServer]:
-        """Servers that had a session of that name, newest last."""
+    def find_by_session(self, session: str) -> list[KnownServer]:
+        """Return the servers that had a session of that name, newest last."""
         return [one for one in self.read() if one.session == session]
 
     def pin(self, address: str, session: str, key: str, *, replace: bool = False) -> KnownServer:
-        """Stores the key (Z85) of an address. Raises `KeysError` when another one is stored, unless `replace`."""
-        new = KnownServer(address, session, key, fingerprint(raw_key(key)), utc_now())
-        with self._folder.locked():
+        """Store the key (Z85) of an address. Raises `KeysError` when another one is stored, unless `replace`."""
+        new = KnownServer(address, session, key, compute_fingerprint(decode_key(key)), format_utc_now())
+        with self._folder.lock():
             servers = self.read()
             old = next((one for one in servers if one.address == address), None)
             if old is not None and old.key != key and not replace:
                 raise KeysError(
                     f"{address} has another key ({new.fingerprint}) than the one stored ({old.fingerprint}): "
-                    "somebody else answers there, or its keys were made anew; "
-                    f"if you know that they were: iris-session keys forget {address}"
+                    "another server answers there, or its keys were regenerated; "
+                    f"if you know that they were, run: iris-session keys forget {address}"
                 )
             servers = [one for one in servers if one.address != address]
             self._folder.write_json(FILE, [*servers, new][-MAX_SERVERS:])
         return new
 
-    def forget(self, address: str) -> KnownServer | None:
-        """Removes the key of an address; `None` when there was none."""
-        with self._folder.locked():
+    def remove(self, address: str) -> KnownServer | None:
+        """Remove the key of an address and return it, `None` when there was none."""
+        with self._folder.lock():
             servers = self.read()
             old = next((one for one in servers if one.address == address), None)
             if old is not None:

@@ -1,8 +1,8 @@
-"""Resume tokens: what lets a client that lost its connection come back as the same participant.
+"""Resume tokens: a client that reconnects with one comes back as the same participant.
 
-A token is 16 random bytes, bound to the key it was given to, valid once. It is used up by the first message of the
-client that proves that its new `Welcome` (with the next token) arrived; a `Welcome` lost on the way costs nothing.
-Only hashes are kept, so the memory handed back to the authority's process opens no door.
+A token is 16 random bytes, bound to the key it was issued to, valid once. It is used up by the first message of the
+client that proves that its new `Welcome` (with the next token) arrived; a lost `Welcome` costs nothing. Only hashes
+are stored, so the table handed back to the authority's process grants no access.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ import os
 import msgspec
 
 
-class _Record(msgspec.Struct, array_like=True):
+class _TokenRecord(msgspec.Struct, array_like=True):
     digest: bytes
     key_id: str
     participant_id: str
-    behind: str = ""  # key of the gateway that speaks for the participant
+    behind: str = ""  # key of the gateway that connects the participant
 
 
 class _Handback(msgspec.Struct, array_like=True):
     next_connection: int
-    records: list[_Record]
+    records: list[_TokenRecord]
     revoked: list[str] = []
 
 
 _decoder = msgspec.msgpack.Decoder(_Handback)
 
 
-def _digest(token: bytes) -> bytes:
+def _hash_token(token: bytes) -> bytes:
     return hashlib.blake2b(token, digest_size=16, person=b"iris-resume").digest()
 
 
-def handback_above(last_connection: int, blob: bytes = b"") -> bytes:
-    """`blob` (empty: no tokens) for a front whose connection numbers begin above `last_connection`.
+def encode_handback(last_connection: int, blob: bytes = b"") -> bytes:
+    """Return `blob` (empty: no tokens) for a front whose connection numbers begin above `last_connection`.
 
-    Raises `msgspec.DecodeError` for bytes that are no such memory.
+    Raises `msgspec.DecodeError` for bytes that are not an encoded table.
     """
     handback = _decoder.decode(blob) if blob else _Handback(1, [])
     handback.next_connection = max(handback.next_connection, last_connection + 1)
@@ -46,7 +46,7 @@ def handback_above(last_connection: int, blob: bytes = b"") -> bytes:
 class ResumeTokens:
     """Bounded table of tokens and the counter of connection numbers.
 
-    `blob()` is handed to the next front, whenever something has `changed` since the last one.
+    `encode()` is handed to the next front, whenever the table has `changed` since the last call.
     """
 
     def __init__(self, capacity: int, blob: bytes = b"") -> None:
@@ -57,50 +57,48 @@ class ResumeTokens:
         self._revoked = dict.fromkeys(handback.revoked)
         self.changed = False
 
-    def new_connection(self) -> int:
-        """A connection number that no front of this session has used, from 1."""
+    def allocate_connection(self) -> int:
+        """Return a connection number that no front of this session has used, from 1."""
         number = self._next_connection
         self._next_connection += 1
         self.changed = True
         return number
 
-    def issue(self, key_id: str, participant_id: str, came_with: bytes = b"", behind: str = "") -> bytes:
-        """A fresh token for `participant_id`, which has at most two: the one it `came_with`, and this. `behind`: key of
-        the gateway that speaks for it.
+    def issue(self, key_id: str, participant_id: str, previous: bytes = b"", behind: str = "") -> bytes:
+        """Return a new token for `participant_id`, which keeps at most one other: the `previous` one that it came with.
 
-        The oldest token is forgotten when the table is full: that of who lost the connection longest ago, since those
-        who are gone for good have none (`left`).
+        `behind`: key of the gateway that connects it. A full table drops its oldest token: that of the participant
+        that has been disconnected for longest, since those who left have none (`remove_participant`).
         """
         token = os.urandom(16)
-        digest = _digest(token)
-        keep = _digest(came_with)
+        digest = _hash_token(token)
+        keep = _hash_token(previous)
         for record in [one for one in self._records.values() if one.participant_id == participant_id]:
             if record.digest != keep:
                 del self._records[record.digest]
         while len(self._records) >= self._capacity:
             del self._records[next(iter(self._records))]
         self.changed = True
-        self._records[digest] = _Record(digest, key_id, participant_id, behind)
+        self._records[digest] = _TokenRecord(digest, key_id, participant_id, behind)
         return token
 
-    def find(self, token: bytes, key_id: str) -> str | None:
-        """The participant that `token` stands for, when it is bound to `key_id`. Does not use the token up."""
-        record = self._records.get(_digest(token))
+    def find_participant(self, token: bytes, key_id: str) -> str | None:
+        """Return the participant of `token` if it is bound to `key_id`. Does not use the token up."""
+        record = self._records.get(_hash_token(token))
         return record.participant_id if record is not None and record.key_id == key_id else None
 
-    def retire(self, token: bytes) -> None:
-        """Uses the token up."""
-        self.changed = self._records.pop(_digest(token), None) is not None or self.changed
+    def use_up(self, token: bytes) -> None:
+        """Use up a token."""
+        self.changed = self._records.pop(_hash_token(token), None) is not None or self.changed
 
-    def left(self, participant_id: str) -> None:
-        """Uses up every token of a participant."""
+    def remove_participant(self, participant_id: str) -> None:
+        """Use up every token of a participant."""
         for record in [one for one in self._records.values() if one.participant_id == participant_id]:
             del self._records[record.digest]
             self.changed = True
 
-    def revoke(self, key_id: str) -> list[str]:
-        """Uses up every token of a key, and of those behind it if it is a gateway's. The participants that they stand
-        for, each once."""
+    def revoke_key(self, key_id: str) -> list[str]:
+        """Use up every token of a key, of a gateway those of its clients too. Returns the participants, each once."""
         theirs = [record for record in self._records.values() if key_id in (record.key_id, record.behind)]
         for record in theirs:
             del self._records[record.digest]
@@ -111,16 +109,17 @@ class ResumeTokens:
         self.changed = True
         return list(dict.fromkeys(record.participant_id for record in theirs))
 
-    def forgive(self, key_id: str) -> None:
-        """The key was let in anew."""
+    def reinstate_key(self, key_id: str) -> None:
+        """Forget that a key was revoked: it was allowed again."""
         self.changed = self.changed or key_id in self._revoked
         self._revoked.pop(key_id, None)
 
-    def revoked(self, key_id: str) -> bool:
-        """Whether this key was revoked in this session, and not let in anew since."""
+    def is_revoked(self, key_id: str) -> bool:
+        """Return True if this key was revoked in this session and not allowed again since."""
         return key_id in self._revoked
 
-    def blob(self) -> bytes:
+    def encode(self) -> bytes:
+        """Return the table as bytes and reset `changed`."""
         self.changed = False
         return msgspec.msgpack.encode(
             _Handback(self._next_connection, list(self._records.values()), list(self._revoked))

@@ -1,7 +1,7 @@
-"""Who may open an encrypted connection: ZeroMQ's authentication protocol (RFC 27), answered in the front's own loop.
+"""ZeroMQ's authentication protocol (ZAP, RFC 27), answered in the front's own loop.
 
-The User-Id that a socket then reports for every message is the fingerprint of the client's key. A key that is not on
-the list gets through on the control socket only, with a User-Id that says so (`keyring.STRANGER`): it may pair.
+The User-Id that a socket then reports for every message is the fingerprint of the client's key. A key that is not
+listed is admitted to the control socket only, with a User-Id that says so (`keyring.PAIRING_PREFIX`): it may pair.
 """
 
 from __future__ import annotations
@@ -12,28 +12,36 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from iris_session.link.sockets import ZAP_CONTROL, ZAP_STATE, readable
 from iris_session.protocol.limits import Drops
-from iris_session.security import fingerprint
-from iris_session.security.keyring import STRANGER, Keyring
+from iris_session.security import compute_fingerprint
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring
 
 ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
+#: ZAP domains: keys that are not on the list may pair, on the control socket only; the state socket is opened again
+#: when a key is revoked that came in there.
+ZAP_CONTROL: Final = b"iris-control"
+ZAP_STATE: Final = b"iris-state"
+ZAP_MEDIA: Final = b"iris-media"
+ZAP_ASSETS: Final = b"iris-assets"
+#: As plain integers: operations on the enumerations take longer than asking the socket.
+_EVENTS: Final = int(zmq.EVENTS)
+_POLLIN: Final = int(zmq.POLLIN)
 _REQUEST_FRAMES: Final = 7  # version, request id, domain, address, routing id, mechanism, client key
 
 
-def asks_with_curve(request: list[bytes]) -> bool:
-    """Whether a ZAP request has all its frames, and the client's key as the last."""
+def is_curve_request(request: list[bytes]) -> bool:
+    """Return True for a complete ZAP request of the CURVE mechanism, whose last frame is the client's key."""
     return len(request) == _REQUEST_FRAMES and request[5] == b"CURVE"
 
 
-def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], str]) -> None:
-    """Answers every ZAP request that waits. `user_id_of(request)`: empty for who is not to be let in."""
-    while readable(socket):
+def answer_zap_requests(socket: zmq.Socket[bytes], authenticate: Callable[[list[bytes]], str]) -> None:
+    """Answer every pending ZAP request. `authenticate(request)` returns the User-Id, empty to refuse."""
+    while _has_message(socket):
         frames = socket.recv_multipart()
         split = frames.index(b"") + 1
         route, request = frames[:split], frames[split:]
         request_id = request[1] if len(request) > 1 else b""
-        user_id = user_id_of(request)
+        user_id = authenticate(request)
         if user_id:
             reply = [b"1.0", request_id, b"200", b"OK", user_id.encode(), b""]
         else:
@@ -41,10 +49,14 @@ def answer_zap(socket: zmq.Socket[bytes], user_id_of: Callable[[list[bytes]], st
         socket.send_multipart(route + reply)
 
 
+def _has_message(socket: zmq.Socket[bytes]) -> bool:
+    return bool(socket.get(_EVENTS) & _POLLIN)  # type: ignore[operator]
+
+
 class Authenticator:
     """Answers ZAP requests for one context. Poll `socket` and call `answer` when it is readable.
 
-    `refused`: told the fingerprint and the address of every key that was not let in.
+    `on_refused`: called with the fingerprint and the address of every key that was refused.
     """
 
     def __init__(
@@ -59,28 +71,28 @@ class Authenticator:
         self.socket.bind(ZAP_ENDPOINT)
         self._keyring = keyring
         self._drops = drops
-        self.refused = refused
-        #: Whether a key was revoked in this session, also where the list could not be changed.
-        self.banned: Callable[[str], bool] = lambda _mark: False
+        self.on_refused = refused
+        #: Returns True for a key that was revoked in this session, also where the list could not be changed.
+        self.is_revoked: Callable[[str], bool] = lambda _mark: False
 
-    def answer(self) -> None:
-        """Answers everything that waits."""
-        if readable(self.socket):
-            self._keyring.look()
-            answer_zap(self.socket, self._user_id)
+    def answer_requests(self) -> None:
+        """Answer every pending request."""
+        if _has_message(self.socket):
+            self._keyring.reload_if_changed()
+            answer_zap_requests(self.socket, self._authenticate)
 
-    def _user_id(self, request: list[bytes]) -> str:
-        """Empty: not to be let in."""
-        if not asks_with_curve(request):
+    def _authenticate(self, request: list[bytes]) -> str:
+        """Return the User-Id, empty to refuse."""
+        if not is_curve_request(request):
             self._drops.count("unknown_key")
             return ""
-        mark = fingerprint(request[6])
-        if self._keyring.find(mark) is not None and (request[2] == ZAP_CONTROL or not self.banned(mark)):
+        mark = compute_fingerprint(request[6])
+        if self._keyring.find_key(mark) is not None and (request[2] == ZAP_CONTROL or not self.is_revoked(mark)):
             if request[2] == ZAP_STATE:
-                self._keyring.watching.add(mark)
-            return mark  # a revoked one is told why it may not join, and gets no state
+                self._keyring.state_subscribers.add(mark)
+            return mark  # a revoked key is refused at hello, with a reason, and gets no state
         self._drops.count("unknown_key")
         if self._keyring.home is not None and request[2] == ZAP_CONTROL:
-            return STRANGER + z85.encode(request[6]).decode()
-        self.refused(mark, request[3].decode(errors="replace"))
+            return PAIRING_PREFIX + z85.encode(request[6]).decode()
+        self.on_refused(mark, request[3].decode(errors="replace"))
         return ""

@@ -50,7 +50,7 @@ from iris_session.recording.journal import CRASHED, check_keyframe
 from iris_session.recording.lock import PATIENCE_S
 from iris_session.recording.paths import resume_path, split_part, split_resume
 from iris_session.recording.verify import Models
-from iris_session.security.resume_tokens import handback_above
+from iris_session.security.resume_tokens import encode_handback
 from iris_session.session.config import SessionConfig
 from iris_session.session.config_checks import check_arguments, check_objects, check_robots
 from iris_session.session.core import CoreConfig, CoreState, SessionCore
@@ -209,9 +209,9 @@ class Continuation:
             self.notes.append(f"{why}: who was in the session joins anew, and gets robots when their leases expire")
         last = self.core.authority.last_connection
         try:
-            self.handback = handback_above(last, b"" if self.note is None else self.note.handback)
+            self.handback = encode_handback(last, b"" if self.note is None else self.note.handback)
         except msgspec.DecodeError:
-            self.handback = handback_above(last)
+            self.handback = encode_handback(last)
         now_ns = time.monotonic_ns()
         same_boot = bool(header.boot_id) and header.boot_id == read_boot_id()
         origin_ns = header.origin_ns if same_boot else now_ns

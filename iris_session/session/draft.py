@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iris_session.protocol.common import Pose
 from iris_session.scene import SceneBuildError
-from iris_session.scene.articulation import Joint
-from iris_session.scene.composed import ComposedScene
+from iris_session.scene.composed import ComposedScene, Joint
 from iris_session.session.errors import PublishError, brief
 
 #: Farthest coordinate [m]. What is beyond is a mistake of units, and exact to less than the stream's bound.

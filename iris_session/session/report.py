@@ -79,14 +79,14 @@ class Reporter:
             load=os.getloadavg()[0],
             cpus=os.cpu_count() or 1,
             memory_bytes=memory_bytes(),
-            participants=stepper.ledger.participant_reports(now_ns, core.authority.alignment_reports()),
+            participants=stepper.ledger.participant_reports(now_ns, core.authority.build_alignment_reports()),
             robots=robots(stepper),
             recorder=recorder,
             drops=processes.own_drops(),
             restarts=processes.restarts(),
             warnings=tuple(warnings(stepper, recorder, self.scheduling, self._noticed())),
             anchors=anchors(core.authority.anchors, processes.sheet_sizes),
-            cross_checks=core.authority.cross_check_reports(),
+            cross_checks=core.authority.build_cross_check_reports(),
         )
 
     def _noticed(self) -> list[str]:

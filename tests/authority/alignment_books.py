@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from anchors.pose import apply, compose, distance, inverse, quat_angle
 from iris_session.authority import AuthorityConfig
-from iris_session.authority.state import Participant, State
+from iris_session.authority.state import AuthorityState, Participant
 from iris_session.protocol.client_messages import Sample
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.entries import Entry
@@ -43,14 +43,14 @@ class AlignmentBooks:
     _told_ns: dict[str, int] = field(default_factory=dict)
     _frozen: dict[int, Pose] = field(default_factory=dict)
 
-    def begin(self, state: State) -> None:
+    def begin(self, state: AuthorityState) -> None:
         """Before a step."""
         self._before = {
             p.id: Before(p.connection, p.tracking_epoch, p.alignment, p.offset, engagements(state, p))
             for p in state.participants.values()
         }
 
-    def check(self, state: State, decision: Decision, entries: Sequence[Entry], now_ns: int) -> None:
+    def check(self, state: AuthorityState, decision: Decision, entries: Sequence[Entry], now_ns: int) -> None:
         """After it."""
         for event in decision.events:
             if isinstance(event.body, Notice) and "is off by" in event.body.text:
@@ -70,7 +70,7 @@ class AlignmentBooks:
             assert c.a in state.participants
             assert c.b in state.participants
 
-    def _check_change(self, state: State, p: Participant, before: Before, now_ns: int) -> None:
+    def _check_change(self, state: AuthorityState, p: Participant, before: Before, now_ns: int) -> None:
         old, new = before.alignment, p.alignment
         if old is None or old == new:
             return
@@ -96,7 +96,7 @@ class AlignmentBooks:
         assert now_ns - self._told_ns.pop(p.id, now_ns) >= self.config.announce_ns, "it came without a word"
         self.came["announced"] += 1
 
-    def _check_commands(self, state: State, decision: Decision, entries: Sequence[Entry]) -> None:
+    def _check_commands(self, state: AuthorityState, decision: Decision, entries: Sequence[Entry]) -> None:
         sent = {
             (e.connection, e.message.device, e.message.seq): e.message for e in entries if isinstance(e.message, Sample)
         }
@@ -110,7 +110,7 @@ class AlignmentBooks:
                 assert pair(source.pose_world) == compose(pair(T), pair(sample.pose)), "a correction moved a robot"
 
 
-def engagements(state: State, p: Participant) -> frozenset[int]:
+def engagements(state: AuthorityState, p: Participant) -> frozenset[int]:
     """Numbers of everything that `p` moves now."""
     leases = (*state.robots.values(), *state.objects.values())
     return frozenset(g.engagement for lease in leases for g in lease.grants if g.participant == p.id and g.engagement)

@@ -15,7 +15,7 @@ import msgspec
 
 from anchors.pose import quat_from_yaw
 from iris_session.authority import Authority, AuthorityConfig
-from iris_session.authority.state import KEPT, Pending, State
+from iris_session.authority.state import NO_REPLY, AuthorityState, Pending
 from iris_session.protocol import client_messages as cm
 from iris_session.protocol.common import Pose, Target
 from iris_session.protocol.entries import (
@@ -123,7 +123,7 @@ class Play:
         return Authority(self.config, ROBOTS, OBJECTS)
 
     @property
-    def state(self) -> State:
+    def state(self) -> AuthorityState:
         """For the books only: who holds what, and the counters that honest clients learn from events."""
         return self.authority._ctx.state
 
@@ -538,7 +538,7 @@ class Play:
         waiting = {
             (people[w.participant].connection, w.request_id)
             for w in (*state.queue, *state.consents)
-            if w.request_id != KEPT
+            if w.request_id != NO_REPLY
         }
         here = {p.connection for p in people.values()}
         assert {asked for asked in self.open if asked[0] in here} == waiting

@@ -10,7 +10,7 @@ import pytest
 
 from anchors.pose import quat_from_rotvec, quat_from_yaw, quat_rotate
 from iris_session.authority import AuthorityConfig
-from iris_session.authority.stated_error import position_p95
+from iris_session.authority.alignment import compute_position_p95
 from iris_session.protocol.client_messages import Heartbeat, Observation, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import IDENTITY, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Notice, ParticipantChanged, SamplesRejected
@@ -39,15 +39,15 @@ def test_stated_error_is_the_95_percent_quantile_at_the_robot() -> None:
             moved = [rng.gauss(0.0, 0.004) + a - b for a, b in zip(turned, r, strict=True)]
             lengths.append(math.hypot(*moved))
         measured = sorted(lengths)[19_000]
-        assert position_p95(C, pivot, point) == pytest.approx(measured, rel=0.05)
+        assert compute_position_p95(C, pivot, point) == pytest.approx(measured, rel=0.05)
 
 
 def test_stated_error_of_degenerate_covariances() -> None:
     zero = (0.0,) * 36
-    assert position_p95(zero, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)) == 0.0
-    assert position_p95((1e300,) * 36, (0.0, 0.0, 0.0), (1e9, 0.0, 0.0)) == math.inf
+    assert compute_position_p95(zero, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)) == 0.0
+    assert compute_position_p95((1e300,) * 36, (0.0, 0.0, 0.0), (1e9, 0.0, 0.0)) == math.inf
     line = tuple(1e-6 if i == 0 else 0.0 for i in range(36))
-    assert position_p95(line, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) == pytest.approx(1.96e-3, rel=0.03)
+    assert compute_position_p95(line, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) == pytest.approx(1.96e-3, rel=0.03)
 
 
 def test_a_good_measurement_is_accepted_with_its_error() -> None:

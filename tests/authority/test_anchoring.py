@@ -34,7 +34,7 @@ def shifted(x: float, **fields: Any) -> Any:
 
 
 def report(t: Table, person: Person) -> AlignmentReport:
-    return t.authority.alignment_reports()[person.id]
+    return t.authority.build_alignment_reports()[person.id]
 
 
 def compared(other: int, **fields: Any) -> CrossChecked:
@@ -340,13 +340,13 @@ def test_two_headsets_are_compared_and_the_newest_is_kept_per_pair() -> None:
     )
     t.step(bert.says(compared(anna.connection, error_m=0.02)), dt_ns=SECOND)
     t.step(dt_ns=100 * MS)
-    newest, older = t.authority.cross_check_reports()
+    newest, older = t.authority.build_cross_check_reports()
     assert ({newest.a, newest.b}, newest.error_m, newest.age_ns) == ({anna.id, bert.id}, 0.02, 100 * MS)
     assert ({older.a, older.b}, older.error_m) == ({bert.id, carl.id}, 0.1)
     t.step(anna.says(Lost()))
-    assert len(t.authority.cross_check_reports()) == 2
+    assert len(t.authority.build_cross_check_reports()) == 2
     carl.does(Bye())
-    assert [{c.a, c.b} for c in t.authority.cross_check_reports()] == [{anna.id, bert.id}]
+    assert [{c.a, c.b} for c in t.authority.build_cross_check_reports()] == [{anna.id, bert.id}]
 
 
 @pytest.mark.parametrize(
@@ -357,7 +357,7 @@ def test_comparisons_that_are_no_numbers_are_ignored(fields: dict[str, Any]) -> 
     t = Table(CONFIG)
     anna, bert = t.operator(), t.operator()
     t.step(anna.says(compared(bert.connection, **fields)))
-    assert (t.decision.events, t.authority.cross_check_reports()) == ((), ())
+    assert (t.decision.events, t.authority.build_cross_check_reports()) == ((), ())
 
 
 def test_comparisons_with_who_is_gone_are_ignored() -> None:
@@ -368,7 +368,7 @@ def test_comparisons_with_who_is_gone_are_ignored() -> None:
         t.step(anna.says(compared(other)))
         assert t.decision.events == ()
     t.step(Entry(99, 99, t.now_ns, compared(anna.connection)), t.host(compared(anna.connection)))
-    assert (t.decision.events, t.authority.cross_check_reports()) == ((), ())
+    assert (t.decision.events, t.authority.build_cross_check_reports()) == ((), ())
 
 
 def test_of_many_pairs_the_newest_are_reported() -> None:
@@ -377,7 +377,7 @@ def test_of_many_pairs_the_newest_are_reported() -> None:
     for i, a in enumerate(people):
         for b in people[:i]:
             t.step(a.says(compared(b.connection)), *(p.says(Heartbeat()) for p in people))
-    reports = t.authority.cross_check_reports()
+    reports = t.authority.build_cross_check_reports()
     assert len(reports) == 64
     assert reports[0].age_ns == 0
 
@@ -386,7 +386,7 @@ def test_the_report_has_those_who_need_an_alignment() -> None:
     t = Table(CONFIG)
     anna = t.operator()
     t.join("agent", alignment="not_needed")
-    assert t.authority.alignment_reports().keys() == {anna.id}
+    assert t.authority.build_alignment_reports().keys() == {anna.id}
     r = report(t, anna)
     a = t.last(AlignmentChanged).alignment
     assert (r.version, r.running, r.error_at_anchor_m, r.error_at_robot_m) == (1, True, 0.002, a.error_at_robot_m)

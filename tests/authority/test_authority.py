@@ -25,7 +25,7 @@ from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.server_messages import MarkerAdded, SamplesRejected, Snapshot
 from iris_session.protocol.session_mirror import SessionMirror
 from iris_session.protocol.specs import ObjectSpec
-from iris_session.protocol.steps import Outgoing
+from iris_session.protocol.steps import OutgoingMessage
 
 from .table import Table, make_view, proposal, robot
 
@@ -148,7 +148,7 @@ def test_join_order_of_effects_is_that_of_the_entries() -> None:
     t.step(anna.says(Marker(1, "a")), anna.says(Marker(2, "b")))
     assert [e.event_seq for e in t.decision.events] == [2, 3]
     assert t.decision.event_seq == 3
-    assert isinstance(t.decision.outgoing[0], Outgoing)
+    assert isinstance(t.decision.outgoing[0], OutgoingMessage)
 
 
 @pytest.mark.parametrize(

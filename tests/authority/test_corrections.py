@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from anchors.pose import quat_angle, quat_from_yaw
-from iris_session.authority.stated_error import position_p95, widened
+from iris_session.authority.alignment import compute_position_p95, widen_covariance
 from iris_session.protocol.client_messages import Grasp, Heartbeat, PlaceAlignment, TrackingEpoch
 from iris_session.protocol.common import Alignment, Pose
 from iris_session.protocol.server_messages import AlignmentChanged, Notice
@@ -49,7 +49,7 @@ def notices(t: Table) -> list[str]:
 
 
 def report(t: Table, person: Person) -> AlignmentReport:
-    return t.authority.alignment_reports()[person.id]
+    return t.authority.build_alignment_reports()[person.id]
 
 
 def test_before_use_every_better_measurement_is_in_force_at_once() -> None:
@@ -98,7 +98,7 @@ def test_what_is_still_away_widens_the_stated_error_at_any_lever_arm() -> None:
     away = (0.003, -0.002, 0.0, 0.0, 0.0, 0.02)
     for point in ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (-1.0, 3.0, 0.5)):
         moved = math.hypot(away[0] - away[5] * point[1], away[1] + away[5] * point[0])
-        assert position_p95(widened(SMALL, away), (0.0, 0.0, 0.0), point) > moved
+        assert compute_position_p95(widen_covariance(SMALL, away), (0.0, 0.0, 0.0), point) > moved
 
 
 def test_a_large_correction_is_announced_and_comes_in_one_go() -> None:

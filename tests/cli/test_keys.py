@@ -20,8 +20,8 @@ from iris_session.cli.main import main
 from iris_session.client.address import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
 from iris_session.protocol import pairing
-from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, SessionNote
-from iris_session.security.files import PrivateFolder
+from iris_session.security import KeyHome, KeyPair, KeysBusyError, KeysError, RegisteredSession
+from iris_session.security.private_folder import PrivateFolder
 
 Capture = pytest.CaptureFixture[str]
 
@@ -35,8 +35,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> KeyHome:
 @pytest.fixture
 def lab(home: KeyHome) -> KeyHome:
     """A home with one session that runs."""
-    mark = home.server_key().fingerprint
-    home.sessions.add(SessionNote("id", "lab-1", os.getpid(), ("10.0.0.5", "fd00::5"), 7731, mark))
+    mark = home.load_server_key().fingerprint
+    home.sessions.add(RegisteredSession("id", "lab-1", os.getpid(), ("10.0.0.5", "fd00::5"), 7731, mark))
     return home
 
 
@@ -44,7 +44,7 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
     assert main(["keys", "list"]) == 0
     assert "nobody may join yet" in capsys.readouterr().out
     certificate, _ = create_certificates(tmp_path, "ann")
-    bob = KeyPair.new()
+    bob = KeyPair.generate()
     assert main(["keys", "allow", "ann", str(certificate), "--role", "director", "--role", "operator"]) == 0
     assert main(["keys", "allow", "bob", bob.public]) == 0
     capsys.readouterr()
@@ -65,14 +65,16 @@ def test_allow_list_revoke(home: KeyHome, tmp_path: Path, capsys: Capture) -> No
 
 def test_who_serves_lets_in_themselves(home: KeyHome, capsys: Capture) -> None:
     assert main(["keys", "allow", "me", "--role", "any"]) == 0
-    own = home.identity()
+    own = home.load_identity()
     assert [(one.name, one.roles) for one in home.clients.read().values()] == [("me", ())]
     assert own.fingerprint in capsys.readouterr().out
 
 
 def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> None:
     """A session that listens on one network is not at 127.0.0.1, where a command looks by itself."""
-    home.sessions.add(SessionNote("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.server_key().fingerprint))
+    home.sessions.add(
+        RegisteredSession("s1", "lab-1", os.getpid(), ("192.0.2.7",), 7721, home.load_server_key().fingerprint)
+    )
     assert find_default_address() == "192.0.2.7:7721"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -81,7 +83,9 @@ def test_who_types_no_address_is_told_where_their_session_is(home: KeyHome) -> N
         check_session_reachable(argparse.Namespace(session="", address=nobody))
     assert "your session" not in str(told.value)
     assert describe_own_sessions() == "; your session 'lab-1' is at 192.0.2.7:7721"
-    home.sessions.add(SessionNote("s2", "lab-2", os.getpid(), ("192.0.2.8",), 7731, home.server_key().fingerprint))
+    home.sessions.add(
+        RegisteredSession("s2", "lab-2", os.getpid(), ("192.0.2.8",), 7731, home.load_server_key().fingerprint)
+    )
     assert find_default_address() == LOCAL
     home.sessions.remove("s1", os.getpid())
     home.sessions.remove("s2", os.getpid())
@@ -104,25 +108,25 @@ def test_what_cannot_be_done_is_one_line(home: KeyHome, arguments: list[str], te
     err = capsys.readouterr().err
     assert text in err
     assert err.count("\n") == 1
-    assert home.codes.read() == []
+    assert home.join_codes.read() == []
 
 
 def test_show_names_both_keys_and_never_a_secret(home: KeyHome, capsys: Capture) -> None:
     assert main(["keys", "show", "--json"]) == 0
     text = capsys.readouterr().out
     shown = json.loads(text)
-    assert shown["server"]["fingerprint"] == home.server_key().fingerprint
-    assert shown["identity"]["key"] == home.identity().public
+    assert shown["server"]["fingerprint"] == home.load_server_key().fingerprint
+    assert shown["identity"]["key"] == home.load_identity().public
     assert main(["keys", "show"]) == 0
     text += capsys.readouterr().out
-    assert home.server_key().secret not in text
-    assert home.identity().secret not in text
+    assert home.load_server_key().secret not in text
+    assert home.load_identity().secret not in text
 
 
 def test_forget_lets_an_address_be_trusted_anew(home: KeyHome) -> None:
-    home.servers.pin("10.0.0.9:7721", "lab", KeyPair.new().public)
+    home.known_servers.pin("10.0.0.9:7721", "lab", KeyPair.generate().public)
     assert main(["keys", "forget", "10.0.0.9:7721"]) == 0
-    assert home.servers.read() == []
+    assert home.known_servers.read() == []
 
 
 def test_pair_shows_a_uri_that_holds_everything(lab: KeyHome, tmp_path: Path, capsys: Capture) -> None:
@@ -131,14 +135,14 @@ def test_pair_shows_a_uri_that_holds_everything(lab: KeyHome, tmp_path: Path, ca
     told = json.loads(capsys.readouterr().out)
     address = Address.parse(told["uri"])
     assert (address.host, address.port, address.session) == ("10.0.0.5", 7731, "lab-1")
-    assert address.server_key == lab.server_key().public
+    assert address.server_key == lab.load_server_key().public
     assert pairing.normal_code(told["code"]) == address.join_code
     assert told["addresses"] == ["10.0.0.5:7731", "[fd00::5]:7731"]
     assert 60 < told["expires"] - time.time() <= 120
     picture = cv2.imread(str(png))  # of some random codes one of OpenCV's two finders sees no corners
     readers = (cv2.QRCodeDetector(), cv2.QRCodeDetectorAruco())
     assert told["uri"] in [reader.detectAndDecode(picture)[0] for reader in readers], "a camera reads it"
-    (made,) = lab.codes.read()
+    (made,) = lab.join_codes.read()
     assert (made.name, made.roles) == ("tablet", ("operator", "observer", "agent", "leader"))
 
 
@@ -147,12 +151,12 @@ def test_pair_for_people_shows_qr_code_and_fingerprint(lab: KeyHome, capsys: Cap
     out = capsys.readouterr().out
     assert "\u2588" in out
     assert "192.0.2.7:7721" in out
-    assert lab.server_key().fingerprint in out
+    assert lab.load_server_key().fingerprint in out
 
 
 def test_of_several_sessions_one_is_chosen(lab: KeyHome, capsys: Capture) -> None:
-    mark = lab.server_key().fingerprint
-    lab.sessions.add(SessionNote("id2", "lab-2", os.getpid(), ("10.0.0.5",), 7741, mark))
+    mark = lab.load_server_key().fingerprint
+    lab.sessions.add(RegisteredSession("id2", "lab-2", os.getpid(), ("10.0.0.5",), 7741, mark))
     assert main(["pair", "--no-wait"]) == 2
     assert "2 sessions run here (lab-1, lab-2): choose with --session NAME" in capsys.readouterr().err
     assert main(["pair", "--no-wait", "--session", "lab-3"]) == 2
@@ -172,7 +176,7 @@ def test_a_code_that_nobody_uses_fails_and_an_interrupted_one_is_void(
 
     monkeypatch.setattr("iris_session.cli.pair.time.sleep", interrupt)
     assert main(["pair"]) == 130
-    assert lab.codes.of(lab.server_key().fingerprint) == ()
+    assert lab.join_codes.list_open(lab.load_server_key().fingerprint) == ()
 
 
 def test_pair_waits_on_while_another_process_holds_the_list(
@@ -180,7 +184,7 @@ def test_pair_waits_on_while_another_process_holds_the_list(
 ) -> None:
     """A code is good for minutes, whatever a slow disk does meanwhile."""
     busy = iter([True, True])
-    locked = PrivateFolder.locked
+    locked = PrivateFolder.lock
     asked: list[float] = []
 
     def slow(folder: PrivateFolder, patience_s: float = 5.0) -> AbstractContextManager[None]:
@@ -189,7 +193,7 @@ def test_pair_waits_on_while_another_process_holds_the_list(
         asked.append(patience_s)
         return locked(folder, patience_s)
 
-    monkeypatch.setattr(PrivateFolder, "locked", slow)
+    monkeypatch.setattr(PrivateFolder, "lock", slow)
     assert main(["pair", "--minutes", "0.02"]) == 1
     assert next(busy, None) is None
     said = capsys.readouterr()
@@ -201,21 +205,21 @@ def test_pair_waits_on_while_another_process_holds_the_list(
 def test_pair_waits_and_says_who_came(
     lab: KeyHome, capsys: Capture, monkeypatch: pytest.MonkeyPatch, full: bool
 ) -> None:
-    ann = KeyPair.new()
+    ann = KeyPair.generate()
 
     def full_disk(_entries: object) -> None:
         raise KeysError("No space left on device")
 
     def use() -> None:
         if full:
-            monkeypatch.setattr(lab.clients, "replace", full_disk)
-        server = lab.server_key()
-        while not lab.codes.of(server.fingerprint):
+            monkeypatch.setattr(lab.clients, "replace_all", full_disk)
+        server = lab.load_server_key()
+        while not lab.join_codes.list_open(server.fingerprint):
             time.sleep(0.01)
-        (made,) = [one for one in lab.codes.read() if one.secret]
+        (made,) = [one for one in lab.join_codes.read() if one.secret]
         proof = pairing.client_proof(made.secret, server.raw_public, ann.raw_public)
         with nullcontext() if not full else pytest.raises(KeysError):
-            lab.codes.attempt(server.raw_public, ann.public, proof, "ann", lab.clients)
+            lab.join_codes.redeem(server.raw_public, ann.public, proof, "ann", lab.clients)
 
     user = threading.Thread(target=use)
     user.start()

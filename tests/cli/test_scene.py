@@ -10,7 +10,7 @@ import trimesh
 
 from iris_session.cli.main import main
 from tests.scene.arm import write_arm
-from tests.scene.test_gltf import furniture
+from tests.scene.importers.test_gltf import furniture
 
 
 def run(*arguments: object) -> int:

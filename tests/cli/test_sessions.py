@@ -12,12 +12,12 @@ from iris_session.cli.common import CommandError
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 from iris_session.client import FoundSession
-from iris_session.security import KeyHome, KeyPair, fingerprint, raw_key
+from iris_session.security import KeyHome, KeyPair, compute_fingerprint, decode_key
 
-KEY = KeyPair.new().public
+KEY = KeyPair.generate().public
 PLAIN = FoundSession("handover", "127.0.0.1:7721", "s1", "live", "", ("127.0.0.1:7721",))
 NEW = FoundSession("lab-1", "10.0.0.5:7721", "s2", "live", "mark", ("10.0.0.5:7721", "10.1.0.5:7721"))
-KNOWN = FoundSession("lab-2", "10.0.0.6:7721", "s3", "replay", fingerprint(raw_key(KEY)), ("10.0.0.6:7721",))
+KNOWN = FoundSession("lab-2", "10.0.0.6:7721", "s3", "replay", compute_fingerprint(decode_key(KEY)), ("10.0.0.6:7721",))
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[FoundSession]
 def test_what_is_heard_is_listed_with_what_is_known_of_it(
     heard: list[FoundSession], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    KeyHome().servers.pin("10.0.0.6:7721", "lab-2", KEY)
+    KeyHome().known_servers.pin("10.0.0.6:7721", "lab-2", KEY)
     heard += [PLAIN, NEW, KNOWN]
     assert main(["sessions"]) == 0
     plain, new, known = capsys.readouterr().out.splitlines()

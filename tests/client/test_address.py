@@ -21,7 +21,7 @@ def test_a_uri_says_everything_and_reads_back(host: str) -> None:
 
 def test_every_key_survives_a_uri() -> None:
     for _ in range(50):
-        key = KeyPair.new().public
+        key = KeyPair.generate().public
         assert Address.parse(pairing_uri("h", 1, key)).server_key == key
 
 

@@ -42,7 +42,7 @@ def test_the_key_that_is_used(
     home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool, used: str | None
 ) -> None:
     if stored:
-        home.servers.pin(str(LAB), "lab-1", stored)
+        home.known_servers.pin(str(LAB), "lab-1", stored)
     address = Address(LAB.host, LAB.port, given)
     assert Trust(home, address).key(offered, loopback=loopback) == used
 
@@ -64,18 +64,18 @@ def test_another_key_is_an_error_and_never_stored(
     home: KeyHome, given: str, stored: str, offered: str | None, loopback: bool
 ) -> None:
     if stored:
-        home.servers.pin(str(LAB), "lab-1", stored)
+        home.known_servers.pin(str(LAB), "lab-1", stored)
     trust = Trust(home, Address(LAB.host, LAB.port, given))
     with pytest.raises(TrustError, match=r"10\.0\.0\.5:7721"):
         trust.key(offered, loopback=loopback)
     if stored:
         with pytest.raises(TrustError, match="iris-session keys forget"):
             trust.store("lab-1", A if stored == B else B)
-    assert [one.key for one in home.servers.read()] == ([stored] if stored else [])
+    assert [one.key for one in home.known_servers.read()] == ([stored] if stored else [])
 
 
 def test_a_name_that_is_known_with_another_key_is_not_taken_at_first_sight(home: KeyHome) -> None:
-    home.servers.pin("10.0.0.7:7721", "lab-1", A)
+    home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
     Trust(home, LAB, "lab-1").check_name(A)  # the machine has another address today
     Trust(home, LAB, "lab-2").check_name(B)
     Trust(home, LAB).check_name(B)  # not asked for by name
@@ -85,7 +85,7 @@ def test_a_name_that_is_known_with_another_key_is_not_taken_at_first_sight(home:
 
 def test_known_by_whatever_address(home: KeyHome) -> None:
     assert known_fingerprints() == frozenset()
-    stored = home.servers.pin("10.0.0.7:7721", "lab-1", A)
+    stored = home.known_servers.pin("10.0.0.7:7721", "lab-1", A)
     trust = Trust(home, LAB)
     assert (trust.stored, trust.familiar(A), trust.familiar(B)) == ("", True, False)
     assert known_fingerprints() == {stored.fingerprint}

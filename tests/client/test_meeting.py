@@ -46,7 +46,7 @@ class Lab:
         self.address = self.session.address
 
     def code(self) -> str:
-        return self.server.codes.make(self.server.server_key())[0]
+        return self.server.join_codes.create(self.server.load_server_key())[0]
 
     def join(self, address: str = "", **options: str) -> Client:
         client = Client(address, name="ann", **options)  # type: ignore[arg-type]
@@ -71,16 +71,16 @@ def test_a_code_is_needed_once(lab: Lab) -> None:
     assert refused.value.code == RefusalCode.UNPAIRED
     code = lab.code()
     lab.join(lab.address, join_code=code.lower()).close()
-    (stored,) = lab.mine.servers.read()
-    assert (stored.address, stored.session, stored.key) == (lab.address, lab.name, lab.server.server_key().public)
-    assert [entry.key for entry in lab.server.clients.read().values()] == [lab.mine.identity().public]
+    (stored,) = lab.mine.known_servers.read()
+    assert (stored.address, stored.session, stored.key) == (lab.address, lab.name, lab.server.load_server_key().public)
+    assert [entry.key for entry in lab.server.clients.read().values()] == [lab.mine.load_identity().public]
     lab.join(lab.address).close()
     lab.join(lab.address, join_code=code).close()  # the same command again: its code is not needed any more
 
 
 def test_a_uri_has_all_of_it_and_a_name_finds_it(lab: Lab) -> None:
     host = Address.parse(lab.address)
-    lab.join(pairing_uri(host.host, host.port, lab.server.server_key().public, lab.code(), lab.name)).close()
+    lab.join(pairing_uri(host.host, host.port, lab.server.load_server_key().public, lab.code(), lab.name)).close()
     client = lab.join(session=lab.name)
     assert client.address == lab.address
     client.close()
@@ -88,7 +88,7 @@ def test_a_uri_has_all_of_it_and_a_name_finds_it(lab: Lab) -> None:
 
 def test_a_key_that_was_taken_off_the_list_pairs_again_with_a_new_code_only(lab: Lab) -> None:
     lab.join(lab.address, join_code=lab.code()).close()
-    lab.server.clients.revoke(lab.mine.identity().fingerprint)
+    lab.server.clients.revoke_key(lab.mine.load_identity().fingerprint)
     with pytest.raises(RefusedError) as refused:
         lab.join(lab.address)
     assert refused.value.code == RefusalCode.UNPAIRED
@@ -100,28 +100,28 @@ def test_a_wrong_code_stores_nothing(lab: Lab) -> None:
     with pytest.raises(RefusedError) as refused:
         lab.join(lab.address, join_code="0000-0000-0000")
     assert refused.value.code == RefusalCode.CODE
-    assert lab.mine.servers.read() == []
+    assert lab.mine.known_servers.read() == []
     with pytest.raises(ClientError, match="not a join code"):
         Client(lab.address, join_code="ABC")
 
 
 def test_another_key_than_the_stored_one_is_an_error(lab: Lab) -> None:
-    other = KeyPair.new().public
-    lab.mine.servers.pin(lab.address, lab.name, other)
+    other = KeyPair.generate().public
+    lab.mine.known_servers.pin(lab.address, lab.name, other)
     for options in ({}, {"join_code": lab.code()}):
         with pytest.raises(TrustError, match="keys forget"):
             lab.join(lab.address, **options)
     with pytest.raises(TrustError, match="keys forget"):
         lab.join(session=lab.name)
-    assert [one.key for one in lab.mine.servers.read()] == [other]
-    lab.mine.servers.forget(lab.address)
+    assert [one.key for one in lab.mine.known_servers.read()] == [other]
+    lab.mine.known_servers.remove(lab.address)
     host = Address.parse(lab.address)
     with pytest.raises(TrustError, match="known with the key"):
         lab.join(pairing_uri(host.host, host.port, other, lab.code()))
 
 
 def test_an_impostor_with_a_known_name_needs_a_code(lab: Lab) -> None:
-    lab.mine.servers.pin("10.0.0.7:7721", lab.name, KeyPair.new().public)
+    lab.mine.known_servers.pin("10.0.0.7:7721", lab.name, KeyPair.generate().public)
     with pytest.raises(TrustError, match="another key"):
         lab.join(session=lab.name)
     lab.join(session=lab.name, join_code=lab.code()).close()
@@ -177,14 +177,14 @@ def test_the_introduction_of_a_neighbouring_port_is_not_taken(lab: Lab, monkeypa
 
     def other_port(said: Introduction) -> Introduction:
         beacon = msgspec.structs.replace(said.beacon, control=said.beacon.control + 1, session_id="other")
-        return Introduction(beacon, KeyPair.new().public)
+        return Introduction(beacon, KeyPair.generate().public)
 
     monkeypatch.setattr(meeting_module, "ask_introduction", introduced_as(other_port))
     lab.join(lab.address).close()  # by the stored key
 
 
 def test_the_session_must_prove_the_code_too(tmp_path: Path) -> None:
-    server, own = KeyPair.new(), KeyPair.new()
+    server, own = KeyPair.generate(), KeyPair.generate()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     impostor = context.socket(zmq.ROUTER)
     impostor.curve_server = True
@@ -209,7 +209,7 @@ def test_a_session_where_many_pair_at_once_is_asked_again(monkeypatch: pytest.Mo
     monkeypatch.setattr(pairing_module, "AGAIN_S", 0.01)
     monkeypatch.setattr(pairing_module, "ANSWER_S", 1.0)
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    server, own, code = KeyPair.new(), KeyPair.new(), "7KQ2-M4XD-9PTR"
+    server, own, code = KeyPair.generate(), KeyPair.generate(), "7KQ2-M4XD-9PTR"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     session = context.socket(zmq.ROUTER)
     session.curve_server = True

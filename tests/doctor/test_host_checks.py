@@ -75,7 +75,7 @@ def test_every_port_of_a_session_is_looked_at() -> None:
 def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
     assert host_checks.check_key_home().state == "ok"  # not there yet
-    KeyHome().server_key()
+    KeyHome().load_server_key()
     assert host_checks.check_key_home().state == "ok"
     (tmp_path / "home" / "server.key_secret").chmod(0o644)
     found = host_checks.check_key_home()
@@ -86,7 +86,7 @@ def test_key_home_that_others_may_read(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_key_home_that_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "home"))
-    KeyHome().server_key()
+    KeyHome().load_server_key()
     path = tmp_path / "home" / "clients.json"
     path.write_text("[{}]")
     path.chmod(0o600)

@@ -21,7 +21,7 @@ from iris_session.doctor.join_checks import (
 from iris_session.protocol.discovery import Beacon, Introduction
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Refused, StateHeader
-from iris_session.security import KeyHome, KeyPair, SessionNote
+from iris_session.security import KeyHome, KeyPair, RegisteredSession
 
 ADDRESS = Address("192.0.2.7", 7721)
 
@@ -56,31 +56,31 @@ def test_every_refusal_has_its_check(error: Exception, check: str) -> None:
 
 
 def test_key_that_is_the_known_one(home: KeyHome) -> None:
-    key = KeyPair.new().public
+    key = KeyPair.generate().public
     assert check_server_key(ADDRESS, said(key)).state == "warning"  # not known yet
-    home.servers.pin(str(ADDRESS), "lab", key)
+    home.known_servers.pin(str(ADDRESS), "lab", key)
     assert check_server_key(ADDRESS, said(key)).state == "ok"
 
 
 def test_key_that_is_another_one(home: KeyHome) -> None:
-    home.servers.pin(str(ADDRESS), "lab", KeyPair.new().public)
-    found = check_server_key(ADDRESS, said(KeyPair.new().public))
+    home.known_servers.pin(str(ADDRESS), "lab", KeyPair.generate().public)
+    found = check_server_key(ADDRESS, said(KeyPair.generate().public))
     assert found.failed
     assert "iris-session keys forget 192.0.2.7:7721" in found.advice
 
 
 def test_key_of_a_scanned_code_counts(home: KeyHome) -> None:
-    scanned = Address("192.0.2.7", 7721, server_key=KeyPair.new().public)
-    assert check_server_key(scanned, said(KeyPair.new().public)).failed
+    scanned = Address("192.0.2.7", 7721, server_key=KeyPair.generate().public)
+    assert check_server_key(scanned, said(KeyPair.generate().public)).failed
     assert check_server_key(scanned, said(scanned.server_key)).state == "ok"
 
 
 def test_damaged_list_of_servers(home: KeyHome) -> None:
-    home.folder.make()
+    home.folder.create()
     path = home.path / "known_servers.json"
     path.write_text("{")
     path.chmod(0o600)
-    assert check_server_key(ADDRESS, said(KeyPair.new().public)).failed
+    assert check_server_key(ADDRESS, said(KeyPair.generate().public)).failed
 
 
 def test_nothing_to_compare() -> None:
@@ -89,21 +89,21 @@ def test_nothing_to_compare() -> None:
 
 
 def test_who_was_let_in_before_is_told_so(home: KeyHome) -> None:
-    new = explain_unpaired_key(ADDRESS, said(KeyPair.new().public))
+    new = explain_unpaired_key(ADDRESS, said(KeyPair.generate().public))
     assert (new.check, new.state, new.why) == ("key", "failed", "")
     assert "iris-session pair" in new.advice
     assert f"iris-session doctor {ADDRESS} --code" in new.advice
-    key = KeyPair.new().public
-    home.servers.pin(str(ADDRESS), "lab", key)
+    key = KeyPair.generate().public
+    home.known_servers.pin(str(ADDRESS), "lab", key)
     assert "let in before" in explain_unpaired_key(ADDRESS, said(key)).why
 
 
 def test_who_serves_the_session_lets_in_themselves(home: KeyHome) -> None:
-    key = KeyPair.new()
-    home.sessions.add(SessionNote("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
+    key = KeyPair.generate()
+    home.sessions.add(RegisteredSession("s1", "lab", os.getpid(), ("192.0.2.7",), 7721, key.fingerprint))
     assert check_server_key(ADDRESS, said(key.public)).state == "ok"
     assert explain_unpaired_key(ADDRESS, said(key.public)).advice == "iris-session keys allow me"
-    assert "pair" in explain_unpaired_key(ADDRESS, said(KeyPair.new().public)).advice
+    assert "pair" in explain_unpaired_key(ADDRESS, said(KeyPair.generate().public)).advice
 
 
 def test_what_is_no_join_code_is_a_matter_of_the_code() -> None:

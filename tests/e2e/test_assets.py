@@ -57,16 +57,16 @@ def test_a_slow_link_that_breaks_and_a_front_that_is_killed(
     ports = [port, endpoints.state, endpoints.media, endpoints.assets]
     with ImpairmentProcess({LINK: "lan"}, ports) as proxy:
         eve = watcher(stage, "eve", f"{LINK}:{port}", tmp_path / "eve")
-        proxy.do(f"profile {slow}")
+        proxy.execute(f"profile {slow}")
         fetch = eve.fetch_assets(list(data))
         stage.run(lambda: fetch.bytes_done > size // 8, "eve gets something")
         others = ann.fetch_assets(list(data))
         stage.run(lambda: others.done, "ann has everything")
         assert not fetch.done
-        proxy.do("cut")
+        proxy.execute("cut")
         stage.run(lambda: fetch.bytes_done > size // 3, "eve goes on after the link broke")
         stage.server.children()["front.main"].kill()
-        proxy.do("profile lan")
+        proxy.execute("profile lan")
         stage.run(lambda: fetch.done, "eve has everything, from another front")
         for one in (fetch, others):
             whole(one, data)

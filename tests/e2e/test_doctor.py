@@ -135,7 +135,7 @@ def test_wrong_code(encrypted: Server, home: Path) -> None:
 
 
 def test_role_that_the_key_may_not_have(encrypted: Server, home: Path) -> None:
-    KeyHome().clients.allow("looker", KeyHome(home).identity().public, ("observer",))
+    KeyHome().clients.allow_key("looker", KeyHome(home).load_identity().public, ("observer",))
     found = doctor(encrypted.address, "--role", "director", home=home)
     found.named("role", "role")
     assert found.failed() == {"role"}
@@ -145,7 +145,7 @@ def test_role_that_the_key_may_not_have(encrypted: Server, home: Path) -> None:
 
 
 def test_another_key_than_the_known_one(encrypted: Server, home: Path) -> None:
-    KeyHome(home).servers.pin(encrypted.address, "arm", KeyPair.new().public)
+    KeyHome(home).known_servers.pin(encrypted.address, "arm", KeyPair.generate().public)
     found = doctor(encrypted.address, home=home)
     found.named("server_key", "is known for", "iris-session keys forget")
     assert found.failed() == {"server_key"}

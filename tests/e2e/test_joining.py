@@ -112,12 +112,12 @@ def test_a_second_session_of_the_same_name_or_ports_is_never_taken_for_the_first
 def test_another_key_than_the_stored_one_is_refused_until_it_is_forgotten(network: Network, lab: Served) -> None:
     headset = network.headset
     headset.iris("keys", "forget", "10.77.1.1:7721")
-    impostor = KeyPair.new().public
-    KeyHome(headset.folder / "keys").servers.pin("10.77.1.1:7721", "lab-1", impostor)
+    impostor = KeyPair.generate().public
+    KeyHome(headset.folder / "keys").known_servers.pin("10.77.1.1:7721", "lab-1", impostor)
     for where in (("10.77.1.1",), ("--session", "lab-1")):
         done = headset.iris("emulate", *where)
         assert done.returncode == 1
-        assert "somebody else answers there" in done.stderr
+        assert "another server answers there" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
     assert headset.iris("keys", "forget", "10.77.1.1:7721").returncode == 0
     assert headset.look("10.77.1.1", "--code", pair(network.server)["code"])["frames"] > SEEN

@@ -127,7 +127,7 @@ def test_blackout_of_five_seconds(linked: Linked) -> None:
     ann = anns.client
     me, before = ann.participant_id, watcher.mirror.leases["left"]
     assert linked.engagements("left")[-1][1]
-    proxy.do("stall")
+    proxy.execute("stall")
     stage.run(lambda: not linked.engagements("left")[-1][1], "the session hears nothing of ann")
     held_ns, _, reason = linked.engagements("left")[-1]
     assert held_ns - linked.last_applied_ns("left") <= (170 + 1000 * linked.longest_s) * MS, "150 ms"
@@ -149,7 +149,7 @@ def test_blackout_of_five_seconds(linked: Linked) -> None:
     assert distance(resting[0], now[0]) < 5e-4
     assert not watcher.mirror.participants[me].connected
     assert watcher.mirror.leases["left"].holder == me, "in grace"
-    proxy.do("resume")
+    proxy.execute("resume")
     resumed_ns = watcher.session_now_ns()
     stage.run(lambda: ann.ready and ann.state is not None and ann.state.received_ns > resumed_ns, "ann is back")
     assert ann.participant_id == me
@@ -174,7 +174,7 @@ def test_cut_off_in_the_middle_of_a_snapshot(linked: Linked, tmp_path: Path, how
     late.open()
 
     def bytes_down() -> int:
-        return int(proxy.do("stats")["links"][0]["bytes_down"])
+        return int(proxy.execute("stats")["links"][0]["bytes_down"])
 
     def in_the_middle() -> bool:
         assert not late.ready, "the snapshot must not be there yet"
@@ -184,10 +184,10 @@ def test_cut_off_in_the_middle_of_a_snapshot(linked: Linked, tmp_path: Path, how
         begun = bytes_down()
         stage.run(in_the_middle, "a part of the snapshot is under way")
         snapshots = late.connection.counters.snapshots
-        proxy.do(how)
+        proxy.execute(how)
         stage.run(lambda: not late.connection.joined, "late notices")
         assert late.connection.counters.snapshots == snapshots == 0
-    proxy.do("profile good-wifi")
+    proxy.execute("profile good-wifi")
     stage.run(lambda: late.ready and late.state is not None, "late has joined")
     stage.run(lambda: late.mirror.mirror_hash() == watcher.mirror.mirror_hash(), "late knows what the watcher knows")
     assert [p.name for p in watcher.mirror.participants.values() if p.connected].count("late") == 1
@@ -202,7 +202,7 @@ def test_another_network(linked: Linked) -> None:
     hand = linked.driving(linked.client("ann"), "left")
     ann = hand.client
     me, before = ann.participant_id, watcher.mirror.leases["left"]
-    proxy.do("roam 127.0.0.9")
+    proxy.execute("roam 127.0.0.9")
     stage.run(lambda: not ann.connection.joined, "ann notices")
     stage.run(lambda: ann.ready, "ann is back")
     assert ann.participant_id == me

@@ -71,7 +71,7 @@ def test_a_slow_link_gets_fewer_media_and_fresh_state(publishing: Stage, tmp_pat
         stage.run(lambda: all(w.feed.received > HZ for w in everybody), "everybody gets media")
         stage.run(lambda: all(w.level == BudgetClass.FULL for w in everybody), "and all of it")
 
-        proxy.do(f"profile {slow}")
+        proxy.execute(f"profile {slow}")
         stage.run(lambda: eve.level in (BudgetClass.QUARTER, BudgetClass.NONE), "eve gets less")
         told = eve.client.delivery
         assert told is not None
@@ -96,7 +96,7 @@ def test_a_slow_link_gets_fewer_media_and_fresh_state(publishing: Stage, tmp_pat
         stage.run(told_of_all, "the status says what ann gets")
         assert {p.media[0].stream for p in row.values() if p.media} == {"cloud"}
 
-        proxy.do("profile lan")
+        proxy.execute("profile lan")
         stage.run(lambda: eve.level == BudgetClass.FULL, "eve has all of it again", 90.0)
         received = eve.feed.received
         stage.run(lambda: eve.feed.received > received + HZ, "at its full rate")

@@ -189,9 +189,9 @@ def test_an_encrypted_session_goes_on_encrypted_with_the_same_keys(
 ) -> None:
     """No option says so again: resume tokens are bound to keys, and nobody is let in who was not before."""
     monkeypatch.setenv("IRIS_HOME", str(tmp_path / "server-home"))
-    home, pair = KeyHome(tmp_path / "server-home"), KeyPair.new()
-    home.clients.allow("ann", pair.public, ())
-    keys = CurveKeys(home.server_key().public.encode(), pair.public.encode(), pair.secret.encode())
+    home, pair = KeyHome(tmp_path / "server-home"), KeyPair.generate()
+    home.clients.allow_key("ann", pair.public, ())
+    keys = CurveKeys(home.load_server_key().public.encode(), pair.public.encode(), pair.secret.encode())
     stage = Stage(serve("handover", "--curve", "--no-beacon"))
     try:
         ann = Client(
@@ -207,7 +207,7 @@ def test_an_encrypted_session_goes_on_encrypted_with_the_same_keys(
         again = resume(stage.server)
         came_back(stage, again, ann)
         assert ann.connection.welcome is not None
-        assert ann.connection.welcome.key_fingerprint == home.server_key().fingerprint
+        assert ann.connection.welcome.key_fingerprint == home.load_server_key().fingerprint
         assert ann.participant_id == me
         assert ann.mirror.leases["left"].holder == me
         again.finish()

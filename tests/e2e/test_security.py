@@ -44,15 +44,15 @@ class Lab(Stage):
 
     def __init__(self, serve: Callable[..., Server], home: Path) -> None:
         self.home = KeyHome(home)
-        self.key = self.home.server_key()
+        self.key = self.home.load_server_key()
         super().__init__(serve("handover", "--curve", "--no-beacon"))
 
     def curve(self, pair: KeyPair) -> CurveKeys:
         return CurveKeys(self.key.public.encode(), pair.public.encode(), pair.secret.encode())
 
     def listed(self, name: str, *roles: str) -> KeyPair:
-        pair = KeyPair.new()
-        self.home.clients.allow(name, pair.public, roles)
+        pair = KeyPair.generate()
+        self.home.clients.allow_key(name, pair.public, roles)
         return pair
 
     def enter(self, name: str, role: str = "operator", pair: KeyPair | None = None) -> Client:
@@ -196,7 +196,7 @@ def test_a_revoked_key_loses_everything_at_once_and_nobody_else_does(lab: Lab) -
     lab.seconds(0.3)
     gap = Gap(bob.client)
     revoked_at = time.monotonic()
-    assert lab.home.clients.revoke("ann") is not None  # what `iris-session keys revoke ann` does
+    assert lab.home.clients.revoke_key("ann") is not None  # what `iris-session keys revoke ann` does
 
     def refused() -> bool:
         gap.look()

@@ -241,5 +241,5 @@ def test_stalls_hold_everything_and_let_go_at_once() -> None:
         bursts.append(len(line.pop(now)))
     assert line.stalls > 10
     assert max(bursts) == pytest.approx(10, abs=2)
-    assert line.next_ns is None or line.next_ns >= 20 * SECOND - SECOND // 5
+    assert line.next_arrival_ns is None or line.next_arrival_ns >= 20 * SECOND - SECOND // 5
     assert len(line) <= 12

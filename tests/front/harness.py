@@ -15,7 +15,7 @@ from iris_session.protocol.client_messages import ClientMessage, GetSnapshot, He
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Entry, Join
 from iris_session.protocol.server_messages import BodyInfo, Event, Message, Notice, Snapshot, StateHeader, Welcome
-from iris_session.protocol.steps import Admitted, Decision, Outgoing
+from iris_session.protocol.steps import Admitted, Decision, OutgoingMessage
 
 N_BODIES = 3
 T = TypeVar("T", bound=Message)
@@ -134,7 +134,7 @@ class FrontSession:
                 participant = message.resume_of or f"p{entry.connection}"
                 admitted.append(Admitted(entry.connection, participant, message.role, bool(message.resume_of)))
             elif isinstance(message, GetSnapshot):
-                outgoing.append(Outgoing(entry.connection, self.snapshot(message.request_id)))
+                outgoing.append(OutgoingMessage(entry.connection, self.snapshot(message.request_id)))
         return Decision((), admitted=tuple(admitted), outgoing=tuple(outgoing))
 
     def snapshot(self, request_id: int) -> Snapshot:

@@ -21,7 +21,7 @@ class Lab:
 
     def __init__(self, open_session: Open, folder: Path) -> None:
         self.home = KeyHome(folder)
-        self.server = self.home.server_key()
+        self.server = self.home.load_server_key()
         self.session = open_session(curve=True, key_home=str(folder))
 
     def curve(self, pair: KeyPair) -> Curve:
@@ -32,8 +32,8 @@ class Lab:
 
     def allowed(self, name: str, *roles: str) -> tuple[KeyPair, RawClient]:
         """A key on the list, and a client with it that has joined."""
-        pair = KeyPair.new()
-        self.home.clients.allow(name, pair.public, roles)
+        pair = KeyPair.generate()
+        self.home.clients.allow_key(name, pair.public, roles)
         client = self.client(pair)
         client.join(name=name)
         return pair, client

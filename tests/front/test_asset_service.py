@@ -1,4 +1,4 @@
-"""What the thread of assets is told to serve: two scenes, and for a while the specifications before them."""
+"""What the thread of assets is server to serve: two scenes, and for a while the specifications before them."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from iris_session.front.asset_service import (
     REPLACED_NS,
     AssetService,
 )
-from iris_session.front.connections import ConnectionTable, FrontConnection, Peer, Route
+from iris_session.front.connections import FrontConnection, Peer, Route
 from iris_session.front.state_publisher import StatePublisher
 from iris_session.link.config import SceneInfo
 from iris_session.protocol.client_messages import Hello
-from iris_session.protocol.limits import Drops
 from iris_session.security import AllowedKey, KeyPair
 from iris_session.security.keyring import Keyring
+from tests.front.fakes import make_context
 
 ROOT = "/store"
 
 
-class Told:
-    """In place of the thread: keeps what it is told, at the time that it is."""
+class FakeServer:
+    """In place of the thread: keeps what it is server, at the time that it is."""
 
     def __init__(self) -> None:
         self.table = AssetAccess()
@@ -44,21 +44,15 @@ class Told:
         return {address for root, addresses in self.table.stores for address in addresses if root == ROOT}
 
 
-class Desk:
+class AssetServiceRig:
     def __init__(self, keyring: Keyring | None = None) -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self.publisher = StatePublisher(context.socket(zmq.PUB), look(0), lambda: 0)
         self.publisher.replace_socket(None)
-        self.told, self.drops, self.clients = Told(), Drops(), ConnectionTable()
-        self.revoked: set[str] = set()
-        self.desk = AssetService(
-            self.told,  # type: ignore[arg-type]
-            self.clients,
-            keyring or Keyring(),
-            self.drops,
-            self.publisher,
-            self.revoked.__contains__,
-        )
+        self.server = FakeServer()
+        front = make_context(self, lambda: 0, keyring=keyring, publisher=self.publisher)
+        self.clients, self.tokens = front.connections, front.tokens
+        self.service = AssetService(front, self.server)  # type: ignore[arg-type]
 
     def join(self, number: int, key: str, gateway: int = 0) -> None:
         route, peer = Route(b"%d" % number), Peer(number, key)
@@ -68,8 +62,8 @@ class Desk:
 
     def show(self, info: SceneInfo) -> set[str]:
         self.publisher.set_scene(info)
-        self.desk.sync_clients()
-        return self.told.served
+        self.service.sync_clients()
+        return self.server.served
 
 
 def look(number: int) -> SceneInfo:
@@ -77,58 +71,58 @@ def look(number: int) -> SceneInfo:
 
 
 def test_a_scene_is_served_at_once_and_of_those_before_the_last_only_what_was_their_specification() -> None:
-    desk = Desk()
-    assert desk.show(look(0)) == {"look0", "mesh0"}
-    assert desk.show(look(1)) == {"look0", "mesh0", "look1", "mesh1"}
-    assert desk.show(look(2)) == {"look0", "look1", "mesh1", "look2", "mesh2"}
-    assert desk.desk.report().served == 2
+    rig = AssetServiceRig()
+    assert rig.show(look(0)) == {"look0", "mesh0"}
+    assert rig.show(look(1)) == {"look0", "mesh0", "look1", "mesh1"}
+    assert rig.show(look(2)) == {"look0", "look1", "mesh1", "look2", "mesh2"}
+    assert rig.service.report().served == 2
     plain = SceneInfo("a model")
-    desk.show(plain)
-    desk.show(look(3))
-    assert desk.show(look(4)) == {"look0", "look1", "look2", "look3", "mesh3", "look4", "mesh4"}, "it offers nothing"
+    rig.show(plain)
+    rig.show(look(3))
+    assert rig.show(look(4)) == {"look0", "look1", "look2", "look3", "mesh3", "look4", "mesh4"}, "it offers nothing"
 
 
 def test_specifications_that_were_replaced_long_ago_are_forgotten() -> None:
-    desk = Desk()
-    desk.desk.tick(0)
+    rig = AssetServiceRig()
+    rig.service.tick(0)
     for number in range(3):
-        desk.show(look(number))
-    desk.desk.tick(REPLACED_NS)
-    assert "look0" in desk.told.served
-    desk.show(look(3))
-    desk.desk.tick(REPLACED_NS + PERIOD_NS)
-    assert desk.told.served >= {"look1", "look2", "look3"}
-    assert "look0" not in desk.told.served
-    desk.desk.tick(2 * REPLACED_NS + PERIOD_NS)
-    assert desk.told.served == {"look2", "mesh2", "look3", "mesh3"}
+        rig.show(look(number))
+    rig.service.tick(REPLACED_NS)
+    assert "look0" in rig.server.served
+    rig.show(look(3))
+    rig.service.tick(REPLACED_NS + PERIOD_NS)
+    assert rig.server.served >= {"look1", "look2", "look3"}
+    assert "look0" not in rig.server.served
+    rig.service.tick(2 * REPLACED_NS + PERIOD_NS)
+    assert rig.server.served == {"look2", "mesh2", "look3", "mesh3"}
 
 
 def test_they_are_so_many_at_most() -> None:
-    desk = Desk()
+    rig = AssetServiceRig()
     n = MAX_REPLACED + 10
     for number in range(n):
-        served = desk.show(look(number))
+        served = rig.show(look(number))
     assert {name for name in served if name.startswith("look")} == {f"look{i}" for i in range(n - MAX_REPLACED - 2, n)}
 
 
 def test_with_keys_everybody_comes_by_his_own_or_that_of_his_gateway_and_revoked_ones_by_none() -> None:
     listed = {mark: AllowedKey(mark, "") for mark in ("ann", "gate", "eve")}
-    desk = Desk(Keyring(KeyPair.new(), read=lambda: listed))
-    desk.join(1, "ann")
-    desk.join(2, "gate")
-    desk.join(3, "bob", gateway=2)
-    desk.revoked.add("eve")
-    desk.desk.tick(0)
-    assert desk.told.table.marks == {"ann", "gate"}
-    assert desk.told.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
-    desk.revoked.add("ann")
-    desk.desk.tick(PERIOD_NS)
-    assert desk.told.table.marks == {"gate"}
+    rig = AssetServiceRig(Keyring(KeyPair.generate(), read=lambda: listed))
+    rig.join(1, "ann")
+    rig.join(2, "gate")
+    rig.join(3, "bob", gateway=2)
+    rig.tokens.revoke_key("eve")
+    rig.service.tick(0)
+    assert rig.server.table.marks == {"ann", "gate"}
+    assert rig.server.table.listeners == {1: "ann", 2: "gate", 3: "gate"}
+    rig.tokens.revoke_key("ann")
+    rig.service.tick(PERIOD_NS)
+    assert rig.server.table.marks == {"gate"}
 
 
 def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
-    desk = Desk()
-    now_ns, steps = 1, desk.publisher
+    rig = AssetServiceRig()
+    now_ns, steps = 1, rig.publisher
 
     def yields(after_ns: int, *, delay_ns: int | None) -> bool:
         """A turn so long after the last one, with a state that left so late, or none."""
@@ -137,9 +131,9 @@ def test_assets_hold_back_when_state_or_the_loop_was_late() -> None:
         if delay_ns is not None:
             steps.frames += 1
             steps._delays.append((now_ns, delay_ns))
-        desk.told.late_until_ns = 0
-        desk.desk.tick(now_ns)
-        return desk.told.late_until_ns > now_ns
+        rig.server.late_until_ns = 0
+        rig.service.tick(now_ns)
+        return rig.server.late_until_ns > now_ns
 
     assert not yields(0, delay_ns=None)
     assert not yields(LATE_TICK_NS, delay_ns=LATE_NS)

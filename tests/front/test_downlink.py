@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 import zmq
 
-from iris_session.alignment.service import AlignmentService
-from iris_session.front.connections import ConnectionTable
 from iris_session.front.downlink import Downlink
 from iris_session.front.state_publisher import RECENT_NS, StatePublisher
 from iris_session.link import messages as link
 from iris_session.link.config import SceneInfo
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import BodyInfo, Event, MarkerAdded, SceneChanged, StateHeader
+from tests.front.fakes import make_alignment, make_context
 
 
-class Far:
+class LinkRig:
     """The authority's end of the link; keeps what is published."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
@@ -29,22 +28,15 @@ class Far:
         near.connect("inproc://link")
         self.published: list[tuple[bytes, ...]] = []
         self.heard_of: list[str] = []  # scenes
-        self.drops = Drops()
-        self.publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
-        unused = None
-        self.downlink = Downlink(
-            near,
-            ConnectionTable(),
-            unused,  # type: ignore[arg-type]
-            unused,  # type: ignore[arg-type]
-            self.publisher,
-            self.drops,
-            lambda: 77,
-            lambda connection: None,
-            unused,  # type: ignore[arg-type]
-            AlignmentService(lambda entry: True, self.drops),
-            lambda: self.heard_of.append(self.publisher.scene.scene_hash),
-        )
+        publisher = StatePublisher(self, scene(1), lambda: 77)  # type: ignore[arg-type]
+        front = make_context(self, lambda: 77, publisher=publisher)
+        self.drops, self.publisher, self.authority = front.drops, publisher, front.authority
+        unused: Any = None
+        self.downlink = Downlink(front, near, unused, unused, unused, make_alignment(front), self)  # type: ignore[arg-type]
+
+    def sync_clients(self) -> None:
+        """In place of the asset service."""
+        self.heard_of.append(self.publisher.scene.scene_hash)
 
     def send_multipart(self, frames: tuple[bytes, ...]) -> None:
         self.published.append(frames)
@@ -65,87 +57,87 @@ def scene(n: int) -> SceneInfo:
 
 
 @pytest.fixture
-def far() -> Iterator[Far]:
+def rig() -> Iterator[LinkRig]:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    yield Far(context)
+    yield LinkRig(context)
     context.destroy(linger=0)
 
 
-def test_only_the_newest_waiting_state_is_published_stamped(far: Far) -> None:
+def test_only_the_newest_waiting_state_is_published_stamped(rig: LinkRig) -> None:
     for tick in (1, 2, 3):
-        far.state(tick)
-    far.downlink.drain()
-    (header,) = far.headers()
+        rig.state(tick)
+    rig.downlink.drain()
+    (header,) = rig.headers()
     assert (header.tick, header.state_seq, header.published_ns) == (3, 1, 77)
-    assert far.drops.by_reason == {"state_superseded": 2}
-    far.state(4)
-    far.downlink.drain()
-    assert [h.state_seq for h in far.headers()] == [1, 2]
+    assert rig.drops.by_reason == {"state_superseded": 2}
+    rig.state(4)
+    rig.downlink.drain()
+    assert [h.state_seq for h in rig.headers()] == [1, 2]
 
 
-def test_state_goes_before_everything_else_that_waits(far: Far) -> None:
+def test_state_goes_before_everything_else_that_waits(rig: LinkRig) -> None:
     order: list[str] = []
-    far.publisher.publish_presence = lambda *_: order.append("presence")  # type: ignore[method-assign]
-    far.publisher.publish = lambda *_: order.append("state") or True  # type: ignore[method-assign, func-returns-value]
-    far.socket.send_multipart((link.PRESENCE, msgspec.msgpack.encode([])))
-    far.state(1)
-    far.downlink.drain()
+    rig.publisher.publish_presence = lambda *_: order.append("presence")  # type: ignore[method-assign]
+    rig.publisher.publish = lambda *_: order.append("state") or True  # type: ignore[method-assign, func-returns-value]
+    rig.socket.send_multipart((link.PRESENCE, msgspec.msgpack.encode([])))
+    rig.state(1)
+    rig.downlink.drain()
     assert order == ["state", "presence"]
 
 
-def test_a_state_of_the_next_scene_waits_for_it(far: Far) -> None:
-    far.state(1)
-    far.scene(2)
-    far.state(2, n=2)
-    far.downlink.drain()
-    assert far.publisher.scene.scene_hash == "scene2"
-    assert [h.tick for h in far.headers()] == [2]
-    assert "state_of_other_scene" not in far.drops.by_reason
+def test_a_state_of_the_next_scene_waits_for_it(rig: LinkRig) -> None:
+    rig.state(1)
+    rig.scene(2)
+    rig.state(2, n=2)
+    rig.downlink.drain()
+    assert rig.publisher.scene.scene_hash == "scene2"
+    assert [h.tick for h in rig.headers()] == [2]
+    assert "state_of_other_scene" not in rig.drops.by_reason
 
 
-def test_another_scene_is_told_of_inside_before_anybody_outside_hears(far: Far) -> None:
-    far.downlink.broadcast = lambda event: far.heard_of.append(event.body.scene_hash)  # type: ignore[method-assign, union-attr]
-    far.scene(1)
+def test_another_scene_is_told_of_inside_before_anybody_outside_hears(rig: LinkRig) -> None:
+    rig.downlink.broadcast = lambda event: rig.heard_of.append(event.body.scene_hash)  # type: ignore[method-assign, union-attr]
+    rig.scene(1)
     event = Event(1, 1, 0, SceneChanged(1, 1, "patch", "to everybody"))
-    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
-    far.scene(2)
-    far.downlink.drain()
-    assert far.heard_of == ["scene1", "to everybody", "scene2"]
+    rig.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    rig.scene(2)
+    rig.downlink.drain()
+    assert rig.heard_of == ["scene1", "to everybody", "scene2"]
 
 
-def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(far: Far) -> None:
-    far.state(1)
-    far.downlink.drain()
-    assert far.publisher.read_keyframe()[0] == 1
-    far.scene(2)
-    far.downlink.drain()
-    assert far.publisher.read_keyframe() == (0, np.ones((2, 7)).tobytes())
-    far.state(3, n=2)
-    far.downlink.drain()
-    assert far.publisher.read_keyframe()[0] == 2
+def test_a_keyframe_before_the_first_state_of_a_scene_is_that_of_the_scene(rig: LinkRig) -> None:
+    rig.state(1)
+    rig.downlink.drain()
+    assert rig.publisher.read_keyframe()[0] == 1
+    rig.scene(2)
+    rig.downlink.drain()
+    assert rig.publisher.read_keyframe() == (0, np.ones((2, 7)).tobytes())
+    rig.state(3, n=2)
+    rig.downlink.drain()
+    assert rig.publisher.read_keyframe()[0] == 2
 
 
-def test_acknowledgements_and_the_end_are_noticed(far: Far) -> None:
-    assert far.downlink.heard_ns == 0
-    far.socket.send_multipart((link.ACK, b"\x04"))
-    far.socket.send_multipart((link.ACK, b"\x03"))
-    far.socket.send_multipart((link.END, b""))
-    far.downlink.drain()
-    assert (far.downlink.acknowledged, far.downlink.ended, far.downlink.heard_ns) == (7, True, 77)
+def test_acknowledgements_and_the_end_are_noticed(rig: LinkRig) -> None:
+    assert rig.authority.heard_ns == 0
+    rig.socket.send_multipart((link.ACK, b"\x04"))
+    rig.socket.send_multipart((link.ACK, b"\x03"))
+    rig.socket.send_multipart((link.END, b""))
+    rig.downlink.drain()
+    assert (rig.authority.acknowledged, rig.authority.ended, rig.authority.heard_ns) == (7, True, 77)
 
 
-def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(far: Far) -> None:
+def test_a_decision_beyond_the_limits_of_the_protocol_ends_no_front(rig: LinkRig) -> None:
     event = Event(1, 1, 0, MarkerAdded("p1", "x" * 3000))
-    far.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
-    far.state(1)
-    far.downlink.drain()
-    assert far.drops.by_reason == {"decision_invalid": 1}
-    assert [h.tick for h in far.headers()] == [1]
+    rig.socket.send_multipart((link.DECIDED, link.encoder.encode(link.Decided(1, events=(event,)))))
+    rig.state(1)
+    rig.downlink.drain()
+    assert rig.drops.by_reason == {"decision_invalid": 1}
+    assert [h.tick for h in rig.headers()] == [1]
 
 
-def test_delays_are_those_of_the_last_seconds(far: Far) -> None:
+def test_delays_are_those_of_the_last_seconds(rig: LinkRig) -> None:
     now = [10]
-    publisher = StatePublisher(far, scene(1), lambda: now[0])  # type: ignore[arg-type]
+    publisher = StatePublisher(rig, scene(1), lambda: now[0])  # type: ignore[arg-type]
     assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([], 0)
     for at_ns, session_time in ((10, 1), (RECENT_NS, RECENT_NS - 20), (RECENT_NS + 20, RECENT_NS + 13)):
         now[0] = at_ns
@@ -154,10 +146,10 @@ def test_delays_are_those_of_the_last_seconds(far: Far) -> None:
     assert (publisher.read_recent_delays_ns(), publisher.newest_delay_ns) == ([20, 7], 7)
 
 
-def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(far: Far) -> None:
+def test_a_state_that_is_sent_again_says_nothing_of_the_way_to_the_socket(rig: LinkRig) -> None:
     """Its source is silent, and it is as old as that."""
     for session_time in (7, 7, 7, 9):
         header = StateHeader(1, 0, 1, 0.0, session_time, 0, 0, 0)
-        assert far.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
-    assert far.publisher.read_recent_delays_ns() == [70, 68]
-    assert [header.session_time for header in far.headers()] == [7, 7, 7, 9]
+        assert rig.publisher.publish(msgspec.msgpack.encode(header), np.zeros((1, 7)).tobytes())
+    assert rig.publisher.read_recent_delays_ns() == [70, 68]
+    assert [header.session_time for header in rig.headers()] == [7, 7, 7, 9]

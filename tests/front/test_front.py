@@ -36,7 +36,7 @@ from iris_session.protocol.server_messages import (
     Snapshot,
     Welcome,
 )
-from iris_session.protocol.steps import Admitted, Decision, Dropped, Outgoing
+from iris_session.protocol.steps import Admitted, Decision, Dropped, OutgoingMessage
 from iris_session.streams.rigid import RigidDecoder
 from tests.front.harness import N_BODIES, FrontSession
 
@@ -189,7 +189,9 @@ def test_dropped_and_refused_connections_end(session: FrontSession) -> None:
     session.admits = False
     client.send(Hello("pilot", "Ann", secret=client.secret))
     join = session.wait_entries(Join, 2)[1]
-    session.once(Decision((), outgoing=(Outgoing(join.connection, Refused("unknown_value", "no role 'pilot'")),)))
+    session.once(
+        Decision((), outgoing=(OutgoingMessage(join.connection, Refused("unknown_value", "no role 'pilot'")),))
+    )
     assert client.wait_for(Refused).code == "unknown_value"
     client.send(Heartbeat(), epoch=2)
     session.pump(lambda: any(f.code == "hello" for f in client.got(ProtocolFault)), "fault")
@@ -204,7 +206,7 @@ def test_snapshot_is_filled_and_comes_after_the_events_of_its_step(session: Fron
     session.send_state(poses)
     events = tuple(session.notice(str(i)) for i in range(3))
     snapshot = msgspec.structs.replace(session.snapshot(5), event_seq=events[-1].event_seq)
-    session.once(Decision((), outgoing=(Outgoing(1, snapshot),), events=events))
+    session.once(Decision((), outgoing=(OutgoingMessage(1, snapshot),), events=events))
     filled = client.wait_for(Snapshot)
     client.wait_for(Event, 3)
     assert (filled.request_id, filled.scene_hash, filled.state_seq) == (5, "hash", 1)

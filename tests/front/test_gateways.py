@@ -23,8 +23,8 @@ class Gateway:
 
     def __init__(self, lab: Lab, *roles: str) -> None:
         self.lab = lab
-        self.pair = KeyPair.new()
-        lab.home.clients.allow("web", self.pair.public, roles)
+        self.pair = KeyPair.generate()
+        lab.home.clients.allow_key("web", self.pair.public, roles)
         self.client: RawClient = lab.client(self.pair)
         self.client.join(role="gateway", name="web")
         self.numbers: dict[str, int] = {"web": self.client.epoch}
@@ -71,7 +71,7 @@ def test_a_revoked_gateway_takes_its_people_along_those_who_are_away_too(lab: La
     lab.session.pump(lambda: "away" in gateway.faults(), "the tab is let go")
     _, bob = lab.allowed("bob")
     if by == "list":
-        lab.home.clients.revoke("web")
+        lab.home.clients.revoke_key("web")
     else:
         dropped = Dropped(gateway.numbers["web"], "revoked", gateway.pair.fingerprint)
         lab.session.once(Decision((), dropped=(dropped,)))
@@ -90,7 +90,7 @@ def test_people_behind_a_gateway_lose_the_role_that_its_key_loses(lab: Lab) -> N
     gateway.enter("tab1", "operator")
     gateway.enter("tab2", "observer")
     first = gateway.ids("tab1")
-    lab.home.clients.allow("web", gateway.pair.public, ("gateway", "observer"))
+    lab.home.clients.allow_key("web", gateway.pair.public, ("gateway", "observer"))
     assert gateway.lost(1) == {gateway.numbers["tab1"]: "role"}
     assert gateway.removed(1) == first
     lab.session.pump(lambda: "tab1" in gateway.faults(), "the tab is told")
@@ -105,7 +105,7 @@ def test_people_behind_a_gateway_lose_the_role_that_its_key_loses(lab: Lab) -> N
 def test_a_key_that_may_be_a_gateway_no_more_takes_its_people_along(lab: Lab) -> None:
     gateway = Gateway(lab)  # any role
     gateway.enter("tab1", "director")
-    lab.home.clients.allow("web", gateway.pair.public, ("director",))
+    lab.home.clients.allow_key("web", gateway.pair.public, ("director",))
     assert gateway.removed(2) == gateway.ids("web", "tab1")
     assert set(gateway.lost(2).values()) == {"role"}
 
@@ -113,7 +113,7 @@ def test_a_key_that_may_be_a_gateway_no_more_takes_its_people_along(lab: Lab) ->
 def test_roles_that_a_key_gains_end_nothing(lab: Lab) -> None:
     gateway = Gateway(lab, "gateway", "observer")
     gateway.enter("tab1", "observer")
-    lab.home.clients.allow("web", gateway.pair.public, ())
+    lab.home.clients.allow_key("web", gateway.pair.public, ())
     names = iter(f"tab{i}" for i in range(2, 100))  # the list is looked at a few times a second
     lab.session.pump(lambda: gateway.enter(next(names), "director").roles == (), "the new roles")
     gateway.client.send(Marker(1, "still here"), on_behalf_of="tab1", epoch=gateway.numbers["tab1"])

@@ -20,7 +20,7 @@ from iris_session.protocol.common import IDENTITY
 from iris_session.protocol.entries import Entry, Lost
 from iris_session.protocol.limits import MAX_CLIENT_BYTES
 from iris_session.protocol.server_messages import Event, ProtocolFault, Refused
-from iris_session.protocol.steps import Decision, Outgoing
+from iris_session.protocol.steps import Decision, OutgoingMessage
 from tests.front.harness import FrontSession
 
 pytestmark = pytest.mark.e2e
@@ -235,7 +235,7 @@ def test_what_waits_for_a_client_that_reads_nothing_is_bounded_in_memory(open_se
     base = front.memory_info().rss
 
     def lost() -> bool:
-        session.once(Decision((), outgoing=(Outgoing(1, session.snapshot(1)),) * 2))
+        session.once(Decision((), outgoing=(OutgoingMessage(1, session.snapshot(1)),) * 2))
         assert front.memory_info().rss - base < 3 * limits.memory_bytes
         return any(isinstance(e.message, Lost) for e in session.entries)
 

@@ -8,16 +8,11 @@ import msgspec
 import pytest
 import zmq
 
-from iris_session.alignment.service import AlignmentService
 from iris_session.front.admission import Admission
-from iris_session.front.audit import AuditTrail
-from iris_session.front.coalescer import Coalescer
-from iris_session.front.connection_guard import ConnectionGuard
-from iris_session.front.connections import ConnectionTable, Outbox, Peer
+from iris_session.front.connections import Peer
 from iris_session.front.intake import Intake, RawFeed
 from iris_session.front.pairing import PairingService
-from iris_session.front.status import StatusService, Telling
-from iris_session.link import FrontConfig, FrontLimits, Ports
+from iris_session.link import FrontLimits
 from iris_session.protocol.client_messages import (
     ClientMessage,
     EStop,
@@ -29,11 +24,9 @@ from iris_session.protocol.client_messages import (
 )
 from iris_session.protocol.codec import decode_server, encode_client
 from iris_session.protocol.entries import Audit, Entry, Join
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.server_messages import Message, ProtocolFault, Refused, Reply, Welcome
 from iris_session.protocol.steps import Admitted
-from iris_session.security.keyring import Keyring
-from iris_session.security.resume_tokens import ResumeTokens
+from tests.front.fakes import make_alignment, make_context, make_status
 
 ROUTE = b"headset"
 ANN = Peer(5, "")
@@ -41,41 +34,25 @@ EVE = Peer(6, "")
 HELLO = Hello("operator", "Ann", secret=b"s" * 16)
 
 
-class Desk:
-    """Intake with an outbox that keeps what it is given."""
+class IntakeRig:
+    """Intake and admission with an outbox that keeps what it is given."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        config = FrontConfig()
         self.now_ns = 1_000_000_000
-        self.limits = config.limits
-        self.drops = Drops()
-        self.clients = ConnectionTable()
         self.sent: list[tuple[bytes, Message, list[bytes]]] = []
-        outbox = Outbox(self, config.limits, self.drops)  # type: ignore[arg-type]
-        self.coalescer = Coalescer(config.limits, self.drops)
-        self.tokens = ResumeTokens(8)
-        keyring, audit = Keyring(), AuditTrail(self.coalescer.offer)
-        guard = self.guard = ConnectionGuard(self.clients, self.drops, audit, config.limits)
-        self.admission = Admission(
-            config, Ports("127.0.0.1", 1, 2), self.clients, outbox, self.drops, self.tokens, keyring, audit, guard
-        )
-        pairing = PairingService(keyring, outbox, audit, self.drops)
-        raw = RawFeed(context, "", self.drops)
-        status = StatusService(config, self.clients, outbox, self.drops, Telling)
+        front = make_context(self, lambda: self.now_ns)
+        self.limits = front.config.limits
+        self.drops, self.clients, self.coalescer = front.drops, front.connections, front.coalescer
+        self.tokens, self.guard = front.tokens, front.guard
+        self.admission = Admission(front, ())
+        alignment = make_alignment(front)
         self.intake = Intake(
-            config,
-            self.clients,
-            outbox,
+            front,
             self.admission,
-            self.coalescer,
-            raw,
-            self.drops,
-            lambda: self.now_ns,
-            status,
-            pairing,
-            audit,
-            guard,
-            AlignmentService(self.coalescer.offer, self.drops, anchors=config.anchors),
+            PairingService(front),
+            make_status(front, alignment),
+            alignment,
+            RawFeed(context, "", front.drops),
         )
 
     def send_multipart(self, frames: list[bytes], _flags: int) -> None:
@@ -102,206 +79,206 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Iterator[Desk]:
+def rig() -> Iterator[IntakeRig]:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    yield Desk(context)
+    yield IntakeRig(context)
     context.destroy(linger=0)
 
 
-def test_another_tcp_connection_on_the_same_route_is_a_stranger_and_ends_the_first(desk: Desk) -> None:
-    epoch = desk.join().connection_epoch
-    desk.take(EStop("as Ann"), EVE, epoch)
-    assert desk.last() == ProtocolFault("hello", "this connection has not said hello: say hello (again)")
-    assert desk.entries() == []
-    assert [c.number for c in desk.intake.replaced] == [epoch]
+def test_another_tcp_connection_on_the_same_route_is_a_stranger_and_ends_the_first(rig: IntakeRig) -> None:
+    epoch = rig.join().connection_epoch
+    rig.take(EStop("as Ann"), EVE, epoch)
+    assert rig.last() == ProtocolFault("hello", "this connection has not said hello: say hello (again)")
+    assert rig.entries() == []
+    assert [c.number for c in rig.intake.replaced] == [epoch]
 
 
-def test_another_key_on_the_same_route_is_a_stranger(desk: Desk) -> None:
-    epoch = desk.join(Peer(5, "key-of-ann"), secret=b"").connection_epoch
-    desk.take(EStop("as Ann"), Peer(5, "key-of-eve"), epoch)
-    assert desk.entries() == []
-    assert isinstance(desk.last(), ProtocolFault)
+def test_another_key_on_the_same_route_is_a_stranger(rig: IntakeRig) -> None:
+    epoch = rig.join(Peer(5, "key-of-ann"), secret=b"").connection_epoch
+    rig.take(EStop("as Ann"), Peer(5, "key-of-eve"), epoch)
+    assert rig.entries() == []
+    assert isinstance(rig.last(), ProtocolFault)
 
 
-def test_the_curve_key_is_the_identity_whatever_the_secret(desk: Desk) -> None:
-    desk.take(Hello("operator", "Ann", secret=b"x" * 16), Peer(5, "fingerprint"))
-    (entry,) = desk.entries()
+def test_the_curve_key_is_the_identity_whatever_the_secret(rig: IntakeRig) -> None:
+    rig.take(Hello("operator", "Ann", secret=b"x" * 16), Peer(5, "fingerprint"))
+    (entry,) = rig.entries()
     assert isinstance(entry.message, Join)
     assert entry.message.key_id == "fingerprint"
 
 
-def test_more_than_one_frame_is_malformed(desk: Desk) -> None:
-    epoch = desk.join().connection_epoch
-    desk.take(Marker(1, "x"), epoch=epoch, extra=1)
-    fault = desk.last()
+def test_more_than_one_frame_is_malformed(rig: IntakeRig) -> None:
+    epoch = rig.join().connection_epoch
+    rig.take(Marker(1, "x"), epoch=epoch, extra=1)
+    fault = rig.last()
     assert isinstance(fault, ProtocolFault)
-    assert (fault.code, desk.entries()) == ("malformed", [])
+    assert (fault.code, rig.entries()) == ("malformed", [])
 
 
-def test_what_is_said_before_admission_is_dropped_and_counted(desk: Desk) -> None:
-    desk.take(Hello("operator", "Ann", secret=b"s" * 16))
-    desk.take(Marker(1, "early"), epoch=1)
-    assert [type(e.message) for e in desk.entries()] == [Join]
-    assert desk.drops.by_reason == {"not_admitted": 1}
+def test_what_is_said_before_admission_is_dropped_and_counted(rig: IntakeRig) -> None:
+    rig.take(Hello("operator", "Ann", secret=b"s" * 16))
+    rig.take(Marker(1, "early"), epoch=1)
+    assert [type(e.message) for e in rig.entries()] == [Join]
+    assert rig.drops.by_reason == {"not_admitted": 1}
 
 
-def test_too_many_messages_of_a_type_are_dropped_with_a_fault_now_and_then(desk: Desk) -> None:
-    epoch = desk.join().connection_epoch
+def test_too_many_messages_of_a_type_are_dropped_with_a_fault_now_and_then(rig: IntakeRig) -> None:
+    epoch = rig.join().connection_epoch
     for i in range(100):
-        desk.take(Marker(i, "x"), epoch=epoch)
-    faults = [m for _, m, _ in desk.sent if isinstance(m, ProtocolFault)]
-    assert desk.drops.by_reason["rate"] == 60
+        rig.take(Marker(i, "x"), epoch=epoch)
+    faults = [m for _, m, _ in rig.sent if isinstance(m, ProtocolFault)]
+    assert rig.drops.by_reason["rate"] == 60
     assert 1 <= len(faults) <= 6
     assert "marker" in faults[0].message
-    desk.take(EStop(), epoch=epoch)
-    assert isinstance(desk.entries()[0].message, EStop)
+    rig.take(EStop(), epoch=epoch)
+    assert isinstance(rig.entries()[0].message, EStop)
 
 
-def test_an_estop_is_never_over_its_rate(desk: Desk) -> None:
-    epoch = desk.join().connection_epoch
+def test_an_estop_is_never_over_its_rate(rig: IntakeRig) -> None:
+    epoch = rig.join().connection_epoch
     for _ in range(1000):
-        desk.take(EStop(), epoch=epoch)
-        (entry,) = desk.entries()
+        rig.take(EStop(), epoch=epoch)
+        (entry,) = rig.entries()
         assert isinstance(entry.message, EStop)
 
 
-def test_a_stop_does_not_wait_for_the_welcome(desk: Desk) -> None:
-    desk.take(Hello("observer", "Ann", secret=b"s" * 16))
-    desk.take(Marker(1, "too early"))
-    desk.take(EStop("now"))
-    assert [type(e.message) for e in desk.entries()] == [EStop, Join]
+def test_a_stop_does_not_wait_for_the_welcome(rig: IntakeRig) -> None:
+    rig.take(Hello("observer", "Ann", secret=b"s" * 16))
+    rig.take(Marker(1, "too early"))
+    rig.take(EStop("now"))
+    assert [type(e.message) for e in rig.entries()] == [EStop, Join]
 
 
-def test_the_hellos_of_one_peer_are_bounded_until_it_is_gone(desk: Desk) -> None:
+def test_the_hellos_of_one_peer_are_bounded_until_it_is_gone(rig: IntakeRig) -> None:
     for _ in range(12):
-        desk.take(Hello("operator", "Ann"))
-    assert [m.code for _, m, _ in desk.sent if isinstance(m, Refused)] == ["identity"] * 10 + ["rate"] * 2
-    desk.take(Hello("operator", "Eve"), EVE)
-    assert desk.last() == desk.sent[0][1]
-    desk.admission.remove_peer(ANN.descriptor)
-    desk.take(Hello("operator", "Ann"))
-    assert desk.last() == desk.sent[0][1]
+        rig.take(Hello("operator", "Ann"))
+    assert [m.code for _, m, _ in rig.sent if isinstance(m, Refused)] == ["identity"] * 10 + ["rate"] * 2
+    rig.take(Hello("operator", "Eve"), EVE)
+    assert rig.last() == rig.sent[0][1]
+    rig.admission.remove_peer(ANN.descriptor)
+    rig.take(Hello("operator", "Ann"))
+    assert rig.last() == rig.sent[0][1]
 
 
-def test_answers_to_those_behind_a_gateway_name_them(desk: Desk) -> None:
-    desk.join(role="gateway")
-    desk.take(Hello("operator", "Tab"), behalf="tab1")
-    route, refused, bulk = desk.sent[-1]
+def test_answers_to_those_behind_a_gateway_name_them(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
+    rig.take(Hello("operator", "Tab"), behalf="tab1")
+    route, refused, bulk = rig.sent[-1]
     assert (route, bulk) == (ROUTE, [b"tab1"])
     assert isinstance(refused, Refused)
 
 
-def test_two_behind_one_gateway_with_one_secret_are_one_key_but_not_that_of_a_client(desk: Desk) -> None:
-    desk.join(role="gateway")
+def test_two_behind_one_gateway_with_one_secret_are_one_key_but_not_that_of_a_client(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
     for tab in ("tab1", "tab2"):
-        desk.take(Hello("operator", tab, secret=b"s" * 16), behalf=tab)
-    first, second = (e.message.key_id for e in desk.entries() if isinstance(e.message, Join))
-    assert first == second != desk.clients.by_number[1].key_id
+        rig.take(Hello("operator", tab, secret=b"s" * 16), behalf=tab)
+    first, second = (e.message.key_id for e in rig.entries() if isinstance(e.message, Join))
+    assert first == second != rig.clients.by_number[1].key_id
 
 
-def test_nobody_speaks_for_a_gateway_of_another_tcp_connection(desk: Desk) -> None:
-    desk.join(role="gateway")
-    desk.take(Hello("operator", "Tab", secret=b"s" * 16), EVE, behalf="tab1")
-    refused = desk.last()
+def test_nobody_speaks_for_a_gateway_of_another_tcp_connection(rig: IntakeRig) -> None:
+    rig.join(role="gateway")
+    rig.take(Hello("operator", "Tab", secret=b"s" * 16), EVE, behalf="tab1")
+    refused = rig.last()
     assert isinstance(refused, Refused)
     assert refused.code == "gateway_only"
-    (audit,) = desk.entries()
+    (audit,) = rig.entries()
     assert audit.message == Audit("gateway_refused", "", "", "", "on behalf of tab1")
 
 
-def test_a_stop_of_who_was_given_up_lately_counts_until_the_tcp_connection_is_closed(desk: Desk) -> None:
-    number = desk.join().connection_epoch
-    lost = desk.clients.by_number[number]
-    desk.clients.remove(lost)
-    desk.take(EStop("unknown"), epoch=number)
-    assert not desk.coalescer
-    desk.clients.keep_for_estop(lost)
-    desk.take(EStop("by another"), EVE, epoch=number)
-    assert not desk.coalescer
-    desk.take(EStop("now"), epoch=number)
-    assert desk.coalescer.take_batch() == [Entry(number, number, desk.now_ns, EStop("now"))]
-    fault = desk.sent[-1][1]
+def test_a_stop_of_who_was_given_up_lately_counts_until_the_tcp_connection_is_closed(rig: IntakeRig) -> None:
+    number = rig.join().connection_epoch
+    lost = rig.clients.by_number[number]
+    rig.clients.remove(lost)
+    rig.take(EStop("unknown"), epoch=number)
+    assert not rig.coalescer
+    rig.clients.keep_for_estop(lost)
+    rig.take(EStop("by another"), EVE, epoch=number)
+    assert not rig.coalescer
+    rig.take(EStop("now"), epoch=number)
+    assert rig.coalescer.take_batch() == [Entry(number, number, rig.now_ns, EStop("now"))]
+    fault = rig.sent[-1][1]
     assert isinstance(fault, ProtocolFault)
     assert fault.code == "hello", "it is told to come back all the same"
-    desk.clients.remove_closed(ANN.descriptor, ("10.0.0.1", 5))
-    desk.take(EStop("somebody else"), epoch=number)
-    assert not desk.coalescer
+    rig.clients.remove_closed(ANN.descriptor, ("10.0.0.1", 5))
+    rig.take(EStop("somebody else"), epoch=number)
+    assert not rig.coalescer
 
 
-def test_requests_above_their_rate_or_without_room_are_answered_by_a_denial(desk: Desk) -> None:
-    number = desk.join().connection_epoch
+def test_requests_above_their_rate_or_without_room_are_answered_by_a_denial(rig: IntakeRig) -> None:
+    number = rig.join().connection_epoch
     for i in range(200):
-        desk.take(Marker(i + 1, "x"), epoch=number)
-    denied = {m.request_id: m.denial for _, m, _ in desk.sent if isinstance(m, Reply)}
-    taken = {e.message.request_id for e in desk.coalescer.take_batch() if isinstance(e.message, Marker)}
+        rig.take(Marker(i + 1, "x"), epoch=number)
+    denied = {m.request_id: m.denial for _, m, _ in rig.sent if isinstance(m, Reply)}
+    taken = {e.message.request_id for e in rig.coalescer.take_batch() if isinstance(e.message, Marker)}
     assert taken == set(range(1, 41))
     assert set(denied) == set(range(41, 81)), "at a bounded rate"
     assert all(d is not None and d.reason == "quota" and "marker" in d.message for d in denied.values())
-    desk.sent.clear()
+    rig.sent.clear()
     for second in range(1, 20):  # within the rate, while the authority takes nothing
-        desk.now_ns += 1_000_000_000
+        rig.now_ns += 1_000_000_000
         for i in range(10):
-            desk.take(Marker(1000 * second + i, "x"), epoch=number)
-    replies = [m for _, m, _ in desk.sent if isinstance(m, Reply)]
+            rig.take(Marker(1000 * second + i, "x"), epoch=number)
+    replies = [m for _, m, _ in rig.sent if isinstance(m, Reply)]
     assert len(replies) == 190 - FrontLimits().pending_messages
     assert all(r.denial is not None and r.denial.reason == "quota" for r in replies)
 
 
-def test_the_newest_tracking_epoch_gets_through_whatever_its_rate(desk: Desk) -> None:
-    number = desk.join().connection_epoch
+def test_the_newest_tracking_epoch_gets_through_whatever_its_rate(rig: IntakeRig) -> None:
+    number = rig.join().connection_epoch
     for epoch in range(1, 101):
-        desk.take(TrackingEpoch(epoch), epoch=number)
-    assert [e.message for e in desk.coalescer.take_batch()] == [TrackingEpoch(10)]
-    desk.now_ns += 1_000_000_000
-    desk.take(Heartbeat(), epoch=number)
-    assert {type(e.message): e.message for e in desk.coalescer.take_batch()}[TrackingEpoch] == TrackingEpoch(100)
-    desk.take(Heartbeat(), epoch=number)
-    assert [e.message for e in desk.coalescer.take_batch()] == [Heartbeat()]
+        rig.take(TrackingEpoch(epoch), epoch=number)
+    assert [e.message for e in rig.coalescer.take_batch()] == [TrackingEpoch(10)]
+    rig.now_ns += 1_000_000_000
+    rig.take(Heartbeat(), epoch=number)
+    assert {type(e.message): e.message for e in rig.coalescer.take_batch()}[TrackingEpoch] == TrackingEpoch(100)
+    rig.take(Heartbeat(), epoch=number)
+    assert [e.message for e in rig.coalescer.take_batch()] == [Heartbeat()]
 
 
-def test_a_full_house_lets_back_in_who_has_a_token(desk: Desk) -> None:
-    welcome = desk.join()
-    for i in range(desk.limits.connections - 1):
-        desk.now_ns += 1_000_000_000
+def test_a_full_house_lets_back_in_who_has_a_token(rig: IntakeRig) -> None:
+    welcome = rig.join()
+    for i in range(rig.limits.connections - 1):
+        rig.now_ns += 1_000_000_000
         hello = msgspec.structs.replace(HELLO, secret=b"%016d" % i)
-        desk.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
-    assert len(desk.clients) == desk.limits.connections
-    desk.now_ns += 1_000_000_000
-    desk.coalescer.take_batch()
+        rig.intake.handle_message(bytes([i]), Peer(100 + i, ""), memoryview(encode_client(envelope(hello))), 0)
+    assert len(rig.clients) == rig.limits.connections
+    rig.now_ns += 1_000_000_000
+    rig.coalescer.take_batch()
     late, back = Peer(7, ""), Peer(8, "")
     data = encode_client(envelope(HELLO))
-    desk.intake.handle_message(b"late", late, memoryview(data), 0)
-    assert isinstance(desk.sent[-1][1], Refused)
+    rig.intake.handle_message(b"late", late, memoryview(data), 0)
+    assert isinstance(rig.sent[-1][1], Refused)
     data = encode_client(envelope(msgspec.structs.replace(HELLO, resume_token=welcome.resume_token)))
-    desk.intake.handle_message(b"back", back, memoryview(data), 0)
-    (entry,) = desk.coalescer.take_batch()
+    rig.intake.handle_message(b"back", back, memoryview(data), 0)
+    (entry,) = rig.coalescer.take_batch()
     assert isinstance(entry.message, Join)
     assert entry.message.resume_of == "p1"
 
 
-def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(desk: Desk) -> None:
+def test_a_key_that_uses_up_all_hellos_keeps_nobody_else_out(rig: IntakeRig) -> None:
     for i in range(1000):
         data = encode_client(envelope(Hello("operator", "Eve")))
-        desk.intake.handle_message(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
-    refused = desk.last()
+        rig.intake.handle_message(b"%d" % i, Peer(1000 + i, "key-of-eve"), memoryview(data), 0)
+    refused = rig.last()
     assert isinstance(refused, Refused)
     assert refused.code == "rate"
-    desk.coalescer.take_batch()
-    assert desk.join(Peer(5, "key-of-ann")).participant_id == "p1"
+    rig.coalescer.take_batch()
+    assert rig.join(Peer(5, "key-of-ann")).participant_id == "p1"
 
 
-def test_who_is_above_the_limits_for_seconds_is_named_as_a_flood(desk: Desk) -> None:
-    epoch = desk.join().connection_epoch
+def test_who_is_above_the_limits_for_seconds_is_named_as_a_flood(rig: IntakeRig) -> None:
+    epoch = rig.join().connection_epoch
 
     def floods() -> list[Audit]:
-        return [e.message for e in desk.entries() if isinstance(e.message, Audit)]
+        return [e.message for e in rig.entries() if isinstance(e.message, Audit)]
 
     for _ in range(60):  # a burst is none
-        desk.take(Marker(1, "x"), epoch=epoch)
+        rig.take(Marker(1, "x"), epoch=epoch)
     assert floods() == []
     for _ in range(300):
-        desk.now_ns += 10_000_000
+        rig.now_ns += 10_000_000
         for _ in range(5):
-            desk.take(Marker(1, "x"), epoch=epoch)
+            rig.take(Marker(1, "x"), epoch=epoch)
     (flood,) = floods()
     assert (flood.kind, flood.subject, flood.name, flood.detail) == ("flood", "p1", "Ann", "marker")

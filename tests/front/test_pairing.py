@@ -1,4 +1,4 @@
-"""The pairing desk and revocation without sockets: shares of an attacker, a slow disk, words that cross."""
+"""The pairing rig and revocation without sockets: shares of an attacker, a slow disk, words that cross."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ from typing import Any
 
 import pytest
 
-from iris_session.front import pairing as pairing_desk
-from iris_session.front.audit import AuditTrail
-from iris_session.front.connections import ConnectionTable, Peer, Route
+from iris_session.front import pairing as pairing_service
+from iris_session.front.connections import Peer, Route
 from iris_session.front.pairing import BURST, MAX_PENDING, PATIENCE_NS, RETRY_S, PairingService
 from iris_session.front.revocation import CHECK_PERIOD_NS, RevocationService
-from iris_session.link.config import SECOND, FrontConfig
+from iris_session.link.config import SECOND
 from iris_session.protocol import pairing
 from iris_session.protocol.client_messages import Pair
 from iris_session.protocol.limits import Drops
 from iris_session.protocol.names import RefusalCode
 from iris_session.protocol.server_messages import Paired
 from iris_session.security import AllowedKey, JoinCode, KeyHome, KeyPair, KeysError
-from iris_session.security.keyring import STRANGER, Keyring, open_keyring
-from iris_session.security.resume_tokens import ResumeTokens
+from iris_session.security.keyring import PAIRING_PREFIX, Keyring, open_keyring
+from tests.front.fakes import make_context
 from tests.front.slow_disk import slow_disk, turns
 
 
@@ -40,40 +39,30 @@ class Outbox:
 class Publisher:
     """Stands for the state socket."""
 
-    def use_socket(self, state: object) -> None:
+    def replace_socket(self, state: object) -> None:
         pass
 
 
-class Desk:
-    """Keyring, desk and revocation of a front, in turns that the test takes. Addresses are made of descriptors."""
+class PairingRig:
+    """Keyring, pairing and revocation of a front, with ticks by the test. Addresses are made of descriptors."""
 
     def __init__(self, folder: Path) -> None:
         self.home = KeyHome(folder)
-        self.server = self.home.server_key()
-        self.drops = Drops()
+        self.server = self.home.load_server_key()
         self.outbox: Any = Outbox()
         clients = self.home.clients
-        self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature, self.drops)
-        self.tokens = ResumeTokens(16)
-        audit = AuditTrail(lambda _entry: True)
-        self.desk = PairingService(self.keyring, self.outbox, audit, self.drops)
+        self.keyring = Keyring(self.server, self.home, clients.read, lambda: clients.signature)
         publisher: Any = Publisher()
-        self.revocation = RevocationService(
-            self.keyring,
-            ConnectionTable(),
-            self.outbox,
-            self.tokens,
-            audit,
-            publisher,
-            lambda _entry: True,
-            lambda _connection, _reason: None,
-            lambda: publisher,
-        )
+        front = make_context(self.outbox, lambda: self.now_ns, keyring=self.keyring, publisher=publisher, max_tokens=16)
+        self.tokens, self.drops = front.tokens, front.drops
+        self.pairing = PairingService(front)
+        disconnects: Any = None  # no key is connected
+        self.revocation = RevocationService(front, disconnects, lambda: publisher)
         self.now_ns = 0
 
     def asks(self, own: KeyPair, proof: bytes = b"x" * 32, descriptor: int = 1) -> None:
-        peer = Peer(descriptor, STRANGER + own.public)
-        self.desk.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
+        peer = Peer(descriptor, PAIRING_PREFIX + own.public)
+        self.pairing.handle_pair(Route(own.public.encode()), peer, Pair("ann", proof), self.now_ns)
 
     def proof(self, code: str, own: KeyPair) -> bytes:
         secret = pairing.stretch(code, self.server.raw_public)
@@ -81,7 +70,7 @@ class Desk:
 
     def turn(self, _now_ns: int = 0) -> None:
         self.now_ns += CHECK_PERIOD_NS
-        for service in (self.keyring, self.desk, self.revocation):
+        for service in (self.keyring, self.pairing, self.revocation):
             service.tick(self.now_ns)
 
     def answers(self, own: KeyPair) -> list[Any]:
@@ -99,143 +88,143 @@ def _no_descriptor(*_args: object, **_more: object) -> None:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PairingRig]:
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    monkeypatch.setattr(pairing_desk, "peer_of", lambda descriptor: (f"10.0.0.{descriptor}", 5))
-    desk = Desk(tmp_path / "home")
-    yield desk
-    desk.keyring.close()
+    monkeypatch.setattr(pairing_service, "peer_of", lambda descriptor: (f"10.0.0.{descriptor}", 5))
+    rig = PairingRig(tmp_path / "home")
+    yield rig
+    rig.keyring.close()
 
 
-def test_a_disk_that_takes_its_time_keeps_the_loop_from_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
-    desk.asks(own, desk.proof(code, own))
+def test_a_slow_disk_does_not_block_the_loop(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    rig.asks(own, rig.proof(code, own))
     with slow_disk(monkeypatch) as disk:
-        turns(desk.turn, disk.waits.is_set)
+        turns(rig.turn, disk.waits.is_set)
         for _ in range(5):
-            desk.turn()
-        assert desk.answers(own) == [], "the answer comes after the write"
-        assert desk.keyring.find(own.fingerprint) is None
-    assert isinstance(desk.answer(own), Paired)
-    assert desk.keyring.find(own.fingerprint) is not None
-    assert list(desk.home.clients.read()) == [own.fingerprint]
+            rig.turn()
+        assert rig.answers(own) == [], "the answer comes after the write"
+        assert rig.keyring.find_key(own.fingerprint) is None
+    assert isinstance(rig.answer(own), Paired)
+    assert rig.keyring.find_key(own.fingerprint) is not None
+    assert list(rig.home.clients.read()) == [own.fingerprint]
 
 
-def test_a_director_revokes_at_once_whatever_the_disk_does(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
-    desk.turn()
+def test_a_director_revokes_at_once_whatever_the_disk_does(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.turn()
     with slow_disk(monkeypatch) as disk:
-        desk.revocation.revoke(own.fingerprint, desk.now_ns)
-        assert desk.tokens.revoked(own.fingerprint)
-        turns(desk.turn, disk.waits.is_set)
-        desk.asks(own)
-        assert desk.answer(own).message == "this key was revoked just now", "not let in again by the way"
-        assert own.fingerprint in desk.home.clients.read()
-    turns(desk.turn, lambda: own.fingerprint not in desk.keyring.revoking)
-    assert desk.home.clients.read() == {}
-    assert desk.tokens.revoked(own.fingerprint)
+        rig.revocation.revoke(own.fingerprint, rig.now_ns)
+        assert rig.tokens.is_revoked(own.fingerprint)
+        turns(rig.turn, disk.waits.is_set)
+        rig.asks(own)
+        assert rig.answer(own).message == "this key was revoked just now", "not let in again by the way"
+        assert own.fingerprint in rig.home.clients.read()
+    turns(rig.turn, lambda: own.fingerprint not in rig.keyring.pending_revocations)
+    assert rig.home.clients.read() == {}
+    assert rig.tokens.is_revoked(own.fingerprint)
 
 
 @pytest.mark.parametrize("when", ["waiting", "writing", "written"])
-def test_a_directors_word_while_the_key_pairs_counts(desk: Desk, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
-    own, first = KeyPair.new(), KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+def test_a_revocation_while_the_key_pairs_counts(rig: PairingRig, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    own, first = KeyPair.generate(), KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
     with slow_disk(monkeypatch) as disk:
         if when == "waiting":  # behind the attempt of somebody else
             with monkeypatch.context() as patch:
                 patch.setattr(os, "fsync", lambda _: None)
-                other, _ = desk.home.codes.make(desk.server)
-            desk.asks(first, desk.proof(other, first), descriptor=2)
-            turns(desk.turn, disk.waits.is_set)
-        desk.asks(own, desk.proof(code, own))
+                other, _ = rig.home.join_codes.create(rig.server)
+            rig.asks(first, rig.proof(other, first), descriptor=2)
+            turns(rig.turn, disk.waits.is_set)
+        rig.asks(own, rig.proof(code, own))
         if when != "waiting":
-            turns(desk.turn, disk.waits.is_set)
+            turns(rig.turn, disk.waits.is_set)
         if when == "written":
             disk.go_on()
-            turns(lambda _: None, lambda: bool(desk.home.clients.read()))
-        desk.revocation.revoke(own.fingerprint, desk.now_ns)
-    answer = desk.answer(own)
+            turns(lambda _: None, lambda: bool(rig.home.clients.read()))
+        rig.revocation.revoke(own.fingerprint, rig.now_ns)
+    answer = rig.answer(own)
     assert (answer.code, answer.message) == (RefusalCode.CODE, "this key was revoked just now")
-    turns(desk.turn, lambda: not desk.keyring.revoking)
-    desk.turn()
-    assert own.fingerprint not in desk.home.clients.read()
-    assert desk.keyring.find(own.fingerprint) is None
-    assert desk.tokens.revoked(own.fingerprint)
+    turns(rig.turn, lambda: not rig.keyring.pending_revocations)
+    rig.turn()
+    assert own.fingerprint not in rig.home.clients.read()
+    assert rig.keyring.find_key(own.fingerprint) is None
+    assert rig.tokens.is_revoked(own.fingerprint)
 
 
-def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(desk: Desk) -> None:
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
-    desk.asks(own, desk.proof(code, own))
-    desk.turn()
-    turns(lambda _: None, lambda: bool(desk.home.clients.read()))  # written, and not told yet
-    assert desk.home.clients.revoke("ann") is not None
-    desk.keyring.look()
-    assert desk.answer(own).message == "this key was revoked just now"
-    assert desk.keyring.find(own.fingerprint) is None
+def test_a_key_that_a_command_takes_off_while_it_pairs_is_off(rig: PairingRig) -> None:
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    rig.asks(own, rig.proof(code, own))
+    rig.turn()
+    turns(lambda _: None, lambda: bool(rig.home.clients.read()))  # written, and not told yet
+    assert rig.home.clients.revoke_key("ann") is not None
+    rig.keyring.reload_if_changed()
+    assert rig.answer(own).message == "this key was revoked just now"
+    assert rig.keyring.find_key(own.fingerprint) is None
 
 
 def test_a_list_that_could_not_be_read_just_then_is_read_again(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    rig: PairingRig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Revoked while the system had no descriptor to spare: it counts as soon as there is one."""
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
-    desk.keyring.look()
-    desk.home.clients.revoke("ann")
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.keyring.reload_if_changed()
+    rig.home.clients.revoke_key("ann")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", _no_descriptor)
         for _ in range(3):
-            desk.keyring.look()
-    assert desk.keyring.find(own.fingerprint) is not None
+            rig.keyring.reload_if_changed()
+    assert rig.keyring.find_key(own.fingerprint) is not None
     assert capsys.readouterr().err.count("Too many open files") == 1, "said once"
-    desk.keyring.look()
-    assert desk.keyring.find(own.fingerprint) is None
+    rig.keyring.reload_if_changed()
+    assert rig.keyring.find_key(own.fingerprint) is None
 
 
 def test_who_is_on_the_list_has_paired_though_it_cannot_be_read_just_then(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
+    rig: PairingRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The code is used up: to be told that one was revoked would be wrong, and of no use."""
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
 
     def unreadable() -> dict[str, AllowedKey]:
         raise KeysError("Too many open files") from OSError(errno.EMFILE, "Too many open files")
 
     with monkeypatch.context() as patch:
-        patch.setattr(desk.keyring, "_read", unreadable)
-        desk.asks(own, desk.proof(code, own))
-        assert isinstance(desk.answer(own), Paired)
-    desk.turn()
-    assert desk.keyring.find(own.fingerprint) is not None
+        patch.setattr(rig.keyring, "_read", unreadable)
+        rig.asks(own, rig.proof(code, own))
+        assert isinstance(rig.answer(own), Paired)
+    rig.turn()
+    assert rig.keyring.find_key(own.fingerprint) is not None
 
 
-def test_who_has_paired_and_did_not_hear_it_is_told_again(desk: Desk) -> None:
+def test_who_has_paired_and_did_not_hear_it_is_told_again(rig: PairingRig) -> None:
     """The answer came too late, or its connection broke: the code is used up, and the key is on the list."""
-    own = KeyPair.new()
-    code, _ = desk.home.codes.make(desk.server)
-    proof = desk.proof(code, own)
-    desk.asks(own, proof)
-    first = desk.answer(own)
+    own = KeyPair.generate()
+    code, _ = rig.home.join_codes.create(rig.server)
+    proof = rig.proof(code, own)
+    rig.asks(own, proof)
+    first = rig.answer(own)
     assert isinstance(first, Paired)
-    _, other = desk.home.codes.make(desk.server)
-    desk.asks(own, proof)
-    assert desk.answers(own) == [first, first], "at once"
-    kept = desk.home.codes.find(other.id)
+    _, other = rig.home.join_codes.create(rig.server)
+    rig.asks(own, proof)
+    assert rig.answers(own) == [first, first], "at once"
+    kept = rig.home.join_codes.find_code(other.id)
     assert kept is not None
     assert kept.attempts_left == other.attempts_left, "it is no attempt at another code"
-    desk.asks(KeyPair.new(), proof, descriptor=2)
-    desk.asks(own, b"x" * 32)
-    turns(desk.turn, lambda: len(desk.answers(own)) == 3)
-    assert desk.answers(own)[2].code == RefusalCode.CODE
-    desk.home.clients.revoke(own.fingerprint)
-    turns(desk.turn, lambda: desk.keyring.find(own.fingerprint) is None)
-    desk.asks(own, proof)
-    turns(desk.turn, lambda: len(desk.answers(own)) == 4)
-    assert desk.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
+    rig.asks(KeyPair.generate(), proof, descriptor=2)
+    rig.asks(own, b"x" * 32)
+    turns(rig.turn, lambda: len(rig.answers(own)) == 3)
+    assert rig.answers(own)[2].code == RefusalCode.CODE
+    rig.home.clients.revoke_key(own.fingerprint)
+    turns(rig.turn, lambda: rig.keyring.find_key(own.fingerprint) is None)
+    rig.asks(own, proof)
+    turns(rig.turn, lambda: len(rig.answers(own)) == 4)
+    assert rig.answers(own)[3].code == RefusalCode.CODE, "who was taken off the list needs another code"
 
 
 def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_given(
@@ -244,104 +233,103 @@ def test_a_folder_of_certificates_is_read_again_whatever_time_its_files_are_give
     """As by `cp -p` or rsync: a key that is replaced is out at once. A certificate that is damaged is said, once."""
     folder = tmp_path / "clients"
     folder.mkdir()
-    first, second = KeyPair.new(), KeyPair.new()
+    first, second = KeyPair.generate(), KeyPair.generate()
     server = KeyHome(tmp_path / "home")
-    server.server_key()
+    server.load_server_key()
     drops = Drops()
-    config = FrontConfig(curve_secret_file=str(server.path / "server.key_secret"), curve_clients_dir=str(folder))
-    keyring = open_keyring(config, drops)
+    keyring = open_keyring("", str(server.path / "server.key_secret"), str(folder), drops)
     path = folder / "ann.key"
 
     def write(text: str) -> None:
         path.write_text(text)
         os.utime(path, ns=(0, 0))
-        keyring.look()
+        keyring.reload_if_changed()
 
     write(f'public-key = "{first.public}"')
-    assert keyring.find(first.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is not None
     write(f'public-key = "{second.public}"')
-    assert keyring.find(first.fingerprint) is None
-    assert set(keyring.gone) == {first.fingerprint}
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(first.fingerprint) is None
+    assert set(keyring.removed) == {first.fingerprint}
+    assert keyring.find_key(second.fingerprint) is not None
     (folder / "bob.key").write_text("nothing")
     for _ in range(3):
         (folder / "other").touch()
-        keyring.look()
+        keyring.reload_if_changed()
     said = capsys.readouterr().err
-    assert said.count("nobody is let in by bob.key") == 1
+    assert said.count("certificate bob.key") == 1
     assert "it should be a ZeroMQ certificate" in said
     assert drops.by_reason["certificate_unusable"] == 1
-    assert keyring.find(second.fingerprint) is not None
+    assert keyring.find_key(second.fingerprint) is not None
     keyring.close()
 
 
-def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(desk: Desk) -> None:
-    own = KeyPair.new()
-    desk.home.clients.allow("ann", own.public)
-    desk.turn()
-    desk.revocation.revoke(own.fingerprint, desk.now_ns)
-    turns(desk.turn, lambda: not desk.keyring.revoking)
-    code, _ = desk.home.codes.make(desk.server)
-    desk.asks(own, desk.proof(code, own))
-    assert isinstance(desk.answer(own), Paired)
-    desk.turn()
-    assert not desk.tokens.revoked(own.fingerprint)
+def test_a_revoked_key_that_pairs_anew_may_join_though_the_list_looks_the_same(rig: PairingRig) -> None:
+    own = KeyPair.generate()
+    rig.home.clients.allow_key("ann", own.public)
+    rig.turn()
+    rig.revocation.revoke(own.fingerprint, rig.now_ns)
+    turns(rig.turn, lambda: not rig.keyring.pending_revocations)
+    code, _ = rig.home.join_codes.create(rig.server)
+    rig.asks(own, rig.proof(code, own))
+    assert isinstance(rig.answer(own), Paired)
+    rig.turn()
+    assert not rig.tokens.is_revoked(own.fingerprint)
 
 
-def test_who_has_no_attempts_left_takes_nothing_from_others(desk: Desk) -> None:
-    eve, ann = KeyPair.new(), KeyPair.new()
+def test_who_has_no_attempts_left_takes_nothing_from_others(rig: PairingRig) -> None:
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(2):
-        desk.home.codes.make(desk.server)
+        rig.home.join_codes.create(rig.server)
         for _ in range(5):
-            before = len(desk.answers(eve))
-            desk.asks(eve)
-            turns(desk.turn, lambda before=before: len(desk.answers(eve)) > before)
-    assert [m.message for m in desk.answers(eve)] == ["this join code is wrong, used or expired"] * 10
-    code, _ = desk.home.codes.make(desk.server)
+            before = len(rig.answers(eve))
+            rig.asks(eve)
+            turns(rig.turn, lambda before=before: len(rig.answers(eve)) > before)
+    assert [m.message for m in rig.answers(eve)] == ["this join code is wrong, used or expired"] * 10
+    code, _ = rig.home.join_codes.create(rig.server)
     for _ in range(200):
-        desk.asks(eve)
-    assert desk.drops.by_reason["pair_shut_out"] == 200
-    assert len(desk.answers(eve)) < 30, "and few are answered"
-    desk.asks(ann, desk.proof(code, ann), descriptor=2)
-    assert isinstance(desk.answer(ann), Paired)
+        rig.asks(eve)
+    assert rig.drops.by_reason["pair_shut_out"] == 200
+    assert len(rig.answers(eve)) < 30, "and few are answered"
+    rig.asks(ann, rig.proof(code, ann), descriptor=2)
+    assert isinstance(rig.answer(ann), Paired)
 
 
-def test_one_address_cannot_use_up_what_all_may_ask(desk: Desk) -> None:
+def test_one_address_cannot_use_up_what_all_may_ask(rig: PairingRig) -> None:
     """Not even while there is no code that it could be wrong about."""
-    eve, ann = KeyPair.new(), KeyPair.new()
+    eve, ann = KeyPair.generate(), KeyPair.generate()
     for _ in range(200):
-        desk.asks(eve)
-    desk.asks(ann, descriptor=2)
-    assert desk.answer(ann).message == "no join code can be used now"
-    assert desk.drops.by_reason["pair_rate"] >= 180
+        rig.asks(eve)
+    rig.asks(ann, descriptor=2)
+    assert rig.answer(ann).message == "no join code can be used now"
+    assert rig.drops.by_reason["pair_rate"] >= 180
 
 
-def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    code, _ = desk.home.codes.make(desk.server)
-    first, *others = [KeyPair.new() for _ in range(MAX_PENDING + 3)]
-    desk.asks(first, desk.proof(code, first), descriptor=0)
+def test_attempts_that_wait_are_few_and_do_not_wait_for_ever(rig: PairingRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, _ = rig.home.join_codes.create(rig.server)
+    first, *others = [KeyPair.generate() for _ in range(MAX_PENDING + 3)]
+    rig.asks(first, rig.proof(code, first), descriptor=0)
     with slow_disk(monkeypatch) as disk:
-        turns(desk.turn, disk.waits.is_set)
-        since_ns = desk.now_ns
+        turns(rig.turn, disk.waits.is_set)
+        since_ns = rig.now_ns
         for n, own in enumerate(others, 1):
-            desk.now_ns = since_ns + max(0, n - BURST) * SECOND // 10  # as fast as all together may ask
-            desk.asks(own, descriptor=n)
-        assert desk.now_ns - since_ns < PATIENCE_NS
+            rig.now_ns = since_ns + max(0, n - BURST) * SECOND // 10  # as fast as all together may ask
+            rig.asks(own, descriptor=n)
+        assert rig.now_ns - since_ns < PATIENCE_NS
         *waiting, late, last = others
-        assert [desk.answer(own).code for own in (late, last)] == [RefusalCode.RATE] * 2
-        desk.now_ns += PATIENCE_NS
-        desk.turn()
-        assert {desk.answer(own).message for own in waiting} == {"the list of keys is busy"}
-        assert {desk.answer(own).code for own in waiting} == {RefusalCode.RATE}, "nothing was tried: ask again"
-    assert isinstance(desk.answer(first), Paired)
+        assert [rig.answer(own).code for own in (late, last)] == [RefusalCode.RATE] * 2
+        rig.now_ns += PATIENCE_NS
+        rig.turn()
+        assert {rig.answer(own).message for own in waiting} == {"the list of keys is busy"}
+        assert {rig.answer(own).code for own in waiting} == {RefusalCode.RATE}, "nothing was tried: ask again"
+    assert isinstance(rig.answer(first), Paired)
 
 
 def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """No descriptor is left for a while, and the file does not change meanwhile."""
-    desk, now_s, tries = Desk(tmp_path / "home"), 1000.0, 0
-    desk.home.codes.make(desk.server)
+    rig, now_s, tries = PairingRig(tmp_path / "home"), 1000.0, 0
+    rig.home.join_codes.create(rig.server)
     with monkeypatch.context() as patch:
 
         def fails(_server: str) -> tuple[JoinCode, ...]:
@@ -349,13 +337,13 @@ def test_codes_that_could_not_be_read_are_read_again_and_complained_about_once(
             tries += 1
             raise KeysError("Too many open files")
 
-        patch.setattr(desk.home.codes, "of", fails)
-        patch.setattr(pairing_desk.time, "monotonic", lambda: now_s)
+        patch.setattr(rig.home.join_codes, "list_open", fails)
+        patch.setattr(pairing_service.time, "monotonic", lambda: now_s)
         for _ in range(3):
-            assert not desk.desk.has_open_code
+            assert not rig.pairing.has_open_code
         now_s += RETRY_S
-        assert not desk.desk.has_open_code
+        assert not rig.pairing.has_open_code
     assert tries == 2
-    assert capsys.readouterr().err.count("Too many open files") == 1
-    monkeypatch.setattr(pairing_desk.time, "monotonic", lambda: now_s + RETRY_S)
-    assert desk.desk.has_open_code
+    assert caplog.text.count("Too many open files") == 1
+    monkeypatch.setattr(pairing_service.time, "monotonic", lambda: now_s + RETRY_S)
+    assert rig.pairing.has_open_code

@@ -62,7 +62,7 @@ def test_open_networks_are_encrypted_with_a_key_that_is_made_on_first_use(tmp_pa
         process = FrontProcess(config, scene())
         marks.append(process.start().key_fingerprint)
         process.close()
-    assert marks[0] == marks[1] == KeyHome(home).server_key().fingerprint
+    assert marks[0] == marks[1] == KeyHome(home).load_server_key().fingerprint
     assert home.stat().st_mode & 0o777 == 0o700
     assert (home / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert KeyHome(home).sessions.read() == []
@@ -70,7 +70,7 @@ def test_open_networks_are_encrypted_with_a_key_that_is_made_on_first_use(tmp_pa
 
 def test_a_damaged_list_of_keys_is_one_line_and_stays_as_it_is(tmp_path: Path) -> None:
     home = tmp_path / "home"
-    KeyHome(home).server_key()
+    KeyHome(home).load_server_key()
     damaged = home / "clients.json"
     damaged.write_text("[{")
     damaged.chmod(0o600)
@@ -95,7 +95,7 @@ def test_an_address_of_another_machine_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("secret_file", "folder", "text"),
     [
-        ("server.key_secret", "missing", "no folder with the public keys"),
+        ("server.key_secret", "missing", "is not a folder"),
         ("nothing", ".", "cannot be used"),
         ("server.key", ".", "holds no secret key"),
     ],

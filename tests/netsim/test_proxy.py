@@ -22,12 +22,12 @@ from iris_session.netsim.profiles import (
     PROFILES,
     UP,
     Direction,
-    Phase,
+    LinkConditions,
     Profile,
     ProfileError,
-    Weather,
-    latency_profile,
+    ProfilePhase,
     load_profile,
+    make_latency_profile,
 )
 
 SECOND = 1_000_000_000
@@ -39,11 +39,11 @@ DEADLINE_S = 20.0
 
 
 def _series(seed: int, profile: str = "busy-wifi", direction: str = DOWN) -> list[tuple[int, bool]]:
-    weather = Weather(load_profile(profile), seed)
+    weather = LinkConditions(load_profile(profile), seed)
     out = []
     for t in range(0, 60 * SECOND, 10 * MS):
-        weather.move_on(t)
-        out.append((weather.delay_ns(direction, t), weather.stalled(direction, t)))
+        weather.advance(t)
+        out.append((weather.compute_delay_ns(direction, t), weather.is_stalled(direction, t)))
     return out
 
 
@@ -51,10 +51,10 @@ def test_weather_is_a_function_of_seed_and_time() -> None:
     assert _series(1) == _series(1)
     assert _series(1) != _series(2)
     assert _series(1) != _series(1, direction=UP)
-    weather, sparse = (Weather(PROFILES["busy-wifi"], 1) for _ in range(2))
-    dense = {t: (weather.delay_ns(UP, t), weather.stalled(UP, t)) for t in range(0, 20 * SECOND, 5 * MS)}
+    weather, sparse = (LinkConditions(PROFILES["busy-wifi"], 1) for _ in range(2))
+    dense = {t: (weather.compute_delay_ns(UP, t), weather.is_stalled(UP, t)) for t in range(0, 20 * SECOND, 5 * MS)}
     for t in range(0, 20 * SECOND, 500 * MS):  # asked less often, it is the same
-        assert dense[t] == (sparse.delay_ns(UP, t), sparse.stalled(UP, t))
+        assert dense[t] == (sparse.compute_delay_ns(UP, t), sparse.is_stalled(UP, t))
 
 
 def test_profiles_are_what_their_names_say() -> None:
@@ -73,21 +73,21 @@ def test_profiles_are_what_their_names_say() -> None:
 def test_phases_follow_each_other_and_repeat() -> None:
     profile = Profile(
         phases=(
-            Phase(seconds=1.0, delay_ms=1.0),
-            Phase(seconds=2.0, delay_ms=5.0, at_start="cut", up=Direction(delay_ms=9.0, stalled=True)),
+            ProfilePhase(seconds=1.0, delay_ms=1.0),
+            ProfilePhase(seconds=2.0, delay_ms=5.0, at_start="cut", up=Direction(delay_ms=9.0, stalled=True)),
         ),
         repeat=True,
     )
-    weather = Weather(profile)
+    weather = LinkConditions(profile)
     seen: list[tuple[int, str]] = []
     for t in range(0, 7 * SECOND, SECOND // 2):
-        weather.move_on(t, lambda how, t=t: seen.append((t, how)))  # type: ignore[misc]
+        weather.advance(t, lambda how, t=t: seen.append((t, how)))  # type: ignore[misc]
         late = t % (3 * SECOND) >= SECOND
-        assert weather.delay_ns(DOWN, t) == (5 if late else 1) * MS
-        assert weather.delay_ns(UP, t) == (9 if late else 1) * MS
-        assert weather.stalled(UP, t) is late
-        assert not weather.stalled(DOWN, t)
-        assert weather.next_change_ns(t) == t - t % (3 * SECOND) + (3 * SECOND if late else SECOND)
+        assert weather.compute_delay_ns(DOWN, t) == (5 if late else 1) * MS
+        assert weather.compute_delay_ns(UP, t) == (9 if late else 1) * MS
+        assert weather.is_stalled(UP, t) is late
+        assert not weather.is_stalled(DOWN, t)
+        assert weather.find_next_change_ns(t) == t - t % (3 * SECOND) + (3 * SECOND if late else SECOND)
     assert seen == [(SECOND, "cut"), (4 * SECOND, "cut")]
 
 
@@ -98,11 +98,11 @@ def test_profiles_from_files(tmp_path: Path) -> None:
         "[[phases]]\nseconds = 2\nstalled = true\n"
     )  # fmt: skip
     profile = load_profile(str(toml))
-    assert profile.phases[0].direction(UP) == Direction(delay_ms=9.0)
-    assert profile.phases[0].direction(DOWN).jitter_ms == 2.0
+    assert profile.phases[0].get_direction(UP) == Direction(delay_ms=9.0)
+    assert profile.phases[0].get_direction(DOWN).jitter_ms == 2.0
     file = tmp_path / "lab.json"
     file.write_text(json.dumps({"phases": [{"delay_ms": 30}], "window_kib": 1024}))
-    assert load_profile(str(file)) == latency_profile(30.0) == load_profile("30ms")
+    assert load_profile(str(file)) == make_latency_profile(30.0) == load_profile("30ms")
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_bytes_come_complete_in_order_and_not_early(echo: Echo, tmp_path: Path) 
             even.sendall(b"ping")
             assert _receive(even, 4) == b"ping"
             assert time.monotonic() - begin >= 0.060  # both ways
-        stats = {link["link"]: link for link in proxy.do("stats")["links"]}
+        stats = {link["link"]: link for link in proxy.execute("stats")["links"]}
         assert stats["127.0.0.2"]["bytes_up"] == stats["127.0.0.2"]["bytes_down"] == len(payload)
         assert stats["127.0.0.3"]["bytes_up"] == 20
         wild.shutdown(socket.SHUT_WR)
@@ -241,18 +241,18 @@ def test_stall_holds_the_sender_back_and_loses_nothing(echo: Echo) -> None:
     ):
         connection.sendall(b"before")
         assert _receive(connection, 6) == b"before"
-        proxy.do("stall")
+        proxy.execute("stall")
         connection.setblocking(False)
         sent = 0
         with contextlib.suppress(BlockingIOError):
             while True:
                 sent += connection.send(b"z" * 65536)
-        held = proxy.do("stats @127.0.0.2")["links"][0]["held_bytes"]
+        held = proxy.execute("stats @127.0.0.2")["links"][0]["held_bytes"]
         assert 0 < held <= PROFILES["none"].window_kib * 1024
         assert sent < 32 * 2**20, "a stalled link must not swallow everything"
         with pytest.raises(BlockingIOError):
             connection.recv(1)
-        proxy.do("resume")
+        proxy.execute("resume")
         connection.settimeout(DEADLINE_S)
         assert _receive(connection, sent) == b"z" * sent
 
@@ -284,7 +284,7 @@ def test_cut_and_reset(echo: Echo, command: str, end: str) -> None:
             for connection in (hit, spared):
                 connection.sendall(b"x")
                 _receive(connection, 1)
-            proxy.do(f"{command} @127.0.0.2")
+            proxy.execute(f"{command} @127.0.0.2")
             if command == "reset":
                 with pytest.raises(ConnectionResetError):
                     hit.recv(1)
@@ -305,7 +305,7 @@ def test_roaming_leaves_the_server_in_the_dark(echo: Echo) -> None:
     ):
         connection.sendall(b"x")
         _receive(connection, 1)
-        proxy.do("roam 127.0.0.9")
+        proxy.execute("roam 127.0.0.9")
         with pytest.raises(ConnectionResetError):
             connection.recv(1)
         with _connect("127.0.0.2", echo.port) as again:
@@ -368,12 +368,12 @@ def test_datagrams_are_lost_doubled_and_overtake(tmp_path: Path) -> None:
 def test_commands_and_errors(echo: Echo, tmp_path: Path) -> None:
     with ImpairmentProcess({"127.0.0.2": "none"}, [echo.port]) as proxy:
         with pytest.raises(ImpairmentError, match="is no command: stall, resume"):
-            proxy.do("explode")
+            proxy.execute("explode")
         with pytest.raises(ImpairmentError, match=r"no link 127\.0\.0\.9: there are 127\.0\.0\.2"):
-            proxy.do("stall @127.0.0.9")
+            proxy.execute("stall @127.0.0.9")
         with pytest.raises(ImpairmentError, match="no profile"):
-            proxy.do("profile nice-wifi")
-        proxy.do(f"profile {_file(tmp_path, delay_ms=20.0)}")
+            proxy.execute("profile nice-wifi")
+        proxy.execute(f"profile {_file(tmp_path, delay_ms=20.0)}")
         with _connect("127.0.0.2", echo.port) as connection:
             begin = time.monotonic()
             connection.sendall(b"x")

@@ -104,7 +104,7 @@ def test_decision_survives_its_digest_bytes() -> None:
             steps.Command("right", "hold", "estop"),
         ),
         objects=(steps.ObjectCommand("board", 1, IDENTITY),),
-        outgoing=(steps.Outgoing(1, Feedback("left", "pose", rejected={"seq": 1})),),
+        outgoing=(steps.OutgoingMessage(1, Feedback("left", "pose", rejected={"seq": 1})),),
         admitted=(steps.Admitted(1, "p1", "operator", False),),
         dropped=(steps.Dropped(2, "bye"),),
         events=(Event(1, 2, 3, Notice("info", "hello")),),

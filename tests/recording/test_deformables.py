@@ -17,7 +17,7 @@ from iris_session.recording.deformables import DrawnDeformable
 from iris_session.recording.messages import Batch, SceneAssets, SceneModel, VertexFrame
 from iris_session.recording.writer import MAX_PENDING_VERTICES, RrdWriter
 from iris_session.scene import AssetDecodeError, AssetStore, decode_arrays
-from iris_session.scene.mujoco_deformables import flex_mesh
+from iris_session.scene.mujoco_assets import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import column, read

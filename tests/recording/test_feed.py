@@ -12,7 +12,7 @@ import zmq
 
 from iris_session.protocol.common import Denial, Pose
 from iris_session.protocol.server_messages import BodyInfo, PresenceItem, Reply
-from iris_session.protocol.steps import Decision, Outgoing
+from iris_session.protocol.steps import Decision, OutgoingMessage
 from iris_session.recording import Keyframe, RecorderFeed, make_row
 from iris_session.recording.feed import BATCH_ITEMS, BATCH_ROWS, VERTEX_FRAMES
 from iris_session.recording.journal import check_keyframe
@@ -225,7 +225,7 @@ def test_states_events_and_denials_travel_with_the_rows(feed: RecorderFeed, play
     played[0].take(1)
     head = PresenceItem("p1", "head", Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)), 5)
     denial = Denial("held", "left is held", "ask", "left", "p2", "Ada")
-    replies = (Outgoing(4, Reply(1, False, denial)), Outgoing(5, Reply(2, True)))
+    replies = (OutgoingMessage(4, Reply(1, False, denial)), OutgoingMessage(5, Reply(2, True)))
     feed.add_decision(3, 70, Decision(commands=(), outgoing=replies, presence=(head,)))
     feed.add_state(3, 9, 0.1, 70, np.arange(21.0).reshape(3, 7))
     feed.add_metric("late_ms", 2.5)

@@ -23,7 +23,7 @@ from iris_session.recording.feed import BATCH_NS
 from iris_session.recording.paths import part_path
 from iris_session.recording.process import DRAIN_S, FLUSH_S
 from iris_session.scene import AssetStore, decode_arrays
-from iris_session.scene.mujoco_deformables import flex_mesh
+from iris_session.scene.mujoco_assets import flex_mesh
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.streams.deformable import DeformableEncoder
 from tests.recording.support import (

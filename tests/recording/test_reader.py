@@ -230,7 +230,7 @@ def test_what_does_not_decode_is_one_line_that_names_the_place(tmp_path: Path) -
     writer.flush()
     times = [sequence_index(paths.STEP, [59]), duration_index(paths.SESSION_TIME, [0])]
     for entity, column in PLACES.items():
-        writer._send(entity, times, [bytes_column(column, [b"\xc1 nothing"])])
+        writer._send_columns(entity, times, [bytes_column(column, [b"\xc1 nothing"])])
     writer.flush()
     writer._stream.close()
     report = verify(path, SmallCore)

@@ -18,7 +18,7 @@ from iris_session.recording import scene_geometry as scene
 from iris_session.recording.messages import SceneAssets
 from iris_session.recording.picture import build_components
 from iris_session.scene import AssetMissingError, AssetStore, EncodeOptions
-from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from tests.recording.support import XML, make_header
 from tests.scene.models import LOOKS, SHAPES, every_shape

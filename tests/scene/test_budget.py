@@ -9,11 +9,10 @@ import pytest
 
 from iris_session.protocol.scene import Deformable, SceneSpec
 from iris_session.scene import AssetStore
-from iris_session.scene.budget import Budget, choose_levels
-from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.budget import Budget, choose_levels, with_totals
+from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import report, tree
-from iris_session.scene.totals import with_totals
 from tests.scene.models import many_objects
 
 

@@ -11,10 +11,10 @@ import pytest
 import trimesh
 
 from iris_session.scene import AssetStore
-from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.elements import matrix_of
 from iris_session.scene.extent import box_extent, extent_of, length, unit_hint
 from iris_session.scene.mujoco_scene import parse_mujoco
-from iris_session.scene.parts import matrix_of
 from iris_session.scene.shapes import primitive
 
 TURN = (0.8, 0.1, -0.3, 0.5)

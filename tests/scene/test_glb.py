@@ -16,7 +16,7 @@ import trimesh
 
 from iris_session.protocol.scene import SceneSpec
 from iris_session.scene import AssetStore, SceneBuildError
-from iris_session.scene.compose import SceneBuilder
+from iris_session.scene.builder import SceneBuilder
 from iris_session.scene.glb import write_glb
 from iris_session.scene.mujoco_scene import parse_mujoco
 from iris_session.scene.report import not_in_glb

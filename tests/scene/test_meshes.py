@@ -20,8 +20,8 @@ from iris_session.scene import (
     encode_mesh_quantised,
 )
 from iris_session.scene.arrays import Stored
+from iris_session.scene.mesh_processing import simplified, smooth_mesh, sorted_rows
 from iris_session.scene.meshes import index_corners
-from iris_session.scene.simplify import simplified, smooth_mesh, sorted_rows
 
 
 def soup(seed: int, faces: int, *, uv: bool) -> MeshArrays:

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from iris_session.physics import World
 from iris_session.protocol.scene import SceneError, SceneSpec, asset_addresses, decode_scene, encode_scene
 from iris_session.scene import AssetStore, EncodeOptions, decode_arrays
+from iris_session.scene.elements import matrix_of
 from iris_session.scene.mujoco_scene import Parsed, parse_mujoco
-from iris_session.scene.parts import matrix_of
 from tests.scene.models import every_shape, flexes
 
 

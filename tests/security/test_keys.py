@@ -21,11 +21,11 @@ from iris_session.security import (
     KeyPair,
     KeysBusyError,
     KeysError,
-    SessionNote,
-    fingerprint,
+    RegisteredSession,
+    compute_fingerprint,
+    decode_key,
     load_public,
     load_secret,
-    raw_key,
 )
 
 
@@ -58,13 +58,13 @@ def test_the_home_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch,
 def test_keys_are_made_once_and_are_for_their_owner_only(home: KeyHome) -> None:
     old = os.umask(0)
     try:
-        server, own = home.server_key(), home.identity()
-        home.clients.allow("ann", own.public)
-        home.codes.make(server)
-        home.servers.pin("lab:7721", "lab", server.public)
+        server, own = home.load_server_key(), home.load_identity()
+        home.clients.allow_key("ann", own.public)
+        home.join_codes.create(server)
+        home.known_servers.pin("lab:7721", "lab", server.public)
     finally:
         os.umask(old)
-    assert (home.server_key(), home.identity()) == (server, own)
+    assert (home.load_server_key(), home.load_identity()) == (server, own)
     assert server != own
     assert mode(home.path) == 0o700
     assert {p.name: oct(mode(p)) for p in home.path.iterdir() if mode(p) != 0o600} == {}
@@ -73,27 +73,27 @@ def test_keys_are_made_once_and_are_for_their_owner_only(home: KeyHome) -> None:
 
 
 def test_what_others_may_read_is_refused_with_the_remedy(home: KeyHome) -> None:
-    home.server_key()
+    home.load_server_key()
     (home.path / "server.key_secret").chmod(0o644)
     with pytest.raises(KeysError, match=r"can be used by other users of this machine: chmod 600 .*server\.key_secret"):
-        home.server_key()
+        home.load_server_key()
     (home.path / "server.key_secret").chmod(0o600)
     home.path.chmod(0o755)
     with pytest.raises(KeysError, match="chmod 700"):
-        home.clients.allow("ann", home.identity().public)
+        home.clients.allow_key("ann", home.load_identity().public)
 
 
 @pytest.mark.parametrize("name", ["clients.json", "join_codes.json", "known_servers.json", "server.key_secret"])
 def test_a_damaged_file_is_one_line_and_never_replaced(home: KeyHome, name: str) -> None:
-    own = home.identity()
+    own = home.load_identity()
     path = home.path / name
     path.write_text("[{half")
     path.chmod(0o600)
     use = {
-        "clients.json": lambda: home.clients.allow("ann", own.public),
-        "join_codes.json": lambda: home.codes.make(own),
-        "known_servers.json": lambda: home.servers.pin("a:1", "a", own.public),
-        "server.key_secret": home.server_key,
+        "clients.json": lambda: home.clients.allow_key("ann", own.public),
+        "join_codes.json": lambda: home.join_codes.create(own),
+        "known_servers.json": lambda: home.known_servers.pin("a:1", "a", own.public),
+        "server.key_secret": home.load_server_key,
     }[name]
     with pytest.raises(KeysError) as error:
         use()
@@ -103,60 +103,62 @@ def test_a_damaged_file_is_one_line_and_never_replaced(home: KeyHome, name: str)
 
 
 def test_a_name_belongs_to_one_key(home: KeyHome) -> None:
-    ann, eve = KeyPair.new(), KeyPair.new()
-    home.clients.allow("ann", ann.public, ("operator",))
+    ann, eve = KeyPair.generate(), KeyPair.generate()
+    home.clients.allow_key("ann", ann.public, ("operator",))
     with pytest.raises(KeysError, match="'ann' is taken by another key"):
-        home.clients.allow("ann", eve.public)
+        home.clients.allow_key("ann", eve.public)
     first = home.clients.read()[ann.fingerprint]
-    home.clients.allow("anna", ann.public, ("observer", "observer"))
+    home.clients.allow_key("anna", ann.public, ("observer", "observer"))
     assert home.clients.read() == {
         ann.fingerprint: msgspec.structs.replace(first, name="anna", roles=("observer",)),
     }
     with pytest.raises(KeysError, match="unknown role 'king'"):
-        home.clients.allow("eve", eve.public, ("king",))
+        home.clients.allow_key("eve", eve.public, ("king",))
     for key in ("short", "x" * 40 + "y", "\u00e9" * 40, "#" * 40):
         with pytest.raises(KeysError, match="not a CURVE key"):
-            home.clients.allow("eve", key)
+            home.clients.allow_key("eve", key)
 
 
 def test_revoking_by_name_or_fingerprint(home: KeyHome) -> None:
-    ann, bob = KeyPair.new(), KeyPair.new()
-    home.clients.allow("ann", ann.public)
-    home.clients.allow("bob", bob.public)
-    home.clients.seen({ann.fingerprint: "2026-01-01T00:00:00+00:00", "nobody": "x"})
-    gone = home.clients.revoke("ann")
+    ann, bob = KeyPair.generate(), KeyPair.generate()
+    home.clients.allow_key("ann", ann.public)
+    home.clients.allow_key("bob", bob.public)
+    home.clients.record_last_seen({ann.fingerprint: "2026-01-01T00:00:00+00:00", "nobody": "x"})
+    gone = home.clients.revoke_key("ann")
     assert gone is not None
     assert gone.last_seen == "2026-01-01T00:00:00+00:00"
-    assert home.clients.revoke("ann") is None
-    assert home.clients.revoke(bob.fingerprint) is not None
+    assert home.clients.revoke_key("ann") is None
+    assert home.clients.revoke_key(bob.fingerprint) is not None
     assert home.clients.read() == {}
 
 
 def test_a_name_that_looks_like_a_fingerprint_protects_nobody(home: KeyHome) -> None:
-    eve, bob = KeyPair.new(), KeyPair.new()
-    home.clients.allow(bob.fingerprint, eve.public)
-    home.clients.allow("bob", bob.public)
-    gone = home.clients.revoke(bob.fingerprint)
+    eve, bob = KeyPair.generate(), KeyPair.generate()
+    home.clients.allow_key(bob.fingerprint, eve.public)
+    home.clients.allow_key("bob", bob.public)
+    gone = home.clients.revoke_key(bob.fingerprint)
     assert gone is not None
     assert gone.name == "bob"
     assert list(home.clients.read()) == [eve.fingerprint]
 
 
 def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> None:
-    server, ann, eve = home.server_key(), KeyPair.new(), KeyPair.new()
-    code, made = home.codes.make(server, roles=("observer",))
+    server, ann, eve = home.load_server_key(), KeyPair.generate(), KeyPair.generate()
+    code, made = home.join_codes.create(server, roles=("observer",))
     text = (home.path / "join_codes.json").read_text()
     assert code not in text
     assert code.replace("-", "") not in text
-    assert len(home.codes.of(server.fingerprint)) == 1
-    assert home.codes.of(eve.fingerprint) == ()
-    good = home.codes.attempt(server.raw_public, ann.public, proof_of(code.lower(), server, ann), "ann", home.clients)
+    assert len(home.join_codes.list_open(server.fingerprint)) == 1
+    assert home.join_codes.list_open(eve.fingerprint) == ()
+    good = home.join_codes.redeem(
+        server.raw_public, ann.public, proof_of(code.lower(), server, ann), "ann", home.clients
+    )
     assert good.entry is not None
     assert (good.entry.name, good.entry.roles, good.entry.key) == ("ann", ("observer",), ann.public)
     assert good.secret == pairing.stretch(code, server.raw_public)
-    again = home.codes.attempt(server.raw_public, eve.public, proof_of(code, server, eve), "eve", home.clients)
+    again = home.join_codes.redeem(server.raw_public, eve.public, proof_of(code, server, eve), "eve", home.clients)
     assert again.entry is None
-    kept = home.codes.find(made.id)
+    kept = home.join_codes.find_code(made.id)
     assert kept is not None
     assert (kept.secret, kept.paired) == (b"", good.entry)
     assert list(home.clients.read()) == [ann.fingerprint]
@@ -164,39 +166,39 @@ def test_a_code_is_good_for_one_key_and_is_nowhere_to_be_read(home: KeyHome) -> 
 
 def test_a_proof_of_one_key_is_no_good_for_another(home: KeyHome) -> None:
     """Somebody in the middle, with keys of their own, gains nothing from a proof."""
-    server, middle, ann, eve = home.server_key(), KeyPair.new(), KeyPair.new(), KeyPair.new()
-    code, _ = home.codes.make(server)
+    server, middle, ann, eve = home.load_server_key(), KeyPair.generate(), KeyPair.generate(), KeyPair.generate()
+    code, _ = home.join_codes.create(server)
     for stolen in (proof_of(code, server, ann), proof_of(code, middle, eve)):
-        attempt = home.codes.attempt(server.raw_public, eve.public, stolen, "eve", home.clients)
+        attempt = home.join_codes.redeem(server.raw_public, eve.public, stolen, "eve", home.clients)
         assert attempt.entry is None
     assert home.clients.read() == {}
 
 
 def test_a_code_is_used_up_before_anybody_is_let_in(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
     """A power cut between the two writes must not leave a code that lets a second key in."""
-    server, ann = home.server_key(), KeyPair.new()
-    code, made = home.codes.make(server)
+    server, ann = home.load_server_key(), KeyPair.generate()
+    code, made = home.join_codes.create(server)
     proof = proof_of(code, server, ann)
 
     def power_cut(_entries: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(home.clients, "replace", power_cut)
+        patch.setattr(home.clients, "replace_all", power_cut)
         with pytest.raises(KeyboardInterrupt):
-            home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients)
+            home.join_codes.redeem(server.raw_public, ann.public, proof, "ann", home.clients)
     assert home.clients.read() == {}
-    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
+    assert home.join_codes.redeem(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
 
     def full_disk(_entries: object) -> None:
         raise KeysError("clients.json cannot be written: No space left on device")
 
-    code, made = home.codes.make(server)
+    code, made = home.join_codes.create(server)
     with monkeypatch.context() as patch:
-        patch.setattr(home.clients, "replace", full_disk)
+        patch.setattr(home.clients, "replace_all", full_disk)
         with pytest.raises(KeysError, match="No space left"):
-            home.codes.attempt(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
-    kept = home.codes.find(made.id)
+            home.join_codes.redeem(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+    kept = home.join_codes.find_code(made.id)
     assert kept is not None
     assert (kept.secret, kept.paired) == (b"", None), "nobody is said to have paired"
 
@@ -204,15 +206,17 @@ def test_a_code_is_used_up_before_anybody_is_let_in(home: KeyHome, monkeypatch: 
 def test_two_codes_and_two_devices_at_once(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two people run `pair` together, and three devices use their codes: everybody but the third gets in, as meant."""
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    server = home.server_key()
+    server = home.load_server_key()
     with ThreadPoolExecutor(3) as pool:
-        (code, _), (other, _) = pool.map(lambda role: home.codes.make(server, roles=(role,)), ("operator", "observer"))
+        (code, _), (other, _) = pool.map(
+            lambda role: home.join_codes.create(server, roles=(role,)), ("operator", "observer")
+        )
         people = {"ann": code, "bob": other, "eve": code}
 
         def pairs(name: str) -> AllowedKey | None:
-            own = KeyPair.new()
+            own = KeyPair.generate()
             proof = proof_of(people[name], server, own)
-            return home.codes.attempt(server.raw_public, own.public, proof, name, home.clients).entry
+            return home.join_codes.redeem(server.raw_public, own.public, proof, name, home.clients).entry
 
         entries = dict(zip(people, pool.map(pairs, people), strict=True))
     assert {entry.name: entry.roles for entry in entries.values() if entry} in (
@@ -223,27 +227,28 @@ def test_two_codes_and_two_devices_at_once(home: KeyHome, monkeypatch: pytest.Mo
 
 
 def test_five_wrong_attempts_make_every_open_code_void(home: KeyHome) -> None:
-    server, ann = home.server_key(), KeyPair.new()
-    codes = [home.codes.make(server)[0] for _ in range(2)]
+    server, ann = home.load_server_key(), KeyPair.generate()
+    codes = [home.join_codes.create(server)[0] for _ in range(2)]
     exhausted = [
-        home.codes.attempt(server.raw_public, ann.public, b"x" * 32, "ann", home.clients).exhausted for _ in range(5)
+        home.join_codes.redeem(server.raw_public, ann.public, b"x" * 32, "ann", home.clients).exhausted
+        for _ in range(5)
     ]
     assert exhausted == [0, 0, 0, 0, 2]
     for code in codes:
-        late = home.codes.attempt(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+        late = home.join_codes.redeem(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
         assert late.entry is None
-    assert [one.secret for one in home.codes.read()] == [b"", b""]
+    assert [one.secret for one in home.join_codes.read()] == [b"", b""]
 
 
 def test_an_expired_code_lets_nobody_in(home: KeyHome) -> None:
-    server, ann = home.server_key(), KeyPair.new()
-    code, made = home.codes.make(server, minutes=0.0005)
+    server, ann = home.load_server_key(), KeyPair.generate()
+    code, made = home.join_codes.create(server, minutes=0.0005)
     while time.time() < made.expires:
         time.sleep(0.005)
-    late = home.codes.attempt(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+    late = home.join_codes.redeem(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
     assert (late.entry, late.open_codes) == (None, 0)
-    home.codes.make(server)
-    kept = home.codes.find(made.id)
+    home.join_codes.create(server)
+    kept = home.join_codes.find_code(made.id)
     assert kept is not None
     assert kept.secret == b"", "what has expired keeps no secret"
 
@@ -251,16 +256,16 @@ def test_an_expired_code_lets_nobody_in(home: KeyHome) -> None:
 def test_a_clock_that_is_put_back_does_not_bring_a_code_back(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
     """A laptop without a network sets its clock when it gets one: hours back, after the code was shown."""
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    server, ann = home.server_key(), KeyPair.new()
+    server, ann = home.load_server_key(), KeyPair.generate()
     made_s = time.time()
-    code, made = home.codes.make(server, minutes=10.0)
+    code, made = home.join_codes.create(server, minutes=10.0)
     proof = proof_of(code, server, ann)
     for after_s, is_open in ((-7200.0, False), (-30.0, True), (0.0, True), (599.0, True), (601.0, False)):
-        assert made.open(made_s + after_s) is is_open, after_s
+        assert made.is_open(made_s + after_s) is is_open, after_s
     monkeypatch.setattr("iris_session.security.join_codes.time.time", lambda: made_s - 7200.0)
-    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
+    assert home.join_codes.redeem(server.raw_public, ann.public, proof, "ann", home.clients).entry is None
     monkeypatch.setattr("iris_session.security.join_codes.time.time", lambda: made_s + 60.0)
-    assert home.codes.attempt(server.raw_public, ann.public, proof, "ann", home.clients).entry is not None
+    assert home.join_codes.redeem(server.raw_public, ann.public, proof, "ann", home.clients).entry is not None
 
 
 def test_what_is_replaced_stays_replaced_after_a_power_cut(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,48 +278,48 @@ def test_what_is_replaced_stays_replaced_after_a_power_cut(home: KeyHome, monkey
         plain(descriptor)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    home.clients.allow("ann", KeyPair.new().public)
+    home.clients.allow_key("ann", KeyPair.generate().public)
     assert synced == [False, True]
 
 
 def test_a_cancelled_code_is_void(home: KeyHome) -> None:
-    server, ann = home.server_key(), KeyPair.new()
-    code, made = home.codes.make(server)
-    home.codes.cancel(made.id)
-    late = home.codes.attempt(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
-    assert (late.entry, home.codes.find(made.id)) == (None, None)
+    server, ann = home.load_server_key(), KeyPair.generate()
+    code, made = home.join_codes.create(server)
+    home.join_codes.cancel(made.id)
+    late = home.join_codes.redeem(server.raw_public, ann.public, proof_of(code, server, ann), "ann", home.clients)
+    assert (late.entry, home.join_codes.find_code(made.id)) == (None, None)
 
 
 def test_codes_are_bounded(home: KeyHome, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pairing, "ITERATIONS", 1)
-    server = home.server_key()
+    server = home.load_server_key()
     for _ in range(32):
-        home.codes.make(server)
-    with pytest.raises(KeysError, match="32 join codes can be used now"):
-        home.codes.make(server)
+        home.join_codes.create(server)
+    with pytest.raises(KeysError, match="32 join codes"):
+        home.join_codes.create(server)
 
 
 def test_a_server_that_changes_its_key_is_not_taken_silently(home: KeyHome) -> None:
-    old, new = KeyPair.new(), KeyPair.new()
-    home.servers.pin("lab:7721", "lab", old.public)
-    home.servers.pin("lab:7721", "lab-2", old.public)
+    old, new = KeyPair.generate(), KeyPair.generate()
+    home.known_servers.pin("lab:7721", "lab", old.public)
+    home.known_servers.pin("lab:7721", "lab-2", old.public)
     with pytest.raises(KeysError, match=rf"another key \({new.fingerprint}\).*keys forget lab:7721"):
-        home.servers.pin("lab:7721", "lab", new.public)
-    known = home.servers.by_address("lab:7721")
+        home.known_servers.pin("lab:7721", "lab", new.public)
+    known = home.known_servers.find_by_address("lab:7721")
     assert known is not None
     assert (known.key, known.session) == (old.public, "lab-2")
-    assert home.servers.forget("lab:7721") == known
-    assert home.servers.forget("lab:7721") is None
-    home.servers.pin("lab:7721", "lab", new.public)
-    assert [one.key for one in home.servers.by_session("lab")] == [new.public]
+    assert home.known_servers.remove("lab:7721") == known
+    assert home.known_servers.remove("lab:7721") is None
+    home.known_servers.pin("lab:7721", "lab", new.public)
+    assert [one.key for one in home.known_servers.find_by_session("lab")] == [new.public]
 
 
 def test_processes_do_not_lose_each_others_changes(home: KeyHome) -> None:
     """Three at once, each with its own keys: every one of them is on the list in the end."""
     script = (
         "import sys\nfrom iris_session.security import KeyHome, KeyPair\nhome = KeyHome(sys.argv[1])\n"
-        "for i in range(10):\n    home.clients.allow(f'{sys.argv[2]}-{i}', KeyPair.new().public)\n"
-        "print(home.server_key().public)\n"
+        "for i in range(10):\n    home.clients.allow_key(f'{sys.argv[2]}-{i}', KeyPair.generate().public)\n"
+        "print(home.load_server_key().public)\n"
     )
     workers = [
         subprocess.Popen([sys.executable, "-c", script, str(home.path), str(i)], stdout=subprocess.PIPE, text=True)
@@ -327,18 +332,18 @@ def test_processes_do_not_lose_each_others_changes(home: KeyHome) -> None:
 
 
 def test_who_may_not_wait_is_told_so(home: KeyHome) -> None:
-    ann = KeyPair.new()
-    home.clients.allow("ann", ann.public)
-    with home.folder.locked(), pytest.raises(KeysBusyError):
-        home.clients.revoke("ann", patience_s=0.0)
-    assert home.clients.revoke("ann", patience_s=0.0) is not None
+    ann = KeyPair.generate()
+    home.clients.allow_key("ann", ann.public)
+    with home.folder.lock(), pytest.raises(KeysBusyError):
+        home.clients.revoke_key("ann", timeout_s=0.0)
+    assert home.clients.revoke_key("ann", timeout_s=0.0) is not None
 
 
 def test_notes_of_sessions_that_are_gone_are_passed_over(home: KeyHome) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    home.sessions.add(SessionNote("a", "old", gone.pid, ("10.0.0.1",), 7721, "key"))
-    home.sessions.add(SessionNote("b", "now", os.getpid(), ("10.0.0.1",), 7731, "key"))
+    home.sessions.add(RegisteredSession("a", "old", gone.pid, ("10.0.0.1",), 7721, "key"))
+    home.sessions.add(RegisteredSession("b", "now", os.getpid(), ("10.0.0.1",), 7731, "key"))
     assert [note.name for note in home.sessions.read()] == ["now"]
     home.sessions.remove("b", 1)
     assert len(home.sessions.read()) == 1, "another process has taken the session over"
@@ -351,7 +356,7 @@ def test_zeromq_certificates_are_read(tmp_path: Path) -> None:
     Path(secret).chmod(0o600)
     pair = load_secret(secret)
     assert load_public(public) == pair.public
-    assert pair.fingerprint == fingerprint(raw_key(pair.public))
+    assert pair.fingerprint == compute_fingerprint(decode_key(pair.public))
     with pytest.raises(KeysError, match="holds no secret key"):
         load_secret(public)
     with pytest.raises(KeysError, match="cannot be used"):

@@ -8,28 +8,28 @@ from iris_session.security.resume_tokens import ResumeTokens
 def test_a_token_stands_for_its_participant_and_key_until_retired() -> None:
     tokens = ResumeTokens(4)
     token = tokens.issue("key", "p1")
-    assert tokens.find(token, "key") == "p1"
-    assert tokens.find(token, "other key") is None
-    assert tokens.find(b"guess", "key") is None
-    tokens.retire(token)
-    assert tokens.find(token, "key") is None
+    assert tokens.find_participant(token, "key") == "p1"
+    assert tokens.find_participant(token, "other key") is None
+    assert tokens.find_participant(b"guess", "key") is None
+    tokens.use_up(token)
+    assert tokens.find_participant(token, "key") is None
 
 
 def test_the_oldest_token_is_forgotten_when_the_table_is_full() -> None:
     tokens = ResumeTokens(2)
     issued = [tokens.issue("key", f"p{i}") for i in range(3)]
-    assert [tokens.find(token, "key") for token in issued] == [None, "p1", "p2"]
+    assert [tokens.find_participant(token, "key") for token in issued] == [None, "p1", "p2"]
 
 
 def test_the_next_front_goes_on_with_tokens_and_numbers() -> None:
     tokens = ResumeTokens(4)
-    assert [tokens.new_connection(), tokens.new_connection()] == [1, 2]
+    assert [tokens.allocate_connection(), tokens.allocate_connection()] == [1, 2]
     token = tokens.issue("key", "p1")
-    blob = tokens.blob()
+    blob = tokens.encode()
     assert token not in blob
     successor = ResumeTokens(4, blob)
-    assert successor.find(token, "key") == "p1"
-    assert successor.new_connection() == 3
+    assert successor.find_participant(token, "key") == "p1"
+    assert successor.allocate_connection() == 3
 
 
 def test_with_a_gateways_key_go_the_tokens_of_those_behind_it_also_in_the_next_front() -> None:
@@ -37,10 +37,10 @@ def test_with_a_gateways_key_go_the_tokens_of_those_behind_it_also_in_the_next_f
     tokens.issue("gateway", "p1")
     tab = tokens.issue("key of a tab", "p2", behind="gateway")
     other = tokens.issue("key of a tab", "p3", behind="another gateway")
-    successor = ResumeTokens(8, tokens.blob())
-    assert successor.revoke("gateway") == ["p1", "p2"]
-    assert successor.find(tab, "key of a tab") is None
-    assert successor.find(other, "key of a tab") == "p3"
+    successor = ResumeTokens(8, tokens.encode())
+    assert successor.revoke_key("gateway") == ["p1", "p2"]
+    assert successor.find_participant(tab, "key of a tab") is None
+    assert successor.find_participant(other, "key of a tab") == "p3"
 
 
 def test_changed_tells_when_to_hand_back() -> None:
@@ -48,10 +48,10 @@ def test_changed_tells_when_to_hand_back() -> None:
     assert not tokens.changed
     token = tokens.issue("key", "p1")
     assert tokens.changed
-    tokens.blob()
-    tokens.retire(b"unknown")
+    tokens.encode()
+    tokens.use_up(b"unknown")
     assert not tokens.changed
-    tokens.retire(token)
+    tokens.use_up(token)
     assert tokens.changed
 
 
@@ -60,8 +60,8 @@ def test_who_comes_and_goes_pushes_out_nobody_who_is_here() -> None:
     ann = tokens.issue("ann", "p1")
     for i in range(10):
         tokens.issue("bob", f"b{i}")
-        tokens.left(f"b{i}")
-    assert tokens.find(ann, "ann") == "p1"
+        tokens.remove_participant(f"b{i}")
+    assert tokens.find_participant(ann, "ann") == "p1"
 
 
 def test_a_participant_keeps_the_token_it_came_with_and_the_newest() -> None:
@@ -69,5 +69,5 @@ def test_a_participant_keeps_the_token_it_came_with_and_the_newest() -> None:
     ann, first = tokens.issue("ann", "p1"), tokens.issue("bob", "p2")
     second = tokens.issue("bob", "p2", first)
     third = tokens.issue("bob", "p2", first)  # the welcome with the second was lost
-    assert [tokens.find(token, "bob") for token in (first, second, third)] == ["p2", None, "p2"]
-    assert tokens.find(ann, "ann") == "p1"
+    assert [tokens.find_participant(token, "bob") for token in (first, second, third)] == ["p2", None, "p2"]
+    assert tokens.find_participant(ann, "ann") == "p1"

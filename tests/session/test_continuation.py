@@ -44,7 +44,7 @@ from iris_session.recording import (
 from iris_session.recording.environment import read_boot_id
 from iris_session.recording.journal import CRASHED, seal_keyframe
 from iris_session.recording.messages import Batch
-from iris_session.security.resume_tokens import ResumeTokens, handback_above
+from iris_session.security.resume_tokens import ResumeTokens, encode_handback
 from iris_session.session import continuation
 from iris_session.session.config import SessionConfig
 from iris_session.session.continuation import MARGIN_NS, Continuation, begin
@@ -285,7 +285,7 @@ def test_what_cannot_be_another_than_it_was_is_refused(session: Path, change: di
 def test_it_listens_where_it_listened_unless_told_otherwise(session: Path) -> None:
     listening = Listening("0.0.0.0", control_port=4001, state_port=4002, curve=True, beacon_port=0)
     keeper = NoteKeeper(note_path(session))
-    keeper.offer(ResumeNote("s1", listening, handback_above(0)))
+    keeper.offer(ResumeNote("s1", listening, encode_handback(0)))
     keeper.close(5.0)
     past, config, _ = begin(SessionConfig(resume=session, control_port=5001), None, None, None, None)
     assert past is not None
@@ -361,22 +361,22 @@ def test_what_is_noted_for_a_resumed_session_is_what_it_was_given() -> None:
 
 def test_tokens_stay_good_and_connection_numbers_go_on(session: Path) -> None:
     tokens = ResumeTokens(8)
-    tokens.new_connection()
+    tokens.allocate_connection()
     token = tokens.issue("key", "p1")
     keeper = NoteKeeper(note_path(session))
-    keeper.offer(ResumeNote("s1", Listening(), tokens.blob()))
+    keeper.offer(ResumeNote("s1", Listening(), tokens.encode()))
     keeper.close(5.0)
     assert token not in note_path(session).read_bytes(), "hashes only"
     assert note_path(session).stat().st_mode & 0o777 == 0o600
     past = Continuation(session)
     after = ResumeTokens(8, past.handback)
-    assert after.find(token, "key") == "p1"
-    assert after.find(token, "another key") is None
-    assert after.new_connection() > ANN
+    assert after.find_participant(token, "key") == "p1"
+    assert after.find_participant(token, "another key") is None
+    assert after.allocate_connection() > ANN
 
 
 def test_without_a_note_numbers_begin_above_those_of_the_journal(session: Path) -> None:
-    assert ResumeTokens(8, Continuation(session).handback).new_connection() == ANN + 1
+    assert ResumeTokens(8, Continuation(session).handback).allocate_connection() == ANN + 1
 
 
 @pytest.mark.parametrize("fault", ["another session", "open to others", "damaged", "nothing"])
@@ -447,7 +447,7 @@ class Journal:
     def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None:
         self.batch.keyframes.append(seal_keyframe(keyframe, chain))
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,

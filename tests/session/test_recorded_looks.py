@@ -59,7 +59,7 @@ class Recorder:
 
     def add_keyframe(self, keyframe: Keyframe, chain: bytes) -> None: ...
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,

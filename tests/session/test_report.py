@@ -115,7 +115,7 @@ def test_alignments_anchors_and_comparisons_are_in_the_report(session: Session) 
     session.step(bob(TICK_NS))
     row = session.people()["bob"]
     session.step(host(session.now_ns, PlaceAlignment(0, row.id, IDENTITY)))
-    reports = session.stepper.core.authority.alignment_reports()
+    reports = session.stepper.core.authority.build_alignment_reports()
     (told,) = [r for r in session.stepper.ledger.participant_reports(session.now_ns, reports) if r.id == row.id]
     assert told.alignment_report is not None
     assert (told.alignment_report.version, told.alignment_report.running) == (1, True)

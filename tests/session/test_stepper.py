@@ -61,7 +61,7 @@ class Recorder:
         self.scenes: list[tuple[int, str]] = []  # rows before it, hash
         self.drawn: list[tuple[str, str]] = []
 
-    def scene(
+    def send_scene(
         self,
         model_hash: str,
         packed_model: bytes,
@@ -87,7 +87,7 @@ class Recorder:
         assert chain == (self.rows[-1].chain if self.rows else b"root")
         self.keyframes.append(keyframe)
 
-    def state(
+    def add_state(
         self,
         step: int,
         tick: int,

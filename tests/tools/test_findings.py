@@ -32,8 +32,8 @@ from iris_session.recording.messages import decode_header
 from iris_session.security import KeysError
 from iris_session.security.allow_list import AllowList
 from iris_session.security.curve import load_public
-from iris_session.security.files import PrivateFolder
-from iris_session.security.session_notes import SessionNotes
+from iris_session.security.private_folder import PrivateFolder
+from iris_session.security.session_registry import SessionRegistry
 from iris_session.streams.rigid import RigidDecoder
 
 MS = 1_000_000
@@ -73,7 +73,7 @@ def test_counts_of_a_row_that_do_not_fit_are_damage() -> None:
 @pytest.mark.parametrize("content", [b'[{"name": "\xff"}]', b"[" * 100_000, b'[{"pid": 1'])
 def test_damaged_files_of_keys_are_one_kind_of_error(tmp_path: Path, content: bytes) -> None:
     tmp_path.chmod(0o700)
-    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionNotes)):
+    for name, kind in (("clients.json", AllowList), ("sessions.json", SessionRegistry)):
         (tmp_path / name).touch(0o600)
         (tmp_path / name).write_bytes(content)
         with pytest.raises(KeysError):
@@ -86,7 +86,7 @@ def test_a_note_of_a_process_that_cannot_be(tmp_path: Path) -> None:
     file.touch(0o600)
     note = {"session_id": "s", "name": "lab", "pid": 2**40, "hosts": [], "control": 1, "server": ""}
     file.write_bytes(msgspec.json.encode([note]))
-    assert SessionNotes(PrivateFolder(tmp_path)).read() == []
+    assert SessionRegistry(PrivateFolder(tmp_path)).read() == []
 
 
 @pytest.mark.parametrize("line", [b"public-key", b"public-key = abc", b'public-key = "\xff\xff"', b"public-key ="])

@@ -7,10 +7,9 @@ dropped for that subscriber alone, and what somebody gets is decided here, not t
 
 from __future__ import annotations
 
-import sys
+import logging
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterable
 from typing import Any, Final
 
@@ -21,6 +20,8 @@ from iris_session.front.media.scheduler import MediaScheduler
 from iris_session.protocol.codec import decode_media_push
 from iris_session.protocol.errors import ProtocolError
 from iris_session.protocol.media import CLASSES, parse_topic
+
+log = logging.getLogger(__name__)
 
 #: While a connection is full it is tried again after so long; else somebody comes to wake us.
 RETRY_MS: Final = 4
@@ -107,8 +108,7 @@ class MediaProxy:
             self.scheduler.count_drop("media_fault")
         if repr(error) != self._reported_fault:
             self._reported_fault = repr(error)
-            text = f"iris-session: a fault in the media thread, which goes on: {self._reported_fault}\n"
-            print(text + "".join(traceback.format_exception(error)), end="", file=sys.stderr, flush=True)
+            log.error("fault in the thread of media, which continues: %s", self._reported_fault, exc_info=error)
         time.sleep(FAULT_S)
 
     def _serve(self) -> None:

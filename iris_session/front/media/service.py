@@ -1,11 +1,13 @@
-"""Who gets which media: the front's side of the media proxy. Decides four times a second, and tells every client."""
+"""Media budgets: which streams each client gets, at which level, decided four times a second and sent to the client.
+
+The front's side of the media proxy: it decides which keys may hand in frames, and passes the levels to the thread.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
-from iris_session.front.connections import ConnectionTable, FrontConnection, Outbox
+from iris_session.front.context import FrontContext
 from iris_session.front.media.budget import (
     MILLISECOND,
     NOTHING,
@@ -16,28 +18,26 @@ from iris_session.front.media.budget import (
 )
 from iris_session.front.media.proxy import MediaProxy
 from iris_session.front.media.scheduler import DeliveryCounters, MediaSubscriber, StreamStats
-from iris_session.protocol.limits import Drops
 from iris_session.protocol.media import CLASSES, StreamBudget
 from iris_session.protocol.names import BudgetClass, Role
 from iris_session.protocol.status import ClientReport, DeliveryBudget, MediaStreamReport
-from iris_session.security.keyring import Keyring
 
 PERIOD_NS: Final = 250 * MILLISECOND
 MBIT: Final = 125_000.0
-#: State frames between two reports of a client, of which some should have come: a third of a second.
+#: State frames between two reports of a client of which some should have arrived: a third of a second.
 MIN_EXPECTED_FRAMES: Final = 20
-#: Roles that may hand in frames from elsewhere.
+#: Roles whose keys may hand in frames from other machines.
 SOURCES: Final = frozenset({Role.CAMERA, Role.SOURCE})
-#: Keys that may not, and are remembered for a look.
+#: Refused keys that are remembered.
 MAX_REFUSED: Final = 256
 
 
 class _ClientState:
-    """What is known of one connection, and what it knows."""
+    """Measurements of one connection, and the budget that it was sent."""
 
     def __init__(self) -> None:
         self.report: ClientReport | None = None
-        self.frames = 0  # that the state socket had sent when it came
+        self.frames = 0  # that the state socket had sent at the time of the report
         self.counters = DeliveryCounters()
         self.grant = BudgetGrant({})
         self.wanted: list[str] = []
@@ -47,59 +47,43 @@ class _ClientState:
 
 
 class MediaService:
-    """A `Service`. `adapt`: slow links get less.
+    """Decide who gets which media, and who may hand in frames. A `Service`. With `adapt_media`, slow links get less."""
 
-    `report_of(connection, now_ns)`: the newest of a client; `revoked(key)`: it may do nothing; `state_frames`: sent by
-    the state socket so far.
-    """
-
-    def __init__(
-        self,
-        proxy: MediaProxy,
-        clients: ConnectionTable,
-        outbox: Outbox,
-        keyring: Keyring,
-        drops: Drops,
-        report_of: Callable[[int, int], ClientReport | None],
-        revoked: Callable[[str], bool],
-        state_frames: Callable[[], int],
-        *,
-        adapt: bool = True,
-    ) -> None:
+    def __init__(self, context: FrontContext, proxy: MediaProxy) -> None:
+        self._context = context
+        self._connections = context.connections
+        self._outbox = context.outbox
+        self._keyring = context.keyring
+        self._drops = context.drops
+        self._tokens = context.tokens
+        self._publisher = context.publisher
         self._proxy = proxy
-        self._clients = clients
-        self._outbox = outbox
-        self._keyring = keyring
-        self._drops = drops
-        self._report_of = report_of
-        self._revoked = revoked
-        self._state_frames = state_frames
-        self._controller = BudgetController() if adapt else None
+        self._controller = BudgetController() if context.config.adapt_media else None
         self._states: dict[int, _ClientState] = {}
         self._facts: dict[str, StreamStats] = {}
         self._names: dict[str, str] = {}  # of sources, by key
         self._next_ns = 0
-        self._clients_changed = False  # since the last turn
+        self._connections_changed = False  # since the last tick
         proxy.start()
 
     def tick(self, now_ns: int) -> None:
-        """Lets in who came and out who left, at once; looks at everybody now and then."""
+        """Take over which clients are admitted, and update the budgets when they are due."""
         if self._proxy.undecided:
             self._decide_sources()
         self.sync_clients()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + PERIOD_NS
             self._update_budgets(set(self._states), now_ns)
-        elif not self._clients_changed:
+        elif not self._connections_changed:
             return
-        self._clients_changed = False
+        self._connections_changed = False
         self._send_budgets()
 
     def sync_clients(self) -> None:
-        """Lets the thread know who is there, before it hears of them."""
-        here = {number for number, one in self._clients.by_number.items() if one.admitted}
+        """Update the thread's clients. Called before a client gets its `Welcome`."""
+        here = {number for number, one in self._connections.by_number.items() if one.admitted}
         if here != set(self._states):
-            self._clients_changed = True
+            self._connections_changed = True
             self._sync_table(here)
             self._publish_levels()
 
@@ -109,7 +93,7 @@ class MediaService:
     # --- for the status ----------------------------------------------------------------------------------------------
 
     def report_streams(self) -> tuple[MediaStreamReport, ...]:
-        """Every stream, at its best."""
+        """Return a report of every stream, with the rate of its full level."""
         return tuple(
             MediaStreamReport(
                 name, facts.hz, facts.rates[0] / MBIT, self._names.get(facts.source, ""), facts.subscribers
@@ -118,15 +102,15 @@ class MediaService:
         )
 
     def report_participant(self, number: int) -> dict[str, Any]:
-        """Fields of a `ParticipantReport`."""
-        told = self._states.get(number)
-        if told is None or not told.wanted:
+        """Return the media fields of a `ParticipantReport`."""
+        state = self._states.get(number)
+        if state is None or not state.wanted:
             return {}
         return {
-            "budget_class": _lowest_class(told),
-            "media": tuple(self._make_stream_budget(told, stream) for stream in told.wanted),
-            "media_bytes_per_s": told.bytes_per_s,
-            "media_drops": told.drops,
+            "budget_class": _lowest_class(state),
+            "media": tuple(self._make_stream_budget(state, stream) for stream in state.wanted),
+            "media_bytes_per_s": state.bytes_per_s,
+            "media_drops": state.drops,
         }
 
     # --- inside ------------------------------------------------------------------------------------------------------
@@ -155,51 +139,43 @@ class MediaService:
             self._drops.count("media_superseded", number if number in self._states else 0, count)
             if number in self._states:
                 self._states[number].drops += count
-        for number, told in self._states.items():
-            told.wanted = wanted[number]
-            self._update_client(number, told, tallies[number], now_ns)
+        for number, state in self._states.items():
+            state.wanted = wanted[number]
+            self._update_client(number, state, tallies[number], now_ns)
         self._publish_levels()
 
-    def _update_client(self, number: int, told: _ClientState, tally: DeliveryCounters, now_ns: int) -> None:
-        before, told.counters = told.counters, tally
-        told.bytes_per_s = (tally.bytes - before.bytes) * 1e9 / PERIOD_NS
-        report, fresh = self._report_of(number, now_ns), None
-        if report is not None and report is not told.report:
-            fresh = StateReport(report.age_ms_p50, self._missed_share(told, report))
-        told.report = report or told.report
-        limit = max(0.0, told.report.media_limit_mbit_per_s) * MBIT if told.report is not None else 0.0
+    def _update_client(self, number: int, state: _ClientState, tally: DeliveryCounters, now_ns: int) -> None:
+        before, state.counters = state.counters, tally
+        state.bytes_per_s = (tally.bytes - before.bytes) * 1e9 / PERIOD_NS
+        report, fresh = self._connections.by_number[number].recent_report(now_ns), None
+        if report is not None and report is not state.report:
+            fresh = StateReport(report.age_ms_p50, self._missed_share(state, report))
+        state.report = report or state.report
+        limit = max(0.0, state.report.media_limit_mbit_per_s) * MBIT if state.report is not None else 0.0
         measure = LinkMeasure(fresh, tally.taken - before.taken, tally.due - before.due, limit)
-        rates = {stream: self._facts[stream].rates for stream in told.wanted if stream in self._facts}
+        rates = {stream: self._facts[stream].rates for stream in state.wanted if stream in self._facts}
         if self._controller is not None:
-            told.grant = self._controller.update(number, measure, rates, now_ns)
+            state.grant = self._controller.update(number, measure, rates, now_ns)
 
-    def _missed_share(self, told: _ClientState, report: ClientReport) -> float:
-        """Of state. Who was delivered nothing at all cannot know what was missed, but we know whether we sent it."""
-        before, told.frames = told.frames, self._state_frames()
+    def _missed_share(self, state: _ClientState, report: ClientReport) -> float:
+        """Return the share of state frames that was missed. A client that got none cannot report that, but the
+        front knows whether it sent some."""
+        before, state.frames = state.frames, self._publisher.frames
         expected = report.delivered + report.missed
         if not expected:
-            return 1.0 if told.report is not None and told.frames - before >= MIN_EXPECTED_FRAMES else 0.0
+            return 1.0 if state.report is not None and state.frames - before >= MIN_EXPECTED_FRAMES else 0.0
         return report.missed / expected
 
     def _publish_levels(self) -> None:
-        listeners = {
-            number: MediaSubscriber(
-                self._find_key(self._clients.by_number[number]), told.grant.levels, _initial_level(told.grant)
-            )
-            for number, told in self._states.items()
-        }
+        subscribers = {}
+        for number, state in self._states.items():
+            key = self._context.find_channel_key(self._connections.by_number[number])
+            subscribers[number] = MediaSubscriber(key, state.grant.levels, _initial_level(state.grant))
         with self._proxy.lock:
-            self._proxy.scheduler.set_subscribers(listeners)
-
-    def _find_key(self, connection: FrontConnection) -> str:
-        """The key of the TCP connections that may carry this connection's media: of people behind a gateway, its."""
-        if self._keyring.key is None:
-            return ""
-        gateway = self._clients.by_number.get(connection.gateway)
-        return connection.key_id if gateway is None else gateway.key_id
+            self._proxy.scheduler.set_subscribers(subscribers)
 
     def _decide_sources(self, *, again: bool = False) -> None:
-        """Who may hand in frames: keys with the role, as the list is now. Whoever just came; `again`: everybody."""
+        """Decide which keys may hand in frames, by the present allow-list: new keys; `again`: all keys."""
         if self._keyring.key is None:
             return
         proxy = self._proxy
@@ -214,37 +190,37 @@ class MediaService:
         self._names = {mark: name for mark, name in self._names.items() if mark not in looked} | names
 
     def _find_source_name(self, mark: str) -> str | None:
-        """Name of a key that may hand in frames."""
-        entry = self._keyring.find(mark)
-        if entry is None or self._revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
+        """Return the name of a key that may hand in frames, `None` for any other."""
+        entry = self._keyring.find_key(mark)
+        if entry is None or self._tokens.is_revoked(mark) or not (not entry.roles or SOURCES.intersection(entry.roles)):
             return None
         return entry.name
 
-    def _make_stream_budget(self, told: _ClientState, stream: str) -> StreamBudget:
-        level = told.grant.levels.get(stream, _initial_level(told.grant))
+    def _make_stream_budget(self, state: _ClientState, stream: str) -> StreamBudget:
+        level = state.grant.levels.get(stream, _initial_level(state.grant))
         facts = self._facts.get(stream)
         rate = 0.0 if facts is None or level >= NOTHING else facts.rates[level]
         return StreamBudget(stream, CLASSES[level], round(rate / MBIT, 3))
 
     def _send_budgets(self) -> None:
-        """Tells what has changed: rates alone are no reason."""
-        for number, told in self._states.items():
-            streams = tuple(self._make_stream_budget(told, stream) for stream in self._facts)
-            grant = told.grant
-            content = (tuple((s.stream, s.budget_class) for s in streams), _lowest_class(told), grant.reason)
-            if content == told.budget:
+        """Send budgets that have changed, other than in their rates."""
+        for number, state in self._states.items():
+            streams = tuple(self._make_stream_budget(state, stream) for stream in self._facts)
+            grant = state.grant
+            content = (tuple((s.stream, s.budget_class) for s in streams), _lowest_class(state), grant.reason)
+            if content == state.budget:
                 continue
             bound = round(grant.bytes_per_s / MBIT, 3)
             if self._outbox.send(
-                self._clients.by_number[number], DeliveryBudget(_lowest_class(told), bound, grant.reason, streams)
+                self._connections.by_number[number], DeliveryBudget(_lowest_class(state), bound, grant.reason, streams)
             ):
-                told.budget = content
+                state.budget = content
 
 
 def _initial_level(grant: BudgetGrant) -> int:
-    """The level of a stream that the controller has not seen for this client yet."""
+    """Return the level of a stream that the controller has not seen for this client yet."""
     return NOTHING if grant.bytes_per_s and grant.reason else 0
 
 
-def _lowest_class(told: _ClientState) -> str:
-    return CLASSES[max(told.grant.levels.values(), default=0)] if told.wanted else BudgetClass.FULL
+def _lowest_class(state: _ClientState) -> str:
+    return CLASSES[max(state.grant.levels.values(), default=0)] if state.wanted else BudgetClass.FULL

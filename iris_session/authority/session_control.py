@@ -1,0 +1,238 @@
+"""Control of the whole session: e-stop, pause, step, reset, gaps, episodes, and scenes.
+
+Another scene brings other robots and objects and a new scene epoch. The holder of a robot whose name the new scene has
+too keeps it, and must clutch again. Every other lease and pending request ends with its scene.
+
+Episodes are of training data: start, end with a verdict, discard, record again, reset between them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from iris_session.authority import engagement, leases
+from iris_session.authority.context import Context, format_names, join_names
+from iris_session.authority.state import HOST_ID, NO_CONNECTION, NO_REPLY, LeaseState, Participant, Pending
+from iris_session.protocol.client_messages import ClearEStop, Control, Episode, EStop
+from iris_session.protocol.common import Denial
+from iris_session.protocol.entries import SceneLoaded, ScenePatched
+from iris_session.protocol.names import (
+    ControlAction,
+    DenialReason,
+    EpisodeAction,
+    HoldReason,
+    LeaseMode,
+    Role,
+    TargetKind,
+)
+from iris_session.protocol.scene import merged
+from iris_session.protocol.server_messages import EpisodeChanged, EStopChanged, Gap, PauseChanged, SceneChanged
+from iris_session.protocol.specs import ObjectSpec, RobotSpec
+
+#: `EpisodeChanged.state` of a running episode.
+RUNNING: Final = "running"
+#: State in which each action ends a running episode.
+VERDICTS: Final = {
+    EpisodeAction.SUCCESS: "success",
+    EpisodeAction.FAILURE: "failure",
+    EpisodeAction.DISCARD: "discarded",
+}
+#: `LeaseChanged.cause` of leases that end with its scene.
+SCENE_CHANGED: Final = "scene_changed"
+
+
+def latch_estop(ctx: Context, participant: str, m: EStop) -> None:
+    """Latch the e-stop; every robot holds from this step on. `participant`: empty for a sender that is no
+    participant.
+    """
+    ctx.estop_arrived = True
+    if not ctx.state.estop:
+        ctx.state.estop = True
+        ctx.emit(EStopChanged(True, participant, m.reason))
+        engagement.rearm_all(ctx, HoldReason.ESTOP)
+
+
+def clear_estop(ctx: Context, p: Participant, m: ClearEStop) -> None:
+    """End the e-stop; robots hold until clutched again. Denied in a step in which an e-stop arrived."""
+    if ctx.estop_arrived:
+        denial = Denial(DenialReason.ESTOP, "somebody stopped the session in this very step", "look, then clear again")
+        return ctx.deny(p, m.request_id, denial)
+    if ctx.state.estop:
+        ctx.state.estop = False
+        ctx.emit(EStopChanged(False, p.id))
+        engagement.rearm_all(ctx, HoldReason.ESTOP)
+    return ctx.accept(p, m.request_id)
+
+
+def control_session(ctx: Context, p: Participant, m: Control) -> None:
+    """Process a director's pause, resume, step or reset."""
+    if m.action not in ControlAction.ALL:
+        known = f"actions: {', '.join(sorted(ControlAction.ALL))}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+    if ctx.config.user_owned_loop:
+        return ctx.deny(p, m.request_id, build_user_owned_denial(m.action))
+    if m.action == ControlAction.STEP:
+        if not ctx.state.paused or not 1 <= m.ticks <= ctx.config.max_step_ticks:
+            text = f"step needs a paused session and 1 to {ctx.config.max_step_ticks} ticks"
+            return ctx.deny(p, m.request_id, Denial(DenialReason.INVALID, text, "pause first"))
+        ctx.step_ticks = min(ctx.step_ticks + m.ticks, ctx.config.max_step_ticks)
+    elif m.action == ControlAction.RESET:
+        reset_scene(ctx)
+    elif ctx.state.paused != (m.action == ControlAction.PAUSE):
+        ctx.state.paused = not ctx.state.paused
+        ctx.emit(PauseChanged(ctx.state.paused, p.id))
+        # A hand moves on while physics stands still: motion must be latched anew.
+        engagement.rearm_all(ctx, HoldReason.GAP)
+    return ctx.accept(p, m.request_id)
+
+
+def build_user_owned_denial(action: str) -> Denial:
+    """Return the denial of what only the owner of the loop can do."""
+    return Denial(DenialReason.USER_OWNED, f"{action}: the user's own loop drives physics", "do it in that program")
+
+
+def reset_scene(ctx: Context) -> None:
+    """Return to the initial state before the ticks of this step: a new scene epoch, leases stay."""
+    if not ctx.reset:
+        ctx.reset = True
+        begin_scene_epoch(ctx, "reset")
+
+
+def begin_scene_epoch(ctx: Context, cause: str) -> None:
+    """Begin a scene epoch: entries sent for the old one no longer count."""
+    ctx.state.scene_epoch += 1
+    ctx.state.handovers.clear()
+    ctx.state.regrasps.clear()
+    engagement.rearm_all(ctx, HoldReason.SCENE_CHANGED)
+    for lease in ctx.state.objects.values():
+        lease.lead = 0
+    period_ns = ctx.view.tick_period_ns if cause == "new_scene" else 0
+    ctx.emit(SceneChanged(ctx.state.scene_epoch, ctx.state.scene_revision, cause, tick_period_ns=period_ns))
+
+
+def record_gap(ctx: Context, duration_ns: int, kind: str = "stalled") -> None:
+    """Hold all robots after a time without steps, and let no participant expire before its waiting entries were
+    applied.
+
+    Once: where every step is a gap, the step after the first one had those entries.
+    """
+    ctx.state.hold_expiry_until_ns = ctx.now_ns + ctx.config.drain_ns
+    for p in ctx.state.participants.values():
+        if p.spared:
+            continue
+        p.spared = True
+        if p.connection == NO_CONNECTION:
+            if p.expires_ns < ctx.state.hold_expiry_until_ns:
+                p.expires_ns = ctx.state.hold_expiry_until_ns
+                for lease in ctx.list_leases(p):
+                    ctx.publish_lease(lease, "left", p.id)
+        else:
+            p.heard_ns = max(p.heard_ns, ctx.now_ns)
+    for lease in ctx.state.robots.values():
+        lease.override_ns = ctx.now_ns  # the overriding human could not engage meanwhile
+    ctx.emit(Gap(kind, max(0, duration_ns)))
+    engagement.rearm_all(ctx, HoldReason.GAP)
+
+
+# --- episodes ---
+
+
+def control_episode(ctx: Context, p: Participant, m: Episode) -> None:
+    """Process one action of a participant that may drive. `rerecord` discards, resets and starts the next number at
+    once.
+    """
+    if m.action not in EpisodeAction.ALL:
+        known = f"actions: {', '.join(sorted(EpisodeAction.ALL))}"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.UNKNOWN_VALUE, f"unknown action {m.action}", known))
+    if p.role not in Role.DRIVING:
+        denial = Denial(DenialReason.ROLE, f"role {p.role} may not control episodes", "ask an operator or director")
+        return ctx.deny(p, m.request_id, denial)
+    now = ctx.state.episode
+    running = now is not None and now.state == RUNNING
+    if m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD) and ctx.config.user_owned_loop:
+        return ctx.deny(p, m.request_id, build_user_owned_denial(m.action))
+    if running == (m.action in (EpisodeAction.START, EpisodeAction.RESET)):
+        text = "an episode is running" if running else "no episode is running"
+        advice = "end it with success, failure or discard" if running else "start one"
+        return ctx.deny(p, m.request_id, Denial(DenialReason.EPISODE_STATE, text, advice))
+    number = now.number if now is not None else 0
+    if m.action in VERDICTS:
+        _set_episode(ctx, EpisodeChanged(number, VERDICTS[m.action], m.label, p.id))
+    if m.action == EpisodeAction.RERECORD:
+        _set_episode(ctx, EpisodeChanged(number, VERDICTS[EpisodeAction.DISCARD], m.label, p.id))
+    if m.action in (EpisodeAction.RESET, EpisodeAction.RERECORD):
+        reset_scene(ctx)
+    if m.action in (EpisodeAction.START, EpisodeAction.RERECORD):
+        _set_episode(ctx, EpisodeChanged(number + 1, RUNNING, m.label, p.id))
+    return ctx.accept(p, m.request_id)
+
+
+def _set_episode(ctx: Context, episode: EpisodeChanged) -> None:
+    ctx.state.episode = episode
+    ctx.emit(episode)
+
+
+# --- scenes ---
+
+
+def load_scene(ctx: Context, m: SceneLoaded) -> None:
+    """Replace robots and objects by those of `m`. The plant of `ctx.view` is that of the new scene already."""
+    state = ctx.state
+    robots = create_robot_leases(m.robots, ctx.config.default_mode)
+    for name, lease in state.robots.items():
+        if name in robots:
+            robots[name] = lease
+        else:
+            _end_lease(ctx, lease)
+    for lease in state.objects.values():
+        _end_lease(ctx, lease)
+    state.robots, state.objects = robots, create_object_leases(m.objects)
+    state.feedback = {name: feedback for name, feedback in state.feedback.items() if name in robots}
+    state.handover_tick = -1
+    state.scene, state.patches, state.scene_revision = m, (), 0
+    ctx.set_targets(m.robots, m.objects)
+    for pending in (*state.queue, *state.consents):
+        _end_request(ctx, pending)
+    begin_scene_epoch(ctx, "new_scene")
+
+
+def patch_scene(ctx: Context, m: ScenePatched) -> None:
+    """Record a visual change of the scene: nothing else changes, so no robot stops."""
+    state = ctx.state
+    state.patches = merged(state.patches, m.ops)
+    state.scene_revision += 1
+    ctx.emit(SceneChanged(state.scene_epoch, state.scene_revision, "patch", m.scene_hash))
+
+
+def create_robot_leases(robots: tuple[RobotSpec, ...], default_mode: str) -> dict[str, LeaseState]:
+    """Return free robots, in their order."""
+    return {r.name: LeaseState(r.name, TargetKind.ROBOT, default_mode or r.mode) for r in robots}
+
+
+def create_object_leases(objects: tuple[ObjectSpec, ...]) -> dict[str, LeaseState]:
+    """Return free objects, in their order."""
+    return {o.name: LeaseState(o.name, TargetKind.OBJECT, LeaseMode.SHARED) for o in objects}
+
+
+def _end_lease(ctx: Context, lease: LeaseState) -> None:
+    """Revoke every grant of a target that the new scene does not have."""
+    if lease.grants:
+        holder = ctx.get_holder(lease)
+        leases.revoke_all(ctx, lease)
+        ctx.publish_lease(lease, SCENE_CHANGED, holder)
+
+
+def _end_request(ctx: Context, pending: Pending) -> None:
+    """Deny a pending request for targets that the new scene does not have."""
+    gone = [name for name in pending.robots if name not in ctx.robots and not pending.any_robot]
+    gone += [name for name in pending.objects if name not in ctx.objects]
+    if pending.any_robot:
+        pending.robots = ()
+    if not gone:
+        return
+    ctx.state.queue = [other for other in ctx.state.queue if other is not pending]
+    ctx.state.consents = [other for other in ctx.state.consents if other is not pending]
+    p = ctx.state.participants[pending.participant]
+    if pending.request_id != NO_REPLY and p.id != HOST_ID:
+        text = f"another scene was loaded, which has no {join_names(gone)}"
+        ctx.deny(p, pending.request_id, Denial(DenialReason.UNKNOWN_TARGET, text, format_names("robots", ctx.robots)))

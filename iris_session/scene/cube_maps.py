@@ -1,0 +1,297 @@
+"""Cube textures for formats that have none (glTF, Rerun): the six faces in one picture, and coordinates in it.
+
+What MuJoCo looks up by a direction at every pixel becomes texture coordinates at corners. Triangles are cut where the
+direction passes from one face of the cube to another, and split until straight lines in the picture are close to what
+MuJoCo draws. Neighbours are cut and split alike, so that no gaps open between them. docs/scene.md has the formulas.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.assets.store import AssetStore
+from iris_session.protocol.names import AssetEncoding, GeometryKind, TextureKind
+from iris_session.protocol.scene import Geometry, SceneSpec, Texture
+from iris_session.scene.errors import AssetDecodeError
+from iris_session.scene.images import Pixels, decode_image, halved
+from iris_session.scene.mesh_processing import unit
+from iris_session.scene.meshes import MeshArrays, index_corners
+
+#: Longest side of a face in an exported file [pixels]: six in one picture are then no more than headsets take.
+CUBE_SIDE: Final = 2_048
+#: How far a coordinate may be from the exact one, in sides of a face.
+TOLERANCE: Final = 1 / 128
+#: How often an edge is halved at most: where a surface passes the centre, its directions have no end of detail.
+_DEPTH: Final = 8
+_FACES: Final = 6
+#: Part of a direction's length below which it counts as on the edge between two faces, or as none at all.
+_EDGE: Final = 1e-6
+#: Per face the axis that leads, its sign, and the axes and signs of right and down: OpenGL's cube maps.
+_AXES: Final = (
+    (0, 1, 2, -1, 1, -1),
+    (0, -1, 2, 1, 1, -1),
+    (1, 1, 0, 1, 2, 1),
+    (1, -1, 0, 1, 2, -1),
+    (2, 1, 0, 1, 1, -1),
+    (2, -1, 0, -1, 1, -1),
+)
+Floats = NDArray[np.float64]
+
+
+class Atlas(NamedTuple):
+    """`pixels`: two rows of three faces, each with a border of what is beyond its edges, so that what lies beside it in
+    the picture is not mixed in. `side`, `border`: of a face [pixels]. `plain`: every face has one colour only."""
+
+    pixels: Pixels
+    side: int
+    border: int
+    plain: bool
+
+    def uv(self, face: NDArray[np.int64], on_face: Floats) -> Floats:
+        """Coordinates in the picture of those on faces, 0..1 (..., 2)."""
+        cell = self.side + 2 * self.border
+        corner = np.stack([face % 3, face // 3], axis=-1) * cell + self.border
+        return (corner + np.clip(on_face, 0.0, 1.0) * self.side) / [3 * cell, 2 * cell]
+
+
+class Cube(NamedTuple):
+    """What a visual wears: one colour (0..1), or an atlas. `address`: of the asset that it is made of. `encoding`: that
+    suits it, PNG or JPEG."""
+
+    address: str
+    encoding: str
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    atlas: Atlas | None = None
+
+
+class Cubes:
+    """The cube textures of a specification, each read once. `max_side`: of a face [pixels]; finer ones are taken in a
+    coarser level. Raises `SceneBuildError` for what the store lacks or what is damaged."""
+
+    def __init__(self, spec: SceneSpec, store: AssetStore, max_side: int) -> None:
+        self._spec = spec
+        self._store = store
+        self._max_side = max_side
+        self._read: dict[str, Cube] = {}
+
+    def worn(self, material: int, geometry: Geometry) -> Cube | None:
+        """What a visual wears; `None` where it has no cube texture, or a mesh has coordinates of its own: MuJoCo draws
+        no cube there."""
+        index = cube_texture(self._spec, material)
+        textured = geometry.mesh >= 0 and self._spec.meshes[geometry.mesh].textured
+        return None if index < 0 or textured else self._cube(self._spec.textures[index])
+
+    def _cube(self, texture: Texture) -> Cube | None:
+        levels = [level for level in texture.levels if level.encoding != AssetEncoding.OPAQUE]
+        if not levels:
+            return None
+        level = next((level for level in levels if level.width <= self._max_side), levels[-1])
+        if level.address not in self._read:
+            pixels = decode_image(self._store.get(level.address), level.encoding)
+            encoding = AssetEncoding.JPEG if level.encoding == AssetEncoding.JPEG else AssetEncoding.PNG
+            self._read[level.address] = _cube_of(Cube(level.address, encoding), faces_of(pixels), self._max_side)
+        return self._read[level.address]
+
+
+def cube_texture(spec: SceneSpec, material: int) -> int:
+    """The cube texture of a material's colour; -1 where there is none."""
+    index = -1 if material < 0 else spec.materials[material].texture()
+    return -1 if index < 0 or spec.textures[index].kind == TextureKind.IMAGE else index
+
+
+def faces_of(pixels: Pixels) -> Pixels:
+    """(6, side, side, channels) of six faces below one another. Raises `AssetDecodeError` where they are not."""
+    if not len(pixels) == _FACES * pixels.shape[1] > 0:
+        raise AssetDecodeError(
+            f"a cube of {pixels.shape[1]} x {len(pixels)} pixels: six squares below one another are one"
+        )
+    return pixels.reshape(_FACES, len(pixels) // _FACES, *pixels.shape[1:])
+
+
+def _cube_of(cube: Cube, faces: Pixels, max_side: int) -> Cube:
+    plain = bool((faces == faces[:, :1, :1]).all())
+    if plain and bool((faces == faces[:1]).all()) and (faces.shape[3] < 4 or faces[0, 0, 0, 3] == 255):
+        red, green, blue = np.resize(faces[0, 0, 0, : 3 if faces.shape[3] >= 3 else 1] / 255.0, 3).tolist()
+        return cube._replace(tint=(red, green, blue))
+    if plain and 0.5 / faces.shape[2] <= TOLERANCE:  # else what is mixed at edges is to be seen
+        cells = np.broadcast_to(faces[:, :1, :1], (_FACES, 5, 5, faces.shape[3]))
+        return cube._replace(atlas=Atlas(_rows(cells), side=1, border=2, plain=True))
+    while faces.shape[2] > max_side:
+        faces = np.stack([halved(face) for face in faces])
+    side = faces.shape[2]
+    border = max(2, side // 16)
+    return cube._replace(atlas=Atlas(_rows(_bordered(faces, border)), side, border, plain=False))
+
+
+def _rows(cells: Pixels) -> Pixels:
+    return np.concatenate([np.concatenate(list(cells[k : k + 3]), axis=1) for k in (0, 3)])
+
+
+def _bordered(faces: Pixels, border: int) -> Pixels:
+    """Faces with what directions beyond their edges see, which are on other faces."""
+    side = faces.shape[1]
+    cells = np.pad(faces, ((0, 0), (border, border), (border, border), (0, 0)))
+    at = (np.arange(-border, side + border) + 0.5) / side * 2 - 1
+    down, right = np.nonzero(np.maximum(np.abs(at)[:, None], np.abs(at)[None]) > 1)
+    for cell, (lead, sign, u, u_sign, v, v_sign) in zip(cells, _AXES, strict=True):
+        direction = np.empty((len(down), 1, 3))
+        direction[:, 0, lead] = sign
+        direction[:, 0, u] = u_sign * at[right]
+        direction[:, 0, v] = v_sign * at[down]
+        face = np.stack([_inside(direction, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1).argmax(axis=1)
+        x, y = np.clip((_on_face(direction, face)[0][:, 0] * side).astype(int), 0, side - 1).T
+        cell[down, right] = faces[face, y, x]
+    return cells
+
+
+def direction_scale(spec: SceneSpec, geometry: Geometry, material: int) -> tuple[float, float, float]:
+    """What positions in a visual's frame are multiplied with to give directions."""
+    x, y, z = geometry.size
+    uniform = spec.materials[material].uniform
+    if geometry.kind == GeometryKind.PLANE:  # 0: without end, and no direction then where both are
+        return (x, y, 1.0) if uniform and (x or y) else (1.0, 1.0, 1.0)
+    if geometry.hfield >= 0:
+        _, _, top, base = spec.hfields[geometry.hfield].size
+        return (x, y, 0.25 * top + 0.5 * base) if uniform else (1.0, 1.0, 1.0)
+    if geometry.mesh >= 0:
+        return (x, y, z) if uniform else (1.0, 1.0, 1.0)
+    if uniform:
+        return (1.0, 1.0, 1.0)
+    return (1 / x if x else 1.0, 1 / y if y else 1.0, 1 / z if z else 1.0)
+
+
+def baked(mesh: MeshArrays, geometry: Geometry, scale: tuple[float, float, float], atlas: Atlas) -> MeshArrays:
+    """`mesh` cut and split, with coordinates in `atlas`. `scale`: of `direction_scale`."""
+    columns = np.concatenate([mesh.position, mesh.normal, *([] if mesh.color is None else [mesh.color])], axis=1)
+    rest = columns[mesh.index].astype(np.float64)
+    direction = rest[:, :, :3] * scale
+    if geometry.kind == GeometryKind.CAPSULE:
+        direction = _on_capsule(rest[:, :, :3], direction, geometry.size)
+    corners, face = _cut(np.concatenate([direction, rest], axis=2))
+    corners, face, on_face = _split(corners, face, np.inf if atlas.plain else TOLERANCE)
+    position, normal, color = corners[:, :, 3:6], unit(corners[:, :, 6:9]), None
+    if mesh.color is not None:
+        color = np.rint(corners[:, :, 9:13]).astype(np.uint8)
+    uv = atlas.uv(np.repeat(face[:, None], 3, axis=1), on_face)
+    return index_corners(position.astype(np.float32), normal.astype(np.float32), uv.astype(np.float32), color)
+
+
+def _on_capsule(position: Floats, direction: Floats, size: tuple[float, float, float]) -> Floats:
+    """Caps are looked up as if cylinder and half spheres all had a half length of 1; `uniform` stretches them alike."""
+    radius, _, half = size
+    middle = position[:, :, 2].mean(axis=1)
+    cap = np.abs(middle) > half
+    end = np.sign(middle[cap])[:, None]
+    stretch = direction[cap, :, 2] / position[cap, :, 2] * half
+    found = direction.copy()
+    found[cap, :, 2] = ((position[cap, :, 2] - end * half) / radius + end) * stretch
+    return found
+
+
+def _cut(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Triangles that look at one face of the cube each, and which. The first three columns are directions."""
+    length = np.abs(corners[:, :, :3]).max(axis=(1, 2))
+    margin = np.stack([_inside(corners, k).min(axis=(1, 2)) for k in range(_FACES)], axis=1)
+    face = margin.argmax(axis=1)
+    whole = margin.max(axis=1) >= -_EDGE * length
+    found, faces = [corners[whole]], [face[whole]]
+    for k in range(_FACES):
+        part, count = corners[~whole], np.full(int((~whole).sum()), 3)
+        for side in range(4):
+            distance = _inside(part, k)[:, :, side]
+            distance[np.abs(distance) < _EDGE * length[~whole][:, None]] = 0.0
+            part, count = _half(part, count, distance)
+        for last in range(2, part.shape[1]):
+            fan = part[count > last][:, [0, last - 1, last]]
+            found.append(fan)
+            faces.append(np.full(len(fan), k))
+    return np.concatenate(found), np.concatenate(faces)
+
+
+def _inside(corners: Floats, face: int) -> Floats:
+    """How far directions are on the inside of the four planes that bound those of a face (..., 4)."""
+    lead, sign, right, _, down, _ = _AXES[face]
+    ahead = sign * corners[..., lead]
+    a, b = corners[..., right], corners[..., down]
+    return np.stack([ahead - a, ahead + a, ahead - b, ahead + b], axis=-1)
+
+
+def _half(polygon: Floats, count: NDArray[np.int64], distance: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """The part of convex polygons (n, m, columns) that has no negative distance. `count`: how many of the m corners
+    each polygon has."""
+    m = polygon.shape[1]
+    slot = np.arange(m)[None]
+    after = np.where(slot + 1 < count[:, None], slot + 1, 0)
+    beyond, following = np.take_along_axis(distance, after, 1), np.take_along_axis(polygon, after[:, :, None], 1)
+    crossed = (slot < count[:, None]) & (distance * beyond < 0)
+    gap = np.where(crossed, distance - beyond, 1.0)[:, :, None]
+    crossing = (distance[:, :, None] * following - beyond[:, :, None] * polygon) / gap  # the same from both ends
+    used = np.stack([(slot < count[:, None]) & (distance >= 0), crossed], axis=2).reshape(-1, 2 * m)
+    order = np.argsort(~used, axis=1, kind="stable")[:, : m + 1]
+    points = np.stack([polygon, crossing], axis=2).reshape(-1, 2 * m, polygon.shape[2])
+    return np.take_along_axis(points, order[:, :, None], 1), used.sum(axis=1)
+
+
+def _on_face(direction: Floats, face: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Coordinates on their faces (n, k, 2), 0..1 right and down, and where there are any: the centre has none."""
+    lead, sign, right, right_sign, down, down_sign = np.array(_AXES)[face].T
+    row = np.arange(len(face))
+    ahead = sign[:, None] * direction[row, :, lead]
+    there = ahead > _EDGE * np.abs(direction).max(axis=(1, 2), initial=0.0)[:, None]
+    depth = np.where(there, ahead, 1.0)
+    u, v = (s[:, None] * direction[row, :, axis] / depth for axis, s in ((right, right_sign), (down, down_sign)))
+    return (np.stack([u, v], axis=2) + 1) / 2, there
+
+
+def _split(corners: Floats, face: NDArray[np.int64], tolerance: float) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """Triangles in whose edges' middles the coordinates are within `tolerance` of exact ones; with their faces, and the
+    coordinates of their corners. Judged by the edge alone, as its other triangle does."""
+    done: list[tuple[Floats, NDArray[np.int64], Floats]] = []
+    for depth in range(_DEPTH + 1):
+        on_face, there = _on_face(corners[:, :, :3], face)
+        middles = (corners + corners[:, [1, 2, 0]]) / 2
+        exact, _ = _on_face(middles[:, :, :3], face)
+        following, known = on_face[:, [1, 2, 0]], there & there[:, [1, 2, 0]]
+        error = np.abs(exact - (on_face + following) / 2).max(axis=2)
+        # A corner at the centre takes the mean of the others: these may then not be far from each other.
+        fan = np.where(there.all(axis=1, keepdims=True), 0.0, np.abs(following - on_face).max(axis=2) / 2)
+        error = np.where(known, np.maximum(error, fan), 0.0)
+        cut = error > (tolerance if depth < _DEPTH else np.inf)
+        stay = cut.sum(axis=1) == 0
+        others = (on_face * there[:, :, None]).sum(axis=1) / np.maximum(there.sum(axis=1), 1)[:, None]
+        uv = np.where(there[:, :, None], on_face, others[:, None])
+        done.append((corners[stay], face[stay], uv[stay]))
+        if bool(stay.all()):
+            break
+        corners, which = _quarters(corners[~stay], middles[~stay], cut[~stay])
+        face = face[~stay][which]
+    return (
+        np.concatenate([part[0] for part in done]),
+        np.concatenate([part[1] for part in done]),
+        np.concatenate([part[2] for part in done]),
+    )
+
+
+def _quarters(corners: Floats, middles: Floats, cut: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
+    """Triangles split at the middles of their cut edges (0-1, 1-2, 2-0), and of which one each is a part."""
+    n_cut = cut.sum(axis=1)
+    # Turned so that of one cut edge it is the first, of two the last is whole.
+    first = np.where(n_cut == 1, cut.argmax(axis=1), np.where(n_cut == 2, ((~cut).argmax(axis=1) + 1) % 3, 0))
+    turn = (first[:, None] + np.arange(3)) % 3
+    points = np.concatenate(
+        [np.take_along_axis(part, turn[:, :, None], 1) for part in (corners, middles)], axis=1
+    )  # 0, 1, 2: corners; 3, 4, 5: the middles after them
+    found, which = [], []
+    for n, triangles in (
+        (1, ((0, 3, 2), (3, 1, 2))),
+        (2, ((3, 1, 4), (0, 3, 4), (0, 4, 2))),
+        (3, ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))),
+    ):
+        chosen = np.flatnonzero(n_cut == n)
+        for triangle in triangles:
+            found.append(points[chosen][:, triangle])
+            which.append(chosen)
+    return np.concatenate(found), np.concatenate(which)

@@ -1,0 +1,183 @@
+"""What files become before they are part of a scene: nodes with surfaces, looks, lights and cameras, in plain values.
+
+Frames: a node's matrix leads to the file's own frame, as the file has it, with its scale. Colours are those of the
+specification (as they are seen), texture coordinates too (v down).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anchors.lie import quat_from_matrix, quat_to_matrix
+from anchors.pose import compose
+from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
+from iris_session.protocol.names import ColorSpace, GeometryKind, TextureKind
+from iris_session.protocol.scene import Camera, Light, Rgba, Vec2
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.images import Pixels
+from iris_session.scene.meshes import MeshArrays
+
+#: Largest file that is read, with each of the files that it refers to [bytes].
+MAX_FILE_BYTES: Final = 512 << 20
+#: Most triangles of one file, and most nodes.
+MAX_TRIANGLES: Final = 20_000_000
+MAX_NODES: Final = 100_000
+#: What has no colour of its own.
+GREY: Final[Rgba] = (0.5, 0.5, 0.5, 1.0)
+#: Farther than this from the identity, a matrix's scale is put into the vertices.
+_RIGID: Final = 1e-9
+#: Digits of a scale that count.
+_DIGITS: Final = 12
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A texture to be. `pixels` (height, width, channels), 1, 3 or 4 of them; six faces below each other of a cube."""
+
+    pixels: Pixels
+    name: str = ""
+    kind: str = TextureKind.IMAGE
+    colorspace: str = ColorSpace.AUTO
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How a surface looks: fields as in `Material`, which it becomes unless it is a colour only.
+
+    `pictures`: (role, picture) pairs.
+    """
+
+    rgba: Rgba = GREY
+    name: str = ""
+    emission: float = 0.0
+    specular: float = 0.5
+    shininess: float = 0.5
+    metallic: float = -1.0
+    roughness: float = -1.0
+    pictures: tuple[tuple[str, Picture], ...] = ()
+    repeat: Vec2 = (1.0, 1.0)
+    uniform: bool = False
+
+    @property
+    def plain(self) -> bool:
+        """Whether the colour says all."""
+        defaults = (0.0, 0.5, 0.5, -1.0, -1.0)
+        return not self.pictures and defaults == (
+            self.emission,
+            self.specular,
+            self.shininess,
+            self.metallic,
+            self.roughness,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles with one look."""
+
+    mesh: MeshArrays
+    look: Look | None = None
+    name: str = ""
+
+
+@dataclass(eq=False)
+class Node:
+    """A place in a file. `matrix` (4, 4): T_file_node. `parent`: an earlier node, -1 for none.
+
+    The `lights` and `cameras` are in the node's frame; their bodies are not yet known.
+    """
+
+    name: str = ""
+    parent: int = -1
+    matrix: Matrix = field(default_factory=lambda: np.eye(4))
+    surfaces: list[Surface] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)
+    cameras: list[Camera] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Item:
+    """Something drawn on body `body` (its place in a list of bodies, -1 for the world): a `mesh`, or a shape of `kind`
+    and `size` as in `Geometry`. `matrix` (4, 4): T_body_item, of meshes with scale."""
+
+    body: int
+    name: str
+    matrix: Matrix
+    look: Look
+    mesh: MeshArrays | None = None
+    kind: str = GeometryKind.MESH
+    size: Vec3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A file as it was read: nodes, parents first. `up`: the axis that it says is up, `y` or `z`.
+
+    `unit`: one of its lengths in metres. `skipped`: what it has and the specification does not, a line each.
+    """
+
+    nodes: tuple[Node, ...]
+    up: str = "z"
+    unit: float = 1.0
+    skipped: tuple[str, ...] = ()
+
+
+def rigid_and_rest(matrix: Matrix) -> tuple[Pose, Matrix | None]:
+    """`matrix` (4, 4) as a pose and what is left of its turning part (3, 3), to be applied before it: scale, shear,
+    reflection; `None` where nothing is left. Raises `SceneBuildError` for one that flattens or is not finite.
+    """
+    if not solid(matrix):
+        raise SceneBuildError("a scale is 0: give every axis one")
+    turn = np.asarray(matrix[:3, :3], np.float64)
+    U, scale, Vt = np.linalg.svd(turn)
+    R = U @ Vt
+    if np.linalg.det(R) < 0:
+        R = -R
+    digits = _DIGITS - math.floor(math.log10(float(scale[0])))
+    rest = np.round(R.T @ turn, digits) + 0.0  # so that one scale is the same at every angle, and its mesh is one
+    rigid = bool(np.abs(rest - np.eye(3)).max() <= _RIGID)
+    return pose_of(R, matrix[:3, 3]), None if rigid else rest
+
+
+def solid(matrix: Matrix) -> bool:
+    """Whether something is left of what is placed by `matrix`. Raises `SceneBuildError` for one that is not finite."""
+    if not np.isfinite(matrix).all():
+        raise SceneBuildError("a place in the file is not finite")
+    scale = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    return bool(scale[-1] > 1e-12 * max(1.0, float(scale[0])))
+
+
+def pose_of(R: NDArray[np.float64], p: Any) -> Pose:
+    """A pose of a rotation matrix (3, 3) and a position."""
+    w, i, j, k = quat_from_matrix(np.asarray(R, np.float64)).tolist()
+    return Pose(vec3(p), (w, i, j, k))
+
+
+def vec3(p: Any) -> Vec3:
+    """The first three of an array."""
+    x, y, z = (float(v) for v in p[:3])
+    return x, y, z
+
+
+def matrix_of(pose: Pose) -> Matrix:
+    """(4, 4) of a pose."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_to_matrix(np.array(pose.q))
+    matrix[:3, 3] = pose.p
+    return matrix
+
+
+def cut(name: object) -> str:
+    """A name as the wire holds it: not longer, and of characters that can be sent (JSON may hold halves of some)."""
+    return str(name)[:MAX_TEXT].encode("utf-8", "replace").decode() if name is not None else ""
+
+
+def composed(a: Pose, b: Pose) -> Pose:
+    """T_a_c of T_a_b and T_b_c."""
+    return Pose(*compose((a.p, a.q), (b.p, b.q)))

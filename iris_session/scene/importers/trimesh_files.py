@@ -1,0 +1,290 @@
+"""Mesh files that trimesh reads: OBJ with MTL, STL, PLY with colours, OFF, DAE, 3MF. Not glTF: see `gltf`.
+
+Colours are taken as they stand in the file. Where it has no normals they are made as MuJoCo makes them, with creases.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.names import TextureRole
+from iris_session.protocol.scene import Rgba
+from iris_session.scene.elements import (
+    GREY,
+    MAX_NODES,
+    MAX_TRIANGLES,
+    Loaded,
+    Look,
+    Node,
+    Picture,
+    Surface,
+    cut,
+)
+from iris_session.scene.errors import SceneBuildError
+from iris_session.scene.images import PixelBudget, pixels_of
+from iris_session.scene.importers.mesh_validation import CHECKS, absolute_corners
+from iris_session.scene.importers.references import References, read_bounded
+from iris_session.scene.importers.xml_files import check_3mf, check_dae
+from iris_session.scene.mesh_processing import creased_normals, recoloured, unit
+from iris_session.scene.meshes import index_corners, unique_rows
+
+_UP: Final = re.compile(rb"<up_axis>\s*([XYZ])_UP\s*<")
+_USED: Final = re.compile(rb"^[ \t]*usemtl[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+_DEFINED: Final = re.compile(rb"^[ \t]*newmtl[ \t]+(\S[^\r\n]*)", re.MULTILINE | re.IGNORECASE)
+_LIBRARIES: Final = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+#: What trimesh calls geometries that have no name in their file.
+_MADE_UP: Final = re.compile(r"geometry(_\d+)?")
+#: What an MTL file may map on a surface besides its colour; the picture of `map_ka` is that of the colour.
+_MAPS: Final = frozenset({"bump", "norm", "disp", "decal", "refl"})
+
+
+def read_with_trimesh(path: Path, references: References, name: str) -> Loaded:
+    """The file; `name`: of what has none in it. Raises `SceneBuildError`, and what trimesh raises for damaged ones."""
+    trimesh, kind = _trimesh(), path.suffix.lower().lstrip(".")
+    data = _checked(path.name, kind, read_bounded(path))
+    resolver = _resolver(trimesh, references)
+    try:
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+        reader = _Reader(trimesh, path.name, name)
+        nodes = reader.nodes(scene)
+    except IndexError:
+        if kind == "obj":
+            absolute_corners(path.name, data)  # says which
+        raise
+    lost = _lost_materials(path.name, data, resolver) if kind == "obj" else ()
+    return Loaded(nodes, _up(kind, data), _unit(trimesh, scene), (*resolver.missing, *lost, *reader.skipped))
+
+
+def _checked(name: str, kind: str, data: bytes) -> bytes:
+    if kind == "dae":
+        try:
+            import collada  # noqa: F401
+        except ImportError:
+            raise SceneBuildError(f"{name}: DAE files need pycollada: pip install 'iris-session[files]'") from None
+        check_dae(name, data)
+    if kind == "3mf":
+        check_3mf(name, data)
+    return CHECKS[kind](name, data) if kind in CHECKS else data
+
+
+def _lost_materials(name: str, data: bytes, resolver: Any) -> tuple[str, ...]:
+    """Materials that no MTL file has, if there is one: without any, whoever shows the OBJ says how it looks."""
+    libraries = {found.strip() for found in _LIBRARIES.findall(data)}
+    several = (f"{name}: its MTL files but for the first of {len(libraries)}",) if len(libraries) > 1 else ()
+    if not resolver.materials:
+        return several
+    lost = sorted({found.strip() for found in _USED.findall(data)} - resolver.materials)
+    names = ", ".join(cut(found.decode(errors="replace")) for found in lost[:5])
+    return (*several, *([f"{name}: materials that its MTL file does not have: {names}"] if lost else []))
+
+
+def _up(kind: str, data: bytes) -> str:
+    """COLLADA says which axis is up, and means y when it does not; the others say nothing and are taken as z up."""
+    if kind != "dae":
+        return "z"
+    found = _UP.search(data)
+    return found.group(1).decode().lower() if found else "y"
+
+
+def _unit(trimesh: Any, scene: Any) -> float:
+    return float(trimesh.units.unit_conversion(scene.units, "meters")) if scene.units else 1.0
+
+
+class _Reader:
+    def __init__(self, trimesh: Any, name: str, unnamed: str) -> None:
+        self._trimesh = trimesh
+        self._name = name
+        self._unnamed = unnamed
+        self._looks: dict[int, Look | None] = {}
+        self._pictures: dict[int, Picture] = {}
+        self._budget = PixelBudget(name)
+        self.skipped: list[str] = []
+
+    def nodes(self, scene: Any) -> tuple[Node, ...]:
+        """Flat, in the order of the file's geometries: trimesh keeps no other."""
+        surfaces: dict[str, Surface] = {}
+        names = self._names(list(scene.geometry))
+        for name, geometry in scene.geometry.items():
+            if not isinstance(geometry, self._trimesh.Trimesh):
+                self.skipped.append(f"{self._name}: {name}, which is {type(geometry).__name__} and no triangles")
+            elif len(geometry.faces):
+                surfaces[name] = self._surface(geometry, names[name])
+        if sum(surface.mesh.triangles for surface in surfaces.values()) > MAX_TRIANGLES:
+            raise SceneBuildError(f"{self._name} has more than {MAX_TRIANGLES:,} triangles: make it coarser")
+        order = {name: place for place, name in enumerate(surfaces)}
+        placed = []
+        for node in scene.graph.nodes_geometry:
+            matrix, name = scene.graph[node]
+            if name in order:
+                placed.append((order[name], np.array(matrix, np.float64)))
+        if len(placed) > MAX_NODES:
+            raise SceneBuildError(f"{self._name} has {len(placed)} parts, at most {MAX_NODES} are read")
+        placed.sort(key=lambda entry: (entry[0], entry[1].tolist()))  # names of nodes may be made up by the library
+        listed = list(surfaces.values())
+        return tuple(Node(listed[k].name, -1, matrix, [listed[k]]) for k, matrix in placed)
+
+    def _names(self, given: list[str]) -> dict[str, str]:
+        """What the geometries are called: as in the file, or, where trimesh made their names up, as the file is."""
+        made_up = [name for name in given if _MADE_UP.fullmatch(name)]
+        several = len(made_up) > 1
+        ours = {name: f"{self._unnamed}_{k}" if several else self._unnamed for k, name in enumerate(made_up, start=1)}
+        return {name: cut(ours.get(name, name)) for name in given}
+
+    def _surface(self, geometry: Any, name: str) -> Surface:
+        points = np.ascontiguousarray(geometry.vertices, np.float64)
+        faces = np.ascontiguousarray(geometry.faces, np.int64)
+        if not np.isfinite(points).all():
+            raise SceneBuildError(f"{self._name}: a vertex of {name} is not finite")
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(points):
+            wrong = int(faces.min()) if faces.min() < 0 else int(faces.max())
+            raise SceneBuildError(f"{self._name}: a triangle of {name} names vertex {wrong} of {len(points)}")
+        visual = geometry.visual
+        uv: NDArray[np.float32] | None = None
+        color: NDArray[np.uint8] | None = None
+        look: Look | None = None
+        if visual.kind == "texture":
+            look = self._look(visual.material)
+            if visual.uv is not None and len(visual.uv) == len(points):
+                downward = np.asarray(visual.uv, np.float64)[:, :2] * [1, -1] + [0, 1]  # v is up in trimesh
+                uv = np.ascontiguousarray(np.nan_to_num(downward)[faces], np.float32)
+        elif visual.kind == "vertex":
+            color = np.asarray(visual.vertex_colors, np.uint8)[faces]
+        elif visual.kind == "face":
+            color = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None], 3, axis=1)
+        mesh = index_corners(points[faces].astype(np.float32), self._normals(geometry, points, faces), uv, color)
+        if color is not None:
+            mesh, rgba = recoloured(mesh, (1.0, 1.0, 1.0, 1.0))
+            look = Look(rgba=rgba)
+        return Surface(mesh, look, name)
+
+    def _normals(self, geometry: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+        """At the corners: those of the file, else made from the triangles around each point."""
+        given = geometry._cache.cache.get("vertex_normals")  # without it trimesh would make its own
+        if given is not None and len(given) == len(points):
+            return np.asarray(unit(np.nan_to_num(given))[faces], np.float32)
+        first, same = unique_rows(np.ascontiguousarray(points.astype(np.float32) + np.float32(0.0)))
+        return creased_normals(points[first], same[faces]).astype(np.float32)
+
+    def _look(self, material: Any) -> Look | None:
+        if id(material) not in self._looks:
+            pbr = isinstance(material, self._trimesh.visual.material.PBRMaterial)
+            self._looks[id(material)] = self._of_pbr(material) if pbr else self._of_mtl(material)
+        return self._looks[id(material)]
+
+    def _of_mtl(self, material: Any) -> Look | None:
+        """`Kd`, `Ks`, `Ns`, `d` or `Tr`, and `map_Kd`, whose picture multiplies the colour. `None` of one that trimesh
+        makes up for texture coordinates without a material, grey with a picture that comes from no file."""
+        more = getattr(material, "kwargs", None) or {}
+        if not more and getattr(material.image, "format", None) is None:
+            return None
+        rgba = (1.0, 1.0, 1.0, 1.0) if material.image is not None else GREY
+        if "kd" in more:
+            rgba = _rgba(material.diffuse)
+        alpha = _first(more.get("d"), 1.0 - _first(more.get("tr"), 0.0))
+        pictures = self._picture(material.image)
+        if maps := ", ".join(sorted(key for key in more if _other_map(key))):
+            self.skipped.append(f"{self._name}: of material {cut(material.name)} the pictures {maps}")
+        specular, gloss = more.get("ks"), _first(more.get("ns"), 64.0)
+        shine = 0.5 if specular is None else float(np.mean(specular))
+        return Look(
+            rgba=(*rgba[:3], min(max(alpha, 0.0), 1.0)),
+            name=cut(material.name),
+            specular=min(max(shine, 0.0), 1.0) if math.isfinite(shine) else 0.5,
+            shininess=min(max(gloss / 128.0, 0.0), 1.0),
+            pictures=pictures,
+        )
+
+    def _of_pbr(self, material: Any) -> Look:
+        rgba = (1.0, 1.0, 1.0, 1.0) if material.baseColorFactor is None else _rgba(material.baseColorFactor)
+        glow = 0.0 if material.emissiveFactor is None else float(np.max(material.emissiveFactor))
+        metallic = -1.0 if material.metallicFactor is None else float(material.metallicFactor)
+        roughness = -1.0 if material.roughnessFactor is None else float(material.roughnessFactor)
+        return Look(
+            rgba=rgba,
+            name=cut(material.name),
+            emission=max(0.0, glow),
+            shininess=0.5 if roughness < 0 else min(max(1.0 - roughness, 0.0), 1.0),
+            metallic=metallic,
+            roughness=roughness,
+            pictures=self._picture(material.baseColorTexture),
+        )
+
+    def _picture(self, image: Any) -> tuple[tuple[str, Picture], ...]:
+        if image is None:
+            return ()
+        if id(image) not in self._pictures:
+            pixels = pixels_of(image, f"a picture of {self._name}")
+            self._pictures[id(image)] = Picture(self._budget.spend(pixels))
+        picture = self._pictures[id(image)]
+        return ((TextureRole.RGBA if picture.pixels.shape[2] == 4 else TextureRole.RGB, picture),)
+
+
+def _rgba(color: Any) -> Rgba:
+    """Bytes of trimesh as a colour."""
+    if color is None:
+        return GREY
+    red, green, blue, alpha = (float(v) / 255 for v in np.asarray(color).reshape(-1)[:4])
+    return red, green, blue, alpha
+
+
+def _other_map(key: str) -> bool:
+    """Whether a word of an MTL file stands for a picture of something else than the colour."""
+    return key in _MAPS or (key.startswith("map_") and key not in ("map_kd", "map_ka"))
+
+
+def _first(value: Any, default: float) -> float:
+    """A finite number of an MTL file, which may come as a list of texts."""
+    try:
+        found = float(value[0] if isinstance(value, list | tuple) else value)
+    except (TypeError, ValueError, IndexError):
+        return default
+    return found if math.isfinite(found) else default
+
+
+def _resolver(trimesh: Any, references: References) -> Any:
+    """What trimesh asks for further files: ours decides which it may have, and keeps what was missing."""
+
+    class Resolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.missing: list[str] = []
+            self.materials: set[bytes] = set()  # names that MTL files define
+
+        def get(self, name: str) -> bytes:
+            try:
+                data = read_bounded(references.find(str(name).strip()))
+            except SceneBuildError as error:
+                self.missing.append(str(error))
+                raise
+            if str(name).strip().lower().endswith(".mtl"):
+                self.materials.update(found.strip() for found in _DEFINED.findall(data))
+            return data
+
+        def write(self, name: str, data: Any) -> None:
+            raise SceneBuildError("nothing is written where files are read")
+
+        def namespaced(self, namespace: str) -> Any:
+            return self
+
+        def keys(self) -> list[str]:
+            return []
+
+    return Resolver()
+
+
+def _trimesh() -> Any:
+    try:
+        import trimesh
+    except ImportError:
+        raise SceneBuildError("mesh files need trimesh: pip install 'iris-session[files]'") from None
+    logger = logging.getLogger("trimesh")
+    if not logger.handlers:  # else Python prints its tracebacks where nobody has asked for a log
+        logger.addHandler(logging.NullHandler())
+    return trimesh

@@ -1,0 +1,158 @@
+"""Whether what a file says is in metres, radians and colours from 0 to 1: what whoever adds it is asked, a line each.
+
+Nothing is refused for it: halls are large, and wheels turn far. Whatever is advised is to be typed as it stands, in
+place of what is there now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.scene.composed import Joint
+from iris_session.scene.elements import Matrix
+from iris_session.scene.extent import LARGEST_M, SMALLEST_M, length, unit_mistake
+from iris_session.scene.meshes import MeshArrays
+
+#: Limits of a joint that are no radians: three turns and more one way [rad], and no more than 2.5 turns in degrees.
+#: What is beyond is how some say that there are none.
+_FAR_RAD: Final = 20.0
+_FAR_DEGREES: Final = 900.0
+#: How far a colour may be above 1 by rounding.
+_ABOVE_ONE: Final = 1e-3
+_BYTE: Final = 255.0
+#: A box that is turned by 45 degrees around two axes has a box around it that is so many times as long, at most.
+_TURNED: Final = 3.0**0.5
+
+
+class Drawn(NamedTuple):
+    """One mesh or shape of a URDF. `what`: what it is. `side_m`: its longest side as the file has it. `scale`: of a
+    mesh, as its `<mesh>` has it, 1 where that has none; `None` for a shape, whose sizes stand in the file."""
+
+    what: str
+    side_m: float
+    scale: tuple[float, float, float] | None = None
+
+
+def side_of(placed: Sequence[tuple[MeshArrays, Matrix]]) -> float:
+    """Longest side of the box around meshes, each with where it is (4, 4) [m]; 0 of none. Where nobody would ask about
+    it, that of the boxes around them."""
+    rough = _side(_corners(mesh) @ T[:3, :3].T + T[:3, 3] for mesh, T in placed if mesh.vertices)
+    if _TURNED * SMALLEST_M <= rough <= LARGEST_M:
+        return rough
+    return _side(mesh.position.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for mesh, T in placed if mesh.vertices)
+
+
+def file_question(name: str, side_m: float, scale: Sequence[float]) -> tuple[str, ...]:
+    """Of a file that is drawn `side_m` large, by the `scale` that was given."""
+    mistake = unit_mistake(side_m)
+    return () if mistake is None else (f"{name} is {_told(side_m, mistake, _by_scale(scale, mistake[0]))}",)
+
+
+def robot_question(name: str, reach_m: float, drawn: Sequence[Drawn], scale: float) -> tuple[str, ...]:
+    """Of a URDF whose links lie within `reach_m` of one another in the file, drawn by the `scale` that was given."""
+    largest = max(drawn, key=lambda one: one.side_m, default=Drawn("shape", 0.0))
+    side_m, reach_m = scale * largest.side_m, scale * reach_m
+    of_drawn, of_joints = unit_mistake(side_m), unit_mistake(reach_m)
+    alike = of_drawn == of_joints or not reach_m
+    if of_drawn is not None and (alike and (reach_m or scale != 1.0)):
+        return (f"{name} is {_told(max(side_m, reach_m), of_drawn, _by_scale([scale], of_drawn[0]))}",)
+    if of_drawn is None and of_joints is not None and (scale != 1.0 or of_joints[0] < 1.0):
+        remedy = _by_scale([scale], of_joints[0]) if scale != 1.0 else "xyz of their <origin> divided by 1,000"
+        return (f"{name}: its joints reach over {_told(reach_m, of_joints, remedy, large='')}",)
+    if of_drawn is None:
+        return ()
+    return (f"{name}: its largest {largest.what} is {_told(side_m, of_drawn, _in_file(largest, of_drawn[0]))}",)
+
+
+def reach_of(joints: Iterable[Any], root: str) -> float:
+    """Longest side of the box around the origins of all links, joints at 0, as the file has them [m]."""
+    below: dict[str, list[Any]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    origins, waiting = [np.zeros(3)], [(root, np.eye(4))]
+    while waiting:
+        link, T_root_link = waiting.pop()
+        for joint in below.get(link, []):
+            T_root_child = T_root_link if joint.origin is None else T_root_link @ joint.origin
+            origins.append(T_root_child[:3, 3])
+            waiting.append((joint.child, T_root_child))
+    return float(np.ptp(origins, axis=0).max())
+
+
+def degrees_question(name: str, joints: Iterable[Joint]) -> tuple[str, ...]:
+    """Of joints whose limits can hardly be radians."""
+    odd = [
+        joint
+        for joint in joints
+        if joint.kind == "revolute" and _FAR_RAD < max(abs(joint.low), abs(joint.high)) <= _FAR_DEGREES
+    ]
+    if not odd:
+        return ()
+    first = odd[0]
+    which = f"joint {first.name}" if len(odd) == 1 else f"{len(odd)} joints, as {first.name},"
+    right = f"{math.radians(first.low):.4g} to {math.radians(first.high):.4g}"
+    return (
+        f"{name}: limits of {which} are {first.low:g} to {first.high:g} rad: degrees where radians are meant? "
+        f"Then it is {right}",
+    )
+
+
+def colour_question(name: str, material: str, rgba: Sequence[float]) -> tuple[str, ...]:
+    """Of a colour that is not from 0 to 1."""
+    if min(rgba) >= 0.0 and max(rgba) <= 1.0 + _ABOVE_ONE:
+        return ()
+    given = " ".join(f"{v:g}" for v in rgba)
+    said = (
+        f"{name}: rgba of material {material!r} is {given}, drawn as the nearest numbers from 0 to 1, which are meant"
+    )
+    if min(rgba) < 0.0 or max(rgba) > _BYTE:
+        return (said,)
+    *color, alpha = rgba
+    right = [v / _BYTE for v in color] if max(color) > 1.0 + _ABOVE_ONE else color
+    right.append(alpha / _BYTE if alpha > 1.0 + _ABOVE_ONE else alpha)
+    return (f"{said}; divided by 255 it is {' '.join(f'{v:.3g}' for v in right)}",)
+
+
+def _told(side_m: float, mistake: tuple[float, str], remedy: str, large: str = " large") -> str:
+    factor, what = mistake
+    return f"{length(side_m)}{large}: {what} {remedy} makes it {length(factor * side_m)}"
+
+
+def _by_scale(given: Sequence[float], factor: float) -> str:
+    """The scale that makes what was drawn by `given` larger by `factor`."""
+    whole = [factor * one for one in given]
+    if all(math.isclose(one, 1.0) for one in whole):
+        return "leaving out scale (--scale)"
+    text = f"{whole[0]:g}"
+    found = f"scale={text} (--scale {text})"
+    if len(set(whole)) > 1:
+        found = f"scale=({', '.join(f'{one:g}' for one in whole)})"
+    before = {f"{one:g}" for one in given} - {"1"}
+    return found + (" in place of the present one" if before else "")
+
+
+def _in_file(drawn: Drawn, factor: float) -> str:
+    if drawn.scale is None:
+        return f"its sizes {'divided' if factor < 1.0 else 'multiplied'} by 1,000"
+    whole = [factor * one for one in drawn.scale]
+    if all(math.isclose(one, 1.0) for one in whole):
+        return "leaving out scale at its <mesh>"
+    return f'scale="{" ".join(f"{one:g}" for one in whole)}" at its <mesh>'
+
+
+def _corners(mesh: MeshArrays) -> NDArray[np.float64]:
+    """Of the box around a mesh, (8, 3)."""
+    low, high = mesh.position.min(axis=0), mesh.position.max(axis=0)
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])], float)
+
+
+def _side(points: Iterable[NDArray[np.float64]]) -> float:
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for some in points:
+        low, high = np.minimum(low, some.min(axis=0)), np.maximum(high, some.max(axis=0))
+    return float((high - low).max()) if bool((low <= high).all()) else 0.0

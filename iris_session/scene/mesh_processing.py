@@ -1,0 +1,236 @@
+"""Coarser meshes with a stated error: vertices of one cell of a grid become one of them.
+
+Not a quadric decimation, which keeps flat parts better: here the error is proven. No point of a triangle moves farther
+than the vertex that moves most. (fast-simplification states no error, and keeps global state: it may not run in
+threads.) Parts that fit into a cell vanish. Meshes with texture coordinates or colours are not made coarser: these
+would move across seams.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iris_session.protocol.scene import Rgba
+from iris_session.scene.elements import Matrix
+from iris_session.scene.meshes import MeshArrays, index_corners, unique_rows
+
+#: A corner whose smooth normal is farther than this (cosine) from the face's gets the face's: MuJoCo's rule for meshes.
+CREASE: Final = 0.8
+#: Attempts to meet the wanted number of triangles by another size of the cells.
+_TRIES: Final = 3
+#: How often cells are halved for what is long and thin.
+_FINER: Final = 4
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def simplified(mesh: MeshArrays, triangles: int) -> tuple[MeshArrays, float] | None:
+    """A mesh of about `triangles`, and how far its points lie from `mesh` at most [m].
+
+    `None` where that would gain less than a quarter, and when `mesh` is textured or coloured.
+    """
+    if mesh.uv is not None or mesh.color is not None or triangles <= 0 or mesh.triangles <= triangles:
+        return None
+    first, inverse = sorted_rows(mesh.position)
+    points = mesh.position[first].astype(np.float64)
+    index = inverse[mesh.index]
+    area = float(np.linalg.norm(_across(points[index]), axis=1).sum())
+    cell = np.sqrt(max(area, 1e-18) / triangles)  # a cell of surface is about two triangles; `area` is twice the area
+    best: tuple[Doubles, Ints, float] | None = None
+    for _ in range(_TRIES):
+        found = _clustered(points, index, float(cell))
+        if len(found[1]) and (best is None or abs(len(found[1]) - triangles) < abs(len(best[1]) - triangles)):
+            best = found
+        cell *= np.clip(np.sqrt(max(1, len(found[1])) / triangles), 0.5, 2.0)
+    if best is None or len(best[1]) > 0.75 * mesh.triangles:
+        return None
+    return smooth_mesh(best[0], best[1]), best[2]
+
+
+def _clustered(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, float]:
+    """Points that stay, triangles between them, and the longest way that a point moved.
+
+    What is long and thin, as rods and legs of tables, would be gone where its width fits into a cell: it is clustered
+    again in finer ones, at last in none.
+    """
+    found, faces, n_points, longest = [], [], 0, 0.0
+    for finer in range(_FINER + 1):
+        some, between, lost, moved = _once(points, index, cell / (1 << finer))
+        found.append(some)
+        faces.append(between + n_points)
+        n_points, longest, index = n_points + len(some), max(longest, moved), lost
+        if not len(lost):
+            break
+    used, last = _compact(index, len(points))
+    found.append(points[used])
+    faces.append(last + n_points)
+    return np.concatenate(found), np.concatenate(faces), longest
+
+
+def _once(points: Doubles, index: Ints, cell: float) -> tuple[Doubles, Ints, Ints, float]:
+    """As `_clustered`, for one size of cells; before the way the triangles that are lost."""
+    used, index = _compact(index, len(points))
+    points = points[used]
+    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    _, cluster = sorted_rows(cells)
+    count = np.bincount(cluster)
+    mean = np.stack([np.bincount(cluster, points[:, k]) for k in range(3)], axis=1) / count[:, None]
+    off = np.linalg.norm(points - mean[cluster], axis=1)
+    order = np.lexsort((off, cluster))
+    keep = order[np.searchsorted(cluster[order], np.arange(len(count)))]  # of each cell the point nearest to the mean
+    faces = cluster[index]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    moved = float(np.linalg.norm(points - points[keep][cluster], axis=1).max(initial=0.0))
+    lost = used[_lost(points, index[~whole], faces[~whole], faces[whole], 2 * moved)]
+    faces = faces[whole]
+    turned_over = np.einsum("fc,fc->f", _across(points[index[whole]]), _across(points[keep][faces])) < 0
+    faces[turned_over] = faces[turned_over][:, ::-1]
+    turned = np.argmin(faces, axis=1)[:, None] + np.arange(3)
+    faces = np.take_along_axis(faces, turned % 3, axis=1)
+    faces = faces[sorted_rows(faces)[0]]
+    stay, faces = np.unique(faces, return_inverse=True)
+    return points[keep[stay]], faces.reshape(-1, 3), lost, moved
+
+
+def _compact(index: Ints, n_points: int) -> tuple[Ints, Ints]:
+    """The points that triangles have, in order, and the triangles between these."""
+    has = np.zeros(n_points, bool)
+    has[index] = True
+    return np.flatnonzero(has), (np.cumsum(has) - 1)[index]
+
+
+def _lost(points: Doubles, flat: Ints, ends: Ints, faces: Ints, small: float) -> Ints:
+    """Of the triangles `flat`, which became lines or points between the clusters `ends`, those of parts larger than
+    `small` [m] of which nothing is left: no edge or corner of `faces` lies where they were."""
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    n = int(max(high.max(initial=0), faces.max(initial=0))) + 1
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    corners = np.flatnonzero(np.bincount(faces.reshape(-1), minlength=n))
+    there = np.concatenate([edges[:, 0] * n + edges[:, 1], corners * (n + 1)])
+    gone: Ints = flat[~np.isin(low * n + high, there)]
+    if not len(gone):
+        return gone
+    part = _parts(gone, len(points))
+    which = np.repeat(part, 3)
+    at = points[gone.reshape(-1)]
+    box = np.zeros((2, int(part.max()) + 1, 3))
+    box[0], box[1] = np.inf, -np.inf
+    np.minimum.at(box[0], which, at)
+    np.maximum.at(box[1], which, at)
+    large: Ints = gone[np.linalg.norm(box[1, part] - box[0, part], axis=1) > small]
+    return large
+
+
+def _parts(faces: Ints, n_points: int) -> Ints:
+    """Of each triangle the part that it belongs to, with all that share corners: the least number of these."""
+    least = np.arange(n_points)
+    while True:
+        of_corners = least[faces]
+        of_faces = np.repeat(of_corners.min(axis=1), 3)
+        lower = least.copy()
+        np.minimum.at(lower, of_corners.reshape(-1), of_faces)
+        np.minimum.at(lower, faces.reshape(-1), of_faces)
+        lower = lower[lower]
+        if np.array_equal(lower, least):
+            return least[faces[:, 0]]
+        least = lower
+
+
+def sorted_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
+    """Of the different rows (n, 3), ordered by their columns: where each stands first; and for every row which of them
+    it is. As `np.unique` over an axis, which takes several times as long on large meshes."""
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    new = np.ones(len(rows), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    which = np.empty(len(rows), np.int64)
+    which[order] = np.cumsum(new) - 1
+    return order[new], which
+
+
+def smooth_mesh(points: Doubles, faces: Ints) -> MeshArrays:
+    """Corners with area-weighted normals, creased by `CREASE`."""
+    corners = points[faces]
+    return index_corners(corners.astype(np.float32), creased_normals(points, faces).astype(np.float32), None)
+
+
+def creased_normals(points: Doubles, faces: Ints) -> Doubles:
+    """Normals at the corners of faces, (m, 3, 3): area-weighted, those of the face itself across a crease."""
+    face_normal = _across(points[faces])
+    around, each = faces.T.reshape(-1), np.tile(face_normal, (3, 1))
+    vertex_normal = np.stack([np.bincount(around, each[:, k], len(points)) for k in range(3)], axis=1)
+    face_normal = unit(face_normal)
+    normal = unit(vertex_normal)[faces]
+    creased = np.einsum("fkc,fc->fk", normal, face_normal) < CREASE
+    normal[creased] = np.broadcast_to(face_normal[:, None], normal.shape)[creased]
+    return normal
+
+
+def _across(corners: Doubles) -> Doubles:
+    """Normals of triangles (n, 3, 3), as long as twice the area."""
+    normals: Doubles = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals
+
+
+def unit(vectors: NDArray[Any]) -> NDArray[Any]:
+    """Vectors of length 1; those without length become +z, as MuJoCo's renderer has it."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-15, vectors / np.maximum(length, 1e-15), np.array([0, 0, 1], vectors.dtype))
+
+
+# --- transformed meshes -----------------------------------------------------------------------------------------------
+
+
+@np.errstate(all="ignore")  # what gets out of reach is refused by its coordinates
+def scaled(mesh: MeshArrays, scale: Matrix | None) -> MeshArrays:
+    """`mesh` with the matrix (3, 3) in its vertices; the triangles are turned over where that mirrors."""
+    if scale is None:
+        return mesh
+    across = np.linalg.inv(scale)  # normals go with the inverse's transpose
+    position = (mesh.position.astype(np.float64) @ scale.T).astype(np.float32)
+    normal = unit(mesh.normal.astype(np.float64) @ across).astype(np.float32)
+    if np.linalg.det(scale) > 0:
+        return replace(mesh, position=position, normal=normal)
+    index = mesh.index[:, [0, 2, 1]]  # and with it the order in which corners are used, by which they are numbered
+    uv = None if mesh.uv is None else mesh.uv[index]
+    color = None if mesh.color is None else mesh.color[index]
+    return index_corners(position[index], normal[index], uv, color)
+
+
+def closed(mesh: MeshArrays) -> bool:
+    """Whether every edge has its triangles on both sides, so that nobody sees the inside."""
+    _, vertex = unique_rows(np.ascontiguousarray(mesh.position + np.float32(0.0)))  # -0 is 0
+    corner = vertex[mesh.index].astype(np.int64)
+    start, end = corner.reshape(-1), corner[:, [1, 2, 0]].reshape(-1)
+    count = int(corner.max(initial=0)) + 1
+    return bool(np.array_equal(np.sort(start * count + end), np.sort(end * count + start)))
+
+
+def both_sides(mesh: MeshArrays) -> MeshArrays:
+    """`mesh` with every triangle from behind too, unless it is closed."""
+    if closed(mesh):
+        return mesh
+    n = np.uint32(mesh.vertices)
+
+    def twice(values: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([values, values])
+
+    return MeshArrays(
+        position=twice(mesh.position),
+        normal=np.concatenate([mesh.normal, -mesh.normal]),
+        uv=None if mesh.uv is None else twice(mesh.uv),
+        index=np.concatenate([mesh.index, mesh.index[:, [0, 2, 1]] + n]),
+        color=None if mesh.color is None else twice(mesh.color),
+    )
+
+
+def recoloured(mesh: MeshArrays, rgba: Rgba) -> tuple[MeshArrays, Rgba]:
+    """A mesh whose corners all have one colour, without them and with that colour in `rgba`."""
+    if mesh.color is None or not len(mesh.color) or bool((mesh.color != mesh.color[0]).any()):
+        return mesh, rgba
+    red, green, blue, alpha = (float(a) * float(b) / 255 for a, b in zip(rgba, mesh.color[0], strict=True))
+    return replace(mesh, color=None), (red, green, blue, alpha)

@@ -1,0 +1,241 @@
+"""Names, materials, lights, cameras and environment of a compiled MuJoCo model.
+
+Fields that older versions of MuJoCo lack keep their defaults.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from iris_session.protocol.common import MAX_TEXT, Pose, Vec3
+from iris_session.protocol.names import Follow, LightKind, TextureKind
+from iris_session.protocol.scene import Camera, Environment, Headlight, Light, Material, Rgb, Rgba, Texture, TextureUse
+
+#: MuJoCo's default colour: a geom that has it takes its material's.
+_DEFAULT_RGBA: Final = (0.5, 0.5, 0.5, 1.0)
+_ROLES: Final = {
+    int(value): name.removeprefix("mjTEXROLE_").lower()
+    for name, value in mujoco.mjtTextureRole.__members__.items()
+    if name.startswith("mjTEXROLE_")
+}
+_LIGHTS: Final = {0: LightKind.SPOT, 1: LightKind.DIRECTIONAL, 2: LightKind.POINT, 3: LightKind.IMAGE}
+_FOLLOW: Final = {
+    0: Follow.FIXED,
+    1: Follow.TRACK,
+    2: Follow.TRACK_COM,
+    3: Follow.TARGET_BODY,
+    4: Follow.TARGET_BODY_COM,
+}
+_ORTHOGRAPHIC: Final = 1
+#: Values of `_FOLLOW` for what moves with a body and does not turn with it.
+_TRACKING: Final = frozenset({1, 2})
+#: What differs by less [m, and parts of unit vectors] is where the model says, to the bit.
+_SAME: Final = 1e-6
+_TYPES: Final = {
+    kind: int(getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"))
+    for kind in ("body", "geom", "site", "mesh", "texture", "material", "hfield", "light", "camera", "flex", "tendon")
+}
+
+
+def rgb(values: Any) -> Rgb:
+    red, green, blue = (float(v) for v in values)
+    return red, green, blue
+
+
+def rgba(values: Any) -> Rgba:
+    red, green, blue, alpha = (float(v) for v in values)
+    return red, green, blue, alpha
+
+
+def vec3(values: Any) -> Vec3:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def pose(position: Any, quaternion: Any) -> Pose:
+    w, x, y, z = (float(v) for v in quaternion)
+    return Pose(vec3(position), (w, x, y, z))
+
+
+def drawn_rgba(model: mujoco.MjModel, own: Any, material: int) -> Rgba:
+    """The colour that MuJoCo draws: its own, unless that is the default and there is a material."""
+    color = rgba(own)
+    return rgba(model.mat_rgba[material]) if material >= 0 and color == _DEFAULT_RGBA else color
+
+
+def materials(model: mujoco.MjModel) -> tuple[Material, ...]:
+    """All materials, by id."""
+    return tuple(
+        Material(
+            name=label(model, "material", i),
+            rgba=rgba(model.mat_rgba[i]),
+            emission=float(model.mat_emission[i]),
+            specular=float(model.mat_specular[i]),
+            shininess=float(model.mat_shininess[i]),
+            reflectance=float(model.mat_reflectance[i]),
+            metallic=_optional(model, "mat_metallic", i, -1.0),
+            roughness=_optional(model, "mat_roughness", i, -1.0),
+            textures=tuple(
+                TextureUse(_ROLES.get(role, str(role)), int(texture))
+                for role, texture in enumerate(model.mat_texid[i])
+                if texture >= 0
+            ),
+            repeat=(float(model.mat_texrepeat[i, 0]), float(model.mat_texrepeat[i, 1])),
+            uniform=bool(model.mat_texuniform[i]),
+        )
+        for i in range(model.nmat)
+    )
+
+
+def tracked(model: mujoco.MjModel, data: Any) -> Any | None:
+    """A copy of `data` with places of lights and cameras, if any moves with its body and does not turn with it: where
+    such a one stands in its body's frame depends on the state. `None`: all stand as the model says."""
+    if data is None or not {*model.light_mode.tolist(), *model.cam_mode.tolist()} & _TRACKING:
+        return None
+    own = copy.copy(data)
+    mujoco.mj_kinematics(model, own)
+    mujoco.mj_comPos(model, own)
+    mujoco.mj_camlight(model, own)
+    return own
+
+
+def _into_body(at: Any, body: int, v_world: Any) -> Any:
+    """A vector of the world in the frame of a body."""
+    q_body_world, v_body = np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(q_body_world, at.xquat[body])
+    mujoco.mju_rotVecQuat(v_body, v_world, q_body_world)
+    return v_body
+
+
+def _light_place(model: mujoco.MjModel, i: int, at: Any | None) -> tuple[Vec3, Vec3]:
+    """Place and direction in the frame of its body. `at`: of `tracked`."""
+    rigid = vec3(model.light_pos[i]), vec3(model.light_dir[i])
+    if at is None or int(model.light_mode[i]) not in _TRACKING:
+        return rigid
+    body = int(model.light_bodyid[i])
+    p_body = _into_body(at, body, at.light_xpos[i] - at.xpos[body])
+    found = vec3(p_body), vec3(_into_body(at, body, at.light_xdir[i]))
+    return rigid if np.allclose(rigid, found, rtol=0, atol=_SAME) else found
+
+
+def _camera_place(model: mujoco.MjModel, i: int, at: Any | None) -> Pose:
+    """T_body_camera. `at`: of `tracked`."""
+    rigid = pose(model.cam_pos[i], model.cam_quat[i])
+    if at is None or int(model.cam_mode[i]) not in _TRACKING:
+        return rigid
+    body, q_world, q_body_world, q_body = int(model.cam_bodyid[i]), np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_mat2Quat(q_world, at.cam_xmat[i])
+    mujoco.mju_negQuat(q_body_world, at.xquat[body])
+    mujoco.mju_mulQuat(q_body, q_body_world, q_world)
+    found = pose(_into_body(at, body, at.cam_xpos[i] - at.xpos[body]), q_body)
+    near = abs(np.dot(rigid.q, found.q)) >= 1.0 - _SAME**2 and np.allclose(rigid.p, found.p, rtol=0, atol=_SAME)
+    return rigid if near else found
+
+
+def lights(model: mujoco.MjModel, at: Any | None = None) -> tuple[Light, ...]:
+    """All lights, by id. `at`: of `tracked`."""
+    places = [_light_place(model, i, at) for i in range(model.nlight)]
+    return tuple(
+        Light(
+            name=label(model, "light", i),
+            kind=_light_kind(model, i),
+            body=int(model.light_bodyid[i]),
+            p_body=places[i][0],
+            direction_body=places[i][1],
+            ambient=rgb(model.light_ambient[i]),
+            diffuse=rgb(model.light_diffuse[i]),
+            specular=rgb(model.light_specular[i]),
+            attenuation=vec3(model.light_attenuation[i]),
+            cutoff=float(model.light_cutoff[i]),
+            exponent=float(model.light_exponent[i]),
+            range=_optional(model, "light_range", i, 0.0),
+            intensity=_optional(model, "light_intensity", i, 0.0),
+            bulb_radius=_optional(model, "light_bulbradius", i, 0.0),
+            texture=int(_optional(model, "light_texid", i, -1)),
+            castshadow=bool(model.light_castshadow[i]),
+            active=bool(model.light_active[i]),
+            follow=_FOLLOW.get(int(model.light_mode[i]), Follow.FIXED),
+            target=int(model.light_targetbodyid[i]),
+        )
+        for i in range(model.nlight)
+    )
+
+
+def _light_kind(model: mujoco.MjModel, index: int) -> str:
+    if hasattr(model, "light_type"):
+        return _LIGHTS.get(int(model.light_type[index]), LightKind.SPOT)
+    return LightKind.DIRECTIONAL if model.light_directional[index] else LightKind.SPOT  # before MuJoCo 3.3.3
+
+
+def cameras(model: mujoco.MjModel, at: Any | None = None) -> tuple[Camera, ...]:
+    """All cameras, by id. `at`: of `tracked`."""
+    found = []
+    for i in range(model.ncam):
+        width, height = (int(n) for n in model.cam_resolution[i])
+        sensor = [float(v) for v in model.cam_sensorsize[i]]
+        focal, principal = (0.0, 0.0), (0.0, 0.0)
+        if sensor[0] > 0 and sensor[1] > 0:  # lengths on the sensor to pixels
+            per_metre = (width / sensor[0], height / sensor[1])
+            f_x, f_y, c_x, c_y = (float(v) for v in model.cam_intrinsic[i])
+            focal = (f_x * per_metre[0], f_y * per_metre[1])
+            principal = (c_x * per_metre[0], c_y * per_metre[1])
+        found.append(
+            Camera(
+                name=label(model, "camera", i),
+                body=int(model.cam_bodyid[i]),
+                T_body_camera=_camera_place(model, i, at),
+                fovy=float(model.cam_fovy[i]),
+                orthographic=_projection(model, i) == _ORTHOGRAPHIC,
+                focal=focal,
+                principal=principal,
+                resolution=(width, height),
+                follow=_FOLLOW.get(int(model.cam_mode[i]), Follow.FIXED),
+                target=int(model.cam_targetbodyid[i]),
+            )
+        )
+    return tuple(found)
+
+
+def _projection(model: mujoco.MjModel, index: int) -> int:
+    if hasattr(model, "cam_projection"):
+        return int(model.cam_projection[index])
+    return int(model.cam_orthographic[index])
+
+
+def environment(model: mujoco.MjModel, textures: Sequence[Texture]) -> Environment:
+    """What surrounds the scene; MuJoCo draws the first texture of kind skybox."""
+    extent = float(model.stat.extent)
+    headlight, scale = model.vis.headlight, model.vis.map
+    skyboxes = [i for i, texture in enumerate(textures) if texture.kind == TextureKind.SKYBOX]
+    return Environment(
+        headlight=Headlight(
+            bool(headlight.active), rgb(headlight.ambient), rgb(headlight.diffuse), rgb(headlight.specular)
+        ),
+        skybox=skyboxes[0] if skyboxes else -1,
+        haze_rgba=rgba(model.vis.rgba.haze),
+        haze=float(scale.haze),
+        fog_rgba=rgba(model.vis.rgba.fog),
+        fog_start=float(scale.fogstart) * extent,
+        fog_end=float(scale.fogend) * extent,
+        znear=float(scale.znear) * extent,
+        zfar=float(scale.zfar) * extent,
+        extent=extent,
+        center=vec3(model.stat.center),
+    )
+
+
+def _optional(model: mujoco.MjModel, field: str, index: int, default: float) -> float:
+    return float(getattr(model, field)[index]) if hasattr(model, field) else default
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def label(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """The name, or an empty text."""
+    return (mujoco.mj_id2name(model, _TYPES[kind], index) or "")[:MAX_TEXT]

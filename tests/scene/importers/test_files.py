@@ -1,0 +1,329 @@
+"""OBJ, STL, PLY, OFF, DAE, 3MF: geometry, colours and textures as the files have them; what a file may refer to."""
+
+from __future__ import annotations
+
+import re
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from iris_session.scene import AssetStore, SceneBuildError, decode_image, decode_mesh
+from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.composed import ComposedScene
+from iris_session.scene.elements import MAX_FILE_BYTES, matrix_of
+from iris_session.scene.importers.files import load_file
+from iris_session.scene.importers.references import References
+
+PIXELS = np.random.default_rng(2).integers(0, 255, (4, 8, 3), dtype=np.uint8)
+OBJ = """mtllib parts.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 0 0.25
+usemtl red
+f 1 2 3
+usemtl painted
+f 1/1 2/2 4/3
+"""
+MTL = """newmtl red
+Kd 0.8 0.2 0.2
+d 0.4
+newmtl painted
+Kd 1 1 1
+map_Kd picture.png
+"""
+
+
+def built(path: Path, tmp_path: Path, **options: object) -> tuple[ComposedScene, AssetStore]:
+    store = AssetStore(tmp_path / "store")
+    scene = SceneBuilder("test")
+    scene.add_file(path, **options)
+    return scene.build(store), store
+
+
+def write_obj(folder: Path) -> Path:
+    Image.fromarray(PIXELS).save(folder / "picture.png")
+    (folder / "parts.mtl").write_text(MTL)
+    (folder / "parts.obj").write_text(OBJ)
+    return folder / "parts.obj"
+
+
+def test_obj_with_materials_and_a_texture(tmp_path: Path) -> None:
+    scene, store = built(write_obj(tmp_path), tmp_path)
+    assert scene.skipped == ()
+    by_name = {visual.name: visual for visual in scene.spec.visuals}
+    assert by_name["red"].rgba == pytest.approx((0.8, 0.2, 0.2, 0.4), abs=0.003)
+    painted = by_name["painted"]
+    level = scene.spec.textures[scene.spec.materials[painted.material].texture()].levels[0]
+    np.testing.assert_array_equal(decode_image(store.get(level.address), level.encoding), PIXELS)
+    mesh = decode_mesh(store.get(scene.spec.meshes[painted.geometry.mesh].levels[0].address))
+    assert mesh.uv is not None
+    at = {tuple(p): tuple(uv) for p, uv in zip(mesh.position.tolist(), mesh.uv.tolist(), strict=True)}
+    assert at == {(0, 0, 0): (0, 1), (1, 0, 0): (1, 1), (0, 0, 1): (0, 0.75)}  # v goes down here, up in the file
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj", "dae", "3mf"])
+def test_geometry_of_every_format(tmp_path: Path, kind: str) -> None:
+    mesh = trimesh.creation.annulus(0.2, 0.5, 0.3)
+    path = tmp_path / f"ring.{kind}"
+    mesh.export(path)
+    scene, store = built(path, tmp_path, name="ring", movable=True, up="z")
+    assert scene.moving == ("ring",)
+    visual = scene.spec.visuals[0]
+    found = decode_mesh(store.get(scene.spec.meshes[visual.geometry.mesh].levels[0].address))
+    again = trimesh.Trimesh(found.position, found.index, process=True).apply_transform(matrix_of(visual.T_body_visual))
+    unit = 0.001 if kind == "3mf" else 1.0  # which counts in millimetres
+    np.testing.assert_allclose(again.bounds, unit * mesh.bounds, atol=1e-6)
+    assert again.volume == pytest.approx(unit**3 * mesh.volume, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "off", "obj"])
+def test_what_has_no_name_in_its_file_has_that_it_is_added_with(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"ring.{kind}"
+    bare = trimesh.exchange.export.export_mesh(trimesh.creation.box(), path, file_type=kind)
+    if kind == "obj":  # without the `o` of its exporter
+        path.write_text("".join(line for line in bare.splitlines(keepends=True) if not line.startswith("o ")))
+    scene = SceneBuilder()
+    scene.add_file(path)
+    scene.add_file(path, name="left", movable=True)
+    scene.add_file(path, name="right", movable=True)
+    spec = scene.build(AssetStore(tmp_path / "store")).spec
+    bodies = {body.id: body.name for body in spec.bodies}
+    assert [(visual.name, bodies[visual.body]) for visual in spec.visuals] == [
+        (name, name) for name in ("ring", "left", "right")
+    ]
+    assert spec.meshes[0].name == "ring"
+
+
+def test_several_without_a_name_are_numbered(tmp_path: Path) -> None:
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 {z}\nvertex 1 0 {z}\nvertex 0 1 {z}\nendloop\nendfacet\n"
+    solids = [f"solid{name}\n{facet.format(z=z)}endsolid{name}\n" for z, name in enumerate(("", " lid", ""))]
+    (tmp_path / "a.stl").write_text("".join(solids))
+    spec = built(tmp_path / "a.stl", tmp_path, name="case")[0].spec
+    assert [visual.name for visual in spec.visuals] == ["case_1", "lid", "case_2"]
+    assert [body.name for body in spec.bodies] == ["world", "case", "case_1", "lid", "case_2"]
+
+
+def test_scale_and_the_axis_that_is_up(tmp_path: Path) -> None:
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "a.stl")
+    for up, size in ((None, (1, 2, 3)), ("z", (1, 2, 3)), ("y", (1, 3, 2))):
+        scene, _ = built(tmp_path / "a.stl", tmp_path, scale=0.01, up=up, position=(0, 0, 5))
+        assert scene.spec.environment.center == pytest.approx((0, 0, 5))
+        mesh = scene.spec.meshes[0]
+        T = matrix_of(scene.spec.visuals[0].T_body_visual)[:3, :3]
+        extent = np.abs(T @ (np.array(mesh.high) - mesh.low))
+        np.testing.assert_allclose(extent, 0.01 * np.array(size), atol=1e-7)
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "x.dae")
+    text = (tmp_path / "x.dae").read_text()
+    assert "<up_axis>" in text
+    (tmp_path / "x.dae").write_text(re.sub("[XYZ]_UP", "X_UP", text))
+    with pytest.raises(SceneBuildError, match=r"x\.dae says that x is up: give up='y' or up='z'"):
+        built(tmp_path / "x.dae", tmp_path)
+    built(tmp_path / "x.dae", tmp_path, up="z")
+    with pytest.raises(SceneBuildError, match="up is 'x'"):
+        built(tmp_path / "a.stl", tmp_path, up="x")
+    with pytest.raises(SceneBuildError, match="scale is 0"):
+        built(tmp_path / "a.stl", tmp_path, scale=0)
+    for scale in (float("nan"), "big", (1, 2), [[1], [1, 2]], None):
+        with pytest.raises(SceneBuildError, match="scale"):
+            built(tmp_path / "a.stl", tmp_path, scale=scale)
+
+
+def test_colours_at_vertices_and_faces(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
+    box.visual.vertex_colors = colors
+    box.export(tmp_path / "a.ply")
+    scene, store = built(tmp_path / "a.ply", tmp_path)
+    mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
+    assert mesh.color is not None
+    for position, color in zip(mesh.position, mesh.color, strict=True):
+        vertex = int(np.flatnonzero((box.vertices == position).all(axis=1))[0])
+        assert color.tolist() == colors[vertex].tolist()
+    assert scene.spec.visuals[0].rgba == (1.0, 1.0, 1.0, 1.0)
+    box = trimesh.creation.box()
+    box.visual.face_colors = [[255, 0, 0, 255]] * 6 + [[0, 0, 255, 255]] * 6
+    box.export(tmp_path / "b.ply")
+    scene, store = built(tmp_path / "b.ply", tmp_path)
+    mesh = decode_mesh(store.get(scene.spec.meshes[0].levels[0].address))
+    assert mesh.color is not None
+    assert sorted({tuple(c) for c in mesh.color[mesh.index].reshape(-1, 4).tolist()}) == [
+        (0, 0, 255, 255),
+        (255, 0, 0, 255),
+    ]
+    # a colour that is given takes their place
+    scene, store = built(tmp_path / "b.ply", tmp_path, rgba=(0, 1, 0, 1))
+    assert decode_mesh(store.get(scene.spec.meshes[0].levels[0].address)).color is None
+    assert scene.spec.visuals[0].rgba == (0.0, 1.0, 0.0, 1.0)
+
+
+def test_what_a_material_does_not_say_is_not_made_up(tmp_path: Path) -> None:
+    """A texture is not darkened, and a URDF colours a mesh that has coordinates but no material."""
+    path = write_obj(tmp_path)
+    (tmp_path / "parts.mtl").write_text("newmtl painted\nmap_Kd picture.png\n")
+    looks = {node.name: node.surfaces[0].look for node in load_file(path).nodes}
+    painted = next(look for look in looks.values() if look is not None and look.pictures)
+    assert painted.rgba == (1.0, 1.0, 1.0, 1.0)
+    (tmp_path / "bare.obj").write_text(OBJ.replace("mtllib parts.mtl\n", "").replace("f 1 2 3\n", ""))
+    (node,) = load_file(tmp_path / "bare.obj").nodes
+    assert node.surfaces[0].look is None
+    assert node.surfaces[0].mesh.uv is not None
+
+
+def test_numbers_of_a_material_that_are_none_are_left_out(tmp_path: Path) -> None:
+    """Clients and the picture of a recording would draw nothing of the scene."""
+    path = write_obj(tmp_path)
+    (tmp_path / "parts.mtl").write_text(MTL.replace("d 0.4", "d nan\nNs nan\nKs nan nan nan"))
+    scene, _ = built(path, tmp_path)
+    visual = next(visual for visual in scene.spec.visuals if visual.name == "red")
+    assert visual.rgba == pytest.approx((0.8, 0.2, 0.2, 1.0), abs=0.003)
+    assert visual.material == -1 or scene.spec.materials[visual.material].specular == 0.5
+
+
+def test_what_is_missing_is_told(tmp_path: Path) -> None:
+    path = write_obj(tmp_path)
+    (tmp_path / "picture.png").unlink()
+    scene, _ = built(path, tmp_path)
+    assert any("picture.png: there is no file" in line for line in scene.skipped)
+    (tmp_path / "parts.mtl").write_text(MTL.replace("picture.png", "../../etc/passwd"))
+    scene, _ = built(path, tmp_path)
+    assert any("outside of its own folders" in line for line in scene.skipped)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "text"),
+    [
+        ("a.stl", b"", "is empty: 0 bytes"),
+        ("a.stl", b"solid x\nfacet", "is cut: an STL of text ends with endsolid"),
+        ("a.stl", b"\x89PNG", "is cut, or no STL"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "cut: its head says 9 lines, and it has 0"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "outside the range of its vertices"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
+        ("a.dae", b"<COLLADA>", "is cut: it ends in line 1, without </COLLADA>"),
+        ("a.dae", b"<!DOCTYPE COLLADA [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><COLLADA/>", "has a DOCTYPE"),
+        ("a.dae", "<COLLADA/>".encode("utf-16"), "no XML in UTF-8"),
+        ("a.dae", b"<?xml version='1.0' encoding='UTF-7'?><COLLADA/>", "no XML in UTF-8"),
+        ("a.3mf", b"PK\3\4", "is cut, or no 3MF"),
+        ("a.glb", b"glTF", "cut"),
+        ("a.glb", b"", "is empty: 0 bytes"),
+        ("a.glb", b"\x89PNG", "no GLB: it begins with .* where b'glTF' is needed"),
+        ("a.gltf", b"[]", "no glTF"),
+        ("a.gltf", b"{", "no glTF"),
+        ("a.step", b"x", r"are not read\. These are: glb, .*, stl; urdf by add_urdf; mjb, mjcf, xml by Session"),
+        ("a", b"x", "no ending"),
+        ("a.urdf", b"<robot/>", "a URDF is a robot: use add_urdf"),
+        ("a.xml", b"<mujoco/>", r"are MuJoCo's: Session\('a\.xml'\) shares one"),
+        ("a.urdf.xacro", b"<robot/>", r"xacro a\.urdf\.xacro > a\.urdf \(ROS has it; else pip install xacro\)"),
+    ],
+)
+def test_what_is_no_such_file_is_refused(tmp_path: Path, name: str, data: bytes, text: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SceneBuildError, match=text):
+        load_file(tmp_path / name)
+
+
+def test_a_mistake_of_ours_is_not_only_told_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader of ours that stops is named; what a library stops at says nothing to anybody."""
+    monkeypatch.setattr("iris_session.scene.importers.trimesh_files.read_with_trimesh", wrong_reader)
+    monkeypatch.setattr("iris_session.scene.importers.files._ROOM", Path(__file__).parent)
+    (tmp_path / "a.stl").write_bytes(b"solid a")
+    with pytest.raises(SceneBuildError, match=r"^.{,500}please report: TypeError: .{,200}, test_files\.py:\d+\)$"):
+        load_file(tmp_path / "a.stl")
+    monkeypatch.setattr("iris_session.scene.importers.files._ROOM", tmp_path)
+    with pytest.raises(SceneBuildError, match=r"export or download it again$"):
+        load_file(tmp_path / "a.stl")
+
+
+def wrong_reader(*_: object) -> None:
+    raise TypeError("'float' object\nis not iterable" + "!" * 1000)
+
+
+def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SceneBuildError, match="no such file"):
+        load_file(tmp_path / "lost.stl")
+    (tmp_path / "folder.stl").mkdir()
+    with pytest.raises(SceneBuildError, match=r"is a folder: name a file; none in it is of a kind .* \(3mf, "):
+        load_file(tmp_path / "folder.stl")
+    with (tmp_path / "large.stl").open("wb") as file:
+        file.truncate(MAX_FILE_BYTES + 1)
+    with pytest.raises(SceneBuildError, match="at most 512 MiB"):
+        load_file(tmp_path / "large.stl")
+    monkeypatch.setattr("iris_session.scene.importers.xml_files.MAX_FILE_BYTES", 4 << 20)
+    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a", bytes(5 << 20))
+    with pytest.raises(SceneBuildError, match="unpacks to 5 MiB, at most 4 are read"):
+        load_file(tmp_path / "bomb.3mf")
+
+
+@pytest.mark.parametrize(
+    ("package", "name"), [("trimesh", "a.stl"), ("collada", "a.dae"), ("yourdfpy", "a.urdf"), ("PIL", "a.png")]
+)
+def test_what_is_not_installed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, name: str
+) -> None:
+    (tmp_path / name).write_bytes(b"<robot name='r'><link name='a'/></robot>")
+    monkeypatch.setitem(sys.modules, package, None)
+    scene = SceneBuilder()
+    add = {
+        "PIL": lambda: scene.add_box(half_size=(1, 1, 1), texture=tmp_path / name),
+        "yourdfpy": lambda: scene.add_urdf(tmp_path / name),
+    }.get(package, lambda: scene.add_file(tmp_path / name))
+    with pytest.raises(SceneBuildError, match=r"pip install 'iris-session\[files\]'"):
+        add()
+
+
+def test_folders_that_belong_to_a_file(tmp_path: Path) -> None:
+    package = tmp_path / "package"
+    for folder in ("urdf/deep", "meshes", "secret"):
+        (package / folder).mkdir(parents=True)
+    (tmp_path / "other").mkdir()
+    for path in ("urdf/deep/a.stl", "meshes/a b.stl", "secret/a.stl", "../other/a.stl"):
+        (package / path).write_bytes(b"x")
+    (package / "urdf" / "meshes").symlink_to(tmp_path / "other")
+    model = package / "urdf" / "robot.urdf"
+    model.write_text("")
+    references = References(model)
+    assert references.find("deep/a.stl") == package / "urdf/deep/a.stl"
+    assert references.find("../meshes/a%20b.stl") == package / "meshes/a b.stl"
+    assert references.find(f"file://{package}/meshes/a b.stl") == package / "meshes/a b.stl"
+    assert references.find("package://package/meshes/a b.stl") == package / "meshes/a b.stl"
+    for outside in ("../secret/a.stl", "../../other/a.stl", "meshes/a.stl", "/etc/passwd", "file:///etc/passwd"):
+        with pytest.raises(SceneBuildError, match="outside of its own folders"):
+            references.find(outside)
+    for wrong in ("package://package/../other/a.stl", "package://../other/a.stl", "package:///etc/passwd"):
+        with pytest.raises(SceneBuildError, match="package"):
+            references.find(wrong)
+    (package / "package.xml").write_text("<package> <name> official </name> </package>")
+    assert References(model).find("../secret/a.stl") == package / "secret/a.stl"
+    assert References(model).find("package://official/secret/a.stl") == package / "secret/a.stl"
+    assert References(model).find("package://package/secret/a.stl") == package / "secret/a.stl"
+    assert References(model, [tmp_path / "other"]).find("../../other/a.stl") == tmp_path / "other/a.stl"
+    with pytest.raises(SceneBuildError, match="no such folder"):
+        References(model, [tmp_path / "lost"])
+
+
+def test_a_folder_is_no_package_because_of_its_name(tmp_path: Path) -> None:
+    """A downloaded URDF must not show everybody what lies beside the folder of downloads."""
+    home = tmp_path / "ann"
+    for folder in ("Downloads", "Pictures", ".ssh", "gripper"):
+        (home / folder).mkdir(parents=True)
+    for path in ("Pictures/private.png", ".ssh/key", "gripper/a.stl"):
+        (home / path).write_bytes(b"x")
+    model = home / "Downloads" / "robot.urdf"
+    model.write_text("")
+    names = ("Pictures/private.png", ".ssh/key", "ann/Pictures/private.png", "gripper/a.stl")
+    for name in names:
+        with pytest.raises(SceneBuildError, match=r"no package\.xml, so it is no package; name the package's folder"):
+            References(model).find(f"package://{name}")
+    (home / "gripper" / "package.xml").write_text("<package><name>gripper</name></package>")
+    assert References(model).find("package://gripper/a.stl") == home / "gripper" / "a.stl"
+    for given in (home, home / "Pictures"):
+        assert References(model, [given]).find(f"package://{names[0]}") == home / names[0]

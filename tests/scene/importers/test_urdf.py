@@ -1,0 +1,340 @@
+"""URDF: links where MuJoCo and yourdfpy have them, the same picture as MuJoCo's, and faults that are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+import yourdfpy
+from numpy.typing import NDArray
+
+from iris_session.protocol.common import Pose
+from iris_session.scene import AssetStore, SceneBuildError
+from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.composed import ComposedScene
+from iris_session.scene.elements import matrix_of
+from iris_session.scene.extent import extent_of
+from tests.scene.arm import FREE, JOINTS, write_arm
+from tests.scene.pictures import Artist, cameras, graphics, silhouette_iou
+from tests.scene.rebuild import rebuild
+
+FOLLOWS = {"finger_right": ("finger_left", 0.5, 0.01)}
+
+
+def positions(seed: int) -> dict[str, float]:
+    """Random positions of the joints that can be set."""
+    rng = np.random.default_rng(seed)
+    return {name: rng.uniform(-3 if low is None else low, 3 if high is None else high) for name, _, low, high in JOINTS}
+
+
+def with_followers(q: dict[str, float]) -> dict[str, float]:
+    return {**q, **{name: q[source] * times + plus for name, (source, times, plus) in FOLLOWS.items()}}
+
+
+def composed(urdf: Path, tmp_path: Path, **options: object) -> ComposedScene:
+    scene = SceneBuilder("arm")
+    scene.add_urdf(urdf, name="arm", **options)
+    return scene.build(AssetStore(tmp_path / "store"))
+
+
+def difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(np.abs(a - b).max())
+
+
+def test_links_are_where_mujoco_and_yourdfpy_have_them(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    arm = composed(urdf, tmp_path).articulations["arm"]
+    model = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
+    data = mujoco.MjData(model)
+    other = yourdfpy.URDF.load(str(urdf), load_meshes=False)
+    for seed in range(20):
+        q = positions(seed)
+        found = arm.poses(q)
+        everything = with_followers(q)
+        for name, value in everything.items():
+            data.qpos[model.joint(name).qposadr[0]] = value
+        mujoco.mj_kinematics(model, data)
+        other.update_cfg([q[name] for name in other.actuated_joint_names])
+        for body, pose in found.items():
+            link = body.removeprefix("arm/")
+            T_world_link = np.eye(4)
+            if link != "base":
+                T_world_link[:3, :3] = data.body(link).xmat.reshape(3, 3)
+                T_world_link[:3, 3] = data.body(link).xpos
+            assert difference(matrix_of(pose), T_world_link) < 1e-9
+            assert difference(matrix_of(pose), other.get_transform(link)) < 1e-9
+
+
+def _beside_meshes(urdf: Path) -> Path:
+    """The same file where MuJoCo finds its meshes: it strips paths, and searches below the model's own folder."""
+    copy = urdf.parents[1] / "arm.urdf"
+    copy.write_text(urdf.read_text())
+    return copy
+
+
+def test_joints_bodies_and_what_they_follow(tmp_path: Path) -> None:
+    scene = composed(write_arm(tmp_path), tmp_path, position=(1, 2, 3))
+    arm = scene.articulations["arm"]
+    assert tuple(joint.name for joint in arm.joints) == FREE
+    assert arm.mimics == {"finger_right": "finger_left"}
+    by_name = {joint.name: joint for joint in arm.joints}
+    assert (by_name["bend"].low, by_name["bend"].high, by_name["bend"].rest) == (0.3, 2.5, 0.3)
+    assert by_name["twist"].high == float("inf")
+    # the sensor and the hand are fixed: they have no body of their own
+    assert arm.bodies == scene.moving
+    assert arm.bodies[0] == "arm/base"
+    assert {"arm/sensor", "arm/hand"}.isdisjoint(arm.bodies)
+    assert len(arm.bodies) == 1 + 6 + 2
+    assert scene.poses[0] == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    assert arm.poses({})["arm/base"].p == (0.0, 0.0, 0.0)
+    colours = {visual.name: visual.rgba for visual in scene.spec.visuals}
+    assert colours["link2"] == (0.9, 0.5, 0.1, 1.0)
+    assert colours["finger_left"] == (0.5, 0.5, 0.5, 1.0)
+    assert len(scene.spec.meshes) == 2  # the six links wear one
+    assert scene.skipped == ()
+
+
+def test_a_joint_may_follow_one_that_follows_in_turn(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{k}"/>' for k in range(4))
+    joints = "".join(
+        f'<joint name="j{k}" type="prismatic"><parent link="l0"/><child link="l{k}"/><axis xyz="0 0 1"/>'
+        f'<limit lower="-9" upper="9"/>{mimic}</joint>'
+        for k, mimic in (
+            (1, '<mimic joint="j2" multiplier="3" offset="0.01"/>'),
+            (2, '<mimic joint="j3" multiplier="2" offset="0.1"/>'),
+            (3, ""),
+        )
+    )
+    (tmp_path / "a.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    arm = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"]
+    assert arm.mimics == {"j1": "j3", "j2": "j3"}
+    at = {body: pose.p[2] for body, pose in arm.poses({"j3": 1.0}).items()}
+    assert at == {"arm/l0": 0.0, "arm/l1": pytest.approx(6.31), "arm/l2": pytest.approx(2.1), "arm/l3": 1.0}
+
+
+def test_a_joint_without_end_has_no_limits_whatever_the_file_says(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous"><parent link="a"/>'
+        '<child link="b"/><axis xyz="0 0 1"/><limit lower="0" upper="0" effort="1" velocity="1"/></joint></robot>'
+    )
+    (joint,) = composed(tmp_path / "a.urdf", tmp_path).articulations["arm"].joints
+    assert (joint.low, joint.high) == (-float("inf"), float("inf"))
+
+
+def test_meshes_in_millimetres_are_that_small(tmp_path: Path) -> None:
+    trimesh.creation.box((1000, 2000, 3000)).export(tmp_path / "box.3mf")  # which counts in them
+    (tmp_path / "a.urdf").write_text(
+        '<robot name="r"><link name="base"><visual><geometry><mesh filename="box.3mf" scale="2 2 2"/></geometry>'
+        "</visual></link></robot>"
+    )
+    (mesh,) = composed(tmp_path / "a.urdf", tmp_path).spec.meshes
+    np.testing.assert_allclose(np.subtract(mesh.high, mesh.low), (2.0, 4.0, 6.0), atol=1e-5)
+
+
+def test_picture_is_mujocos(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    scene = SceneBuilder("arm")
+    scene.add_urdf(urdf, name="arm")
+    store = AssetStore(tmp_path / "store")
+    ours = rebuild(store.get(scene.build(store).scene_hash), store)
+    theirs = mujoco.MjModel.from_xml_path(str(_beside_meshes(urdf)))
+    rest = {"bend": 0.3, "finger_right": 0.01}  # ours stand as near to 0 as limits and what they follow allow
+    with graphics():
+        a, b = Artist(ours), Artist(theirs)
+        for name, value in rest.items():
+            b.data.qpos[theirs.joint(name).qposadr[0]] = value
+        mujoco.mj_forward(theirs, b.data)
+        for camera in cameras(ours):
+            assert silhouette_iou(a.segments(camera) >= 0, b.segments(camera) >= 0) >= 0.99
+        a.close()
+        b.close()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ('type="continuous"', 'type="magic"', "type 'magic'"),
+        ('<child link="link2"/>', '<child link="link9"/>', "'link9', which is not there"),
+        ('<child link="link2"/>', '<child link="link1"/>', "hangs on two joints, lift and twist: a URDF is a tree"),
+        ('<child link="link0"/>', '<child link="base"/>', "the joints turn make a loop: a URDF is a tree"),
+        ('<parent link="base"/>', '<parent link="link3"/>', "the joints lift, twist, bend, turn make a loop"),
+        ('<link name="base">', '<link name="stand"/><link name="base">', r"2 links hang on no joint \(stand, base\)"),
+        ('joint="finger_left" mult', 'joint="flange" mult', "which does not move"),
+        ('joint="finger_left" mult', 'joint="finger_right" mult', "follows it in turn"),
+        ("meshes/link.stl", "meshes/lost.stl", "lost.stl"),
+        ("package://arm_description/", "package://other/", "package_dirs"),
+        ("package://arm_description/meshes/link.stl", "../../../../../../etc/passwd", "outside of its own folders"),
+        ("package://arm_description/meshes/link.stl", "package://arm_description/../../x.stl", "package_dirs"),
+        ("package://arm_description/meshes/link.stl", "https://host/link.stl", "files are read, not addresses"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="0 0 0"', "the axis of joint turn"),
+        ('xyz="0.1 1.0 0.5"', 'xyz="a b c"', "3 finite numbers must stand"),
+        ('radius="0.1"', 'radius="-1"', "positive lengths"),
+        ('rgba="0.9 0.5', 'rgba="nan 0.5', "4 finite numbers must stand"),
+        ("<robot", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot", "DOCTYPE"),
+        ("</robot>", "", "is cut: it ends in line"),
+        ("</robot>", "\0</robot>", "no XML .*allowed range"),
+        ('<link name="base">', "<link>", r"arm\.urdf, line 1: <link> has no name"),
+        ('<joint name="turn" type="revolute">', '<joint name="turn">', "<joint> turn has no type"),
+        ('<parent link="base"/>', "", '<joint> turn has no <parent link="...">'),
+        ('<parent link="base"/>', "<parent/>", "<parent> has no link"),
+        ('filename="package://arm_description/meshes/link.stl"', "", "<mesh> has no filename"),
+        ('<mimic joint="finger_left"', "<mimic", "<mimic> has no joint"),
+        ('lower="-2.9"', 'lower="${-pi}"', "lower is '.{-pi}' where one finite number must stand"),
+        ('name="arm">', 'name="arm" xmlns:xacro="http://wiki.ros.org/xacro"><xacro:a/>', "xacro must be"),
+        ("robot", "sdf", "<robot> is needed"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, before: str, after: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    assert before in urdf.read_text()
+    urdf.write_text(urdf.read_text().replace(before, after))
+    with pytest.raises(SceneBuildError, match=text) as raised:
+        SceneBuilder().add_urdf(urdf)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_not_drawn_is_told(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    changed = urdf.read_text().replace('<sphere radius="0.02"/>', '<capsule radius="0.02" length="1"/>', 1)
+    changed = changed.replace('name="orange"/>', 'name="lost"/>')
+    urdf.write_text(changed)
+    skipped = composed(urdf, tmp_path).skipped
+    assert any("finger_left: shape 'capsule'" in line for line in skipped)
+    assert any("material 'lost'" in line for line in skipped)
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_what_is_free_is_a_body_of_its_own(tmp_path: Path, kind: str) -> None:
+    urdf = write_arm(tmp_path)
+    before = composed(urdf, tmp_path)
+    urdf.write_text(urdf.read_text().replace('type="continuous"', f'type="{kind}"'))
+    after = composed(urdf, tmp_path)
+    assert after.moving == before.moving
+    assert after.poses == before.poses
+    assert [(v.body, v.name) for v in after.spec.visuals] == [(v.body, v.name) for v in before.spec.visuals]
+    assert len(after.articulations["arm"].joints) == len(before.articulations["arm"].joints) - 1
+    assert after.articulations["arm"].loose == {"twist": "arm/link2"}
+    assert after.skipped == before.skipped, "it is there, and set_pose moves it"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ("</robot>", "", r"arm\.urdf is cut: it ends in line \d+, without </robot>; export or download it again"),
+        ("</link>", "</lynk>", r"arm\.urdf, line \d+: this is no XML \(Opening and ending tag mismatch: link line \d+"),
+    ],
+)
+def test_what_does_not_parse_is_told_with_one_line_number(tmp_path: Path, before: str, after: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace(before, after, 1))
+    with pytest.raises(SceneBuildError, match=text) as raised:
+        SceneBuilder().add_urdf(urdf)
+    assert "<string>" not in str(raised.value)
+
+
+def test_prefixes_that_nobody_declared_are_left_out(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    before = composed(urdf, tmp_path)
+    text = urdf.read_text().replace('effort="1"', 'effort="1" drake:acceleration="15"')
+    urdf.write_text(
+        text.replace("</robot>", '<drake:filter name="a"><drake:member link="base"/></drake:filter></robot>')
+    )
+    assert composed(urdf, tmp_path).scene_hash == before.scene_hash
+
+
+def test_collision_shapes_on_request(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    assert "leave out collisions=True" in composed(urdf, tmp_path, collisions=True).skipped[0]
+    urdf.write_text(urdf.read_text().replace("<visual>", "<collision>").replace("</visual>", "</collision>"))
+    assert composed(urdf, tmp_path).spec.visuals == ()
+    assert "give collisions=True" in composed(urdf, tmp_path).skipped[0]
+    assert len(composed(urdf, tmp_path, collisions=True).spec.visuals) == 11
+
+
+def test_a_robot_in_another_size(tmp_path: Path) -> None:
+    """Every place scales, joints keep their positions, what is drawn is the same picture."""
+    urdf = write_arm(tmp_path)
+    whole, half = composed(urdf, tmp_path), composed(urdf, tmp_path, scale=0.5, position=(1, 0, 0))
+    one, other = whole.articulations["arm"], half.articulations["arm"]
+    assert other.joints == one.joints
+    q = positions(4)
+    for (name, a), b in zip(one.poses(q).items(), other.poses(q).values(), strict=True):
+        np.testing.assert_allclose(b.p, np.array(a.p) / 2, atol=1e-12, err_msg=name)
+        assert b.q == a.q
+    store = AssetStore(tmp_path / "store")
+    a, b = extent_of(whole.spec, store), extent_of(half.spec, store)
+    assert a is not None
+    assert b is not None
+    np.testing.assert_allclose(b.size, np.array(a.size) / 2, rtol=1e-5)
+    np.testing.assert_allclose(b.low, np.array(a.low) / 2 + [1, 0, 0], atol=1e-5)
+    for wrong in (0.0, -1.0, float("nan"), "2", None):
+        with pytest.raises(SceneBuildError, match="scale is"):
+            composed(urdf, tmp_path, scale=wrong)
+
+
+def test_what_exporters_leave_empty_and_nobody_draws_is_no_fault(tmp_path: Path) -> None:
+    """As SolidWorks' exporter does: a texture without a file, a centre of mass of what has none."""
+    urdf = tmp_path / "part.urdf"
+    urdf.write_text(
+        '<robot name="part"><link name="base"><inertial><origin xyz="nan nan nan" rpy="0 0 0"/><mass value="0"/>'
+        '</inertial><visual><geometry><box size="1 2 3"/></geometry><material name=""><color rgba="1 0 0 1"/>'
+        '<texture filename=""/></material></visual></link></robot>'
+    )
+    (shown,) = composed(urdf, tmp_path).spec.visuals
+    assert shown.rgba == (1.0, 0.0, 0.0, 1.0)
+
+
+def test_a_robot_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(urdf.read_text().replace('<robot name="arm">', "<robot>"))
+    assert SceneBuilder().add_urdf(urdf) == "arm"
+
+
+def test_xacro_is_to_be_expanded(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text("<robot/>")
+    with pytest.raises(SceneBuildError, match=r"xacro arm\.urdf\.xacro > arm\.urdf"):
+        SceneBuilder().add_urdf(path)
+    with pytest.raises(SceneBuildError, match="is a folder: name a file"):
+        SceneBuilder().add_urdf(tmp_path)
+    (tmp_path / "part.glb").write_bytes(b"glTF")
+    with pytest.raises(SceneBuildError, match=r"part\.glb is no URDF: files that end in \.glb go with add_file"):
+        SceneBuilder().add_urdf(tmp_path / "part.glb")
+
+
+def test_what_cannot_be_set_is_refused(tmp_path: Path) -> None:
+    arm = composed(write_arm(tmp_path), tmp_path).articulations["arm"]
+    with pytest.raises(SceneBuildError, match="follows 'finger_left'"):
+        arm.poses({"finger_right": 0.0})
+    with pytest.raises(SceneBuildError, match="Joints: turn, lift"):
+        arm.poses({"elbow": 0.0})
+    with pytest.raises(SceneBuildError, match="finite"):
+        arm.poses({"lift": float("nan")})
+    with pytest.raises(SceneBuildError, match="number"):
+        arm.poses({"lift": "high"})  # type: ignore[dict-item]
+
+
+def test_a_file_that_a_package_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
+    """A typo; a reference that only xacro can expand."""
+    package = tmp_path / "mybot"
+    for folder in ("meshes", "urdf"):
+        (package / folder).mkdir(parents=True)
+    (package / "package.xml").write_text("<package><name>mybot</name></package>")
+    (package / "meshes" / "base.stl").write_bytes(b"x")
+    for reference, says in (
+        (
+            "package://mybot/meshes/bsae.stl",
+            "package mybot is there, and has no file .*bsae.stl; in .*meshes: base.stl$",
+        ),
+        ("package://mybot/mesh/base.stl", "package mybot is there, and has no file .*; there is no folder .*mesh$"),
+        ("../meshes/bsae.stl", "there is no file .*bsae.stl; in .*meshes: base.stl$"),
+        ("$(find mybot)/meshes/base.stl", "xacro must be expanded first"),
+        ("package://mybt/meshes/base.stl", "mybt; name the package's folder in package_dirs"),
+    ):
+        text = f'<robot name="r"><link name="a"><visual><geometry><mesh filename="{reference}"/></geometry></visual>'
+        (package / "urdf" / "r.urdf").write_text(f"{text}</link></robot>")
+        with pytest.raises(SceneBuildError, match=says):
+            SceneBuilder().add_urdf(package / "urdf" / "r.urdf")

@@ -1,0 +1,192 @@
+"""Building: nothing twice, levels of detail, damaged notes, and a warm start that encodes nothing."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from iris_session.scene import AssetStore, Builder, EncodeOptions, decode_image, decode_mesh, encode_mesh_quantised
+from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.mesh_processing import simplified
+from iris_session.scene.meshes import index_corners
+from iris_session.scene.mujoco_scene import parse_mujoco
+from tests.scene.models import many_objects
+from tests.scene.test_images import picture
+from tests.scene.test_meshes import ball
+
+
+def test_equal_content_is_built_once_and_remembered(tmp_path: Path) -> None:
+    model = many_objects(40, 3, 1_000, 64)
+    cold = parse_mujoco(model, AssetStore(tmp_path))
+    assert (cold.built, cold.recalled) == (6, 0)
+    warm = parse_mujoco(model, AssetStore(tmp_path), threads=1)
+    assert (warm.built, warm.recalled) == (0, 6)
+    assert warm.spec == cold.spec
+    twins = parse_mujoco(many_objects(4, 3, 1_000, 64, seed=0), AssetStore(tmp_path))
+    assert twins.built == 0
+    other = parse_mujoco(model, AssetStore(tmp_path), options=EncodeOptions(levels=False))
+    assert other.built == 6
+
+
+def test_lost_assets_and_damaged_notes_are_built_anew(tmp_path: Path) -> None:
+    model = many_objects(3, 2, 1_000, 64)
+    store = AssetStore(tmp_path)
+    first = parse_mujoco(model, store)
+    store.path(first.spec.meshes[0].levels[0].address).unlink()
+    assert parse_mujoco(model, store).built == 1
+    next(path for path in (tmp_path / "index").rglob("*") if path.is_file()).write_bytes(b"\xc1")
+    again = parse_mujoco(model, store)
+    assert again.built == 1
+    assert again.spec == first.spec
+
+
+def test_levels_of_a_mesh(tmp_path: Path) -> None:
+    store, mesh = AssetStore(tmp_path), ball(5)
+    (note,) = Builder(store).run([Builder(store).mesh([mesh.position], lambda: mesh)])
+    exact, *coarse = note.levels
+    assert np.array_equal(decode_mesh(store.get(exact.address)).index, mesh.index)
+    assert (exact.max_error_m, exact.triangles, exact.bytes) == (0.0, 20_480, store.size(exact.address))
+    assert len(coarse) >= 2
+    for fine, level in zip(note.levels, coarse, strict=False):
+        assert level.triangles < 0.5 * fine.triangles
+        assert level.max_error_m > fine.max_error_m
+        assert decode_mesh(store.get(level.address)).triangles == level.triangles
+    assert np.allclose((note.low, note.high), [(-1, -1, -1), (1, 1, 1)])
+
+
+def test_a_level_that_saves_little_is_left_out(tmp_path: Path) -> None:
+    """Faces of their own normals; texture coordinates, for which nothing is coarser; quarters that are hardly fewer."""
+    builder = Builder(AssetStore(tmp_path))
+    smooth = ball(3)
+    corners = smooth.position[smooth.index]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = index_corners(corners, np.repeat(across[:, None], 3, axis=1).astype(np.float32), None)
+    textured = replace(ball(4), uv=np.ascontiguousarray(ball(4).position[:, :2]))
+    notes = builder.run(
+        [builder.mesh([mesh.position, mesh.index], lambda mesh=mesh: mesh) for mesh in (flat, textured)]
+    )
+    assert [level.triangles for level in notes[0].levels][:1] == [1_280]
+    for note in notes:
+        for finer, level in itertools.pairwise(note.levels):
+            assert level.triangles <= 2 / 3 * finer.triangles
+            assert level.bytes <= 2 / 3 * finer.bytes
+    assert len(notes[1].levels) == 1
+
+
+@pytest.mark.parametrize("encoding", ["arrays", "png", "jpeg"])
+def test_levels_of_a_texture(tmp_path: Path, encoding: str) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store, EncodeOptions(texture_encoding=encoding))
+    pixels = picture(512, 1024)
+    (note,) = builder.run([builder.texture(pixels, "2d")])
+    assert [(level.width, level.height) for level in note.levels] == [(1024, 512), (512, 256)]
+    for level in note.levels:
+        assert level.encoding == encoding
+        assert decode_image(store.get(level.address), encoding).shape == (level.height, level.width, 3)
+    error = np.abs(decode_image(store.get(note.levels[0].address), encoding).astype(int) - pixels).max()
+    assert error == note.levels[0].max_error
+    assert (error > 0) == (encoding == "jpeg")
+
+
+def test_faces_of_cubes_are_halved_one_by_one(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store)
+    faces = np.repeat(np.arange(6, dtype=np.uint8) * 40, 512)[:, None, None] * np.ones((1, 512, 3), np.uint8)
+    (note,) = builder.run([builder.texture(faces, "cube")])
+    half = decode_image(store.get(note.levels[1].address), "arrays")
+    assert half.shape == (6 * 256, 256, 3)
+    assert np.array_equal(half[::256, 0, 0], np.arange(6) * 40)
+    assert np.array_equal(half[255::256, 0, 0], np.arange(6) * 40)
+
+
+def test_textures_in_a_form_of_their_own_are_passed_on(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store)
+    blob = np.random.default_rng(0).integers(0, 255, (3, 100, 2), np.uint8)
+    (note,) = builder.run([builder.texture(blob, "2d")])
+    assert note.levels[0].encoding == "opaque"
+    assert store.get(note.levels[0].address) == blob.tobytes()
+
+
+def test_arrays_of_one_content_and_another_shape_are_not_the_same(tmp_path: Path) -> None:
+    """Two flat height fields, or the same numbers as edges and as triangles."""
+    builder = Builder(AssetStore(tmp_path))
+    grids = [np.zeros((2, 3), np.float32), np.zeros((3, 2), np.float32), np.zeros((2, 3), np.int32)]
+    wide, tall, whole = builder.run([builder.blob([b"grid", grid], repr(grid).encode) for grid in grids])
+    assert len({wide.address, tall.address, whole.address}) == 3
+    assert builder.built == 3
+
+
+def test_what_a_crash_cut_off_is_built_again(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    pixels = picture(64, 64)
+    (note,) = (builder := Builder(store)).run([builder.texture(pixels, "2d")])
+    store.path(note.levels[0].address).write_bytes(b"")
+    again = Builder(store)
+    assert again.run([again.texture(pixels, "2d")]) == [note]
+    assert (again.built, again.recalled) == (1, 0)
+    assert np.array_equal(decode_image(store.get(note.levels[0].address), "arrays"), pixels)
+
+
+#: A mesh and a flex, and what they may differ in when all else is the same.
+ALIKE = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/></asset>
+    <worldbody><geom type="mesh" mesh="m"/></worldbody>
+    <deformable><flex name="f" dim="2" body="world" radius=".01" vertex="{0}" element="0 1 2 2 1 3"
+        texcoord="{1}"/></deformable></mujoco>"""
+OBJ = """v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 .5\nvt 0 0\nvt 1 0\nvt 0 1\nvt {0} 1\nvn 0 0 1\nvn 0 {1}
+f {2} 2/2/1 3/3/1\nf 3/3/1 2/2/1 4/4/2"""
+DIFFERENT = {
+    "": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/1/1"),
+    "texture coordinates of the mesh": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", ".5", ".6 .8", "1/1/1"),
+    "its normals": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".8 .6", "1/1/1"),
+    "which corner wears which coordinate": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/4/1"),
+    "vertices of the flex": ("0 0 1 1 0 1 0 1 1 1 1 2", "0 0 1 0 0 1 1 1", "1", ".6 .8", "1/1/1"),
+    "its texture coordinates": ("0 0 1 1 0 1 0 1 1 1 1 1", "0 0 1 0 0 1 1 .5", "1", ".6 .8", "1/1/1"),
+}
+
+
+def test_nothing_that_is_remembered_of_a_model_is_taken_for_another(tmp_path: Path) -> None:
+    hashes = set()
+    for number, (vertex, texcoord, *obj) in enumerate(DIFFERENT.values()):
+        model = mujoco.MjModel.from_xml_string(
+            ALIKE.format(vertex, texcoord), assets={"m.obj": OBJ.format(*obj).encode()}
+        )
+        parsed = parse_mujoco(model, AssetStore(tmp_path / "one for all"))
+        assert parsed.spec == parse_mujoco(model, AssetStore(tmp_path / str(number))).spec
+        hashes.add(parsed.scene_hash)
+    assert len(hashes) == len(DIFFERENT)
+
+
+def test_a_cloth_with_other_texture_coordinates_is_another(tmp_path: Path) -> None:
+    addresses = set()
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    for uvs in ([[0, 0], [1, 0], [0, 1]], [[0, 0], [2, 0], [0, 2]]):
+        scene = SceneBuilder()
+        scene.add_deformable("cloth", corners, [[0, 1, 2]], uvs=uvs, texture=np.zeros((4, 4, 3), np.uint8))
+        addresses.add(scene.build(AssetStore(tmp_path)).spec.deformables[0].address)
+    assert len(addresses) == 2
+
+
+def test_what_is_seen_through_is_no_jpeg(tmp_path: Path) -> None:
+    store = AssetStore(tmp_path)
+    builder = Builder(store, EncodeOptions(texture_encoding="jpeg"))
+    pixels = np.random.default_rng(1).integers(0, 255, (16, 16, 4), np.uint8)
+    (note,) = builder.run([builder.texture(pixels, "2d")])
+    assert note.levels[0].encoding == "png"
+    np.testing.assert_array_equal(decode_image(store.get(note.levels[0].address), "png"), pixels)
+
+
+def test_the_stated_error_of_a_level_is_that_of_both_steps(tmp_path: Path) -> None:
+    mesh = ball(4)
+    builder = Builder(AssetStore(tmp_path))
+    (note,) = builder.run([builder.mesh([mesh.position, mesh.index], lambda: mesh)])
+    coarse = simplified(mesh, mesh.triangles // 4)
+    assert coarse is not None
+    rounding = encode_mesh_quantised(coarse[0])[1]
+    assert rounding > 0
+    assert note.levels[1].max_error_m == pytest.approx(coarse[1] + rounding, rel=1e-12)

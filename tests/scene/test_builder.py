@@ -1,0 +1,396 @@
+"""Scenes from shapes, arrays and files: who gets which number, what is refused, the same hash in every process."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+import iris_session
+from iris_session.protocol.common import IDENTITY, Pose
+from iris_session.protocol.media import MAX_STREAMS
+from iris_session.protocol.scene import Environment, decode_scene
+from iris_session.scene import AssetStore, SceneBuildError, decode_arrays, decode_mesh
+from iris_session.scene.builder import SceneBuilder
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.streams.deformable import DeformableEncoder
+from tests.scene.arm import write_arm
+from tests.scene.importers.test_files import write_obj
+from tests.scene.importers.test_gltf import furniture
+
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+SQUARE = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
+HALF = 0.5**0.5
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AssetStore:
+    return AssetStore(tmp_path / "store")
+
+
+def full_scene(folder: Path) -> SceneBuilder:
+    """Something of everything."""
+    scene = SceneBuilder("Lab")
+    scene.add_plane(half_size=(2, 2), texture=np.arange(48, dtype=np.uint8).reshape(4, 4, 3), repeat=(3, 3))
+    scene.add_box("shelf", half_size=(0.1, 0.2, 0.3), rgba=(1, 0, 0))
+    scene.add_sphere("ball", radius=0.1, movable=True, position=(1, 2, 3), metallic=0.5, roughness=0.25)
+    scene.add_capsule(radius=0.1, half_length=0.2, on="ball")
+    scene.add_file(furniture(folder / "furniture.glb"), position=(0, 1, 0))
+    scene.add_file(write_obj(folder), name="part", movable=True, scale=0.5)
+    scene.add_urdf(write_arm(folder), name="arm", position=(0, 0, 0.8))
+    scene.add_mesh("sheet", vertices=SQUARE, triangles=TRIANGLES, colors=np.uint8([[9, 8, 7]] * 3 + [[1, 2, 3]]))
+    scene.add_deformable("cloth", SQUARE, TRIANGLES, rgba=(0, 1, 0, 1), uvs=SQUARE[:, :2])
+    scene.add_deformable("rope", SQUARE, edges=TRIANGLES[:, :2], radius=0.01)
+    scene.add_light("sun", direction=(0, 1, -1))
+    scene.add_camera("eye", on="arm/link5", position=(0, 0, 0.1))
+    scene.set_skybox(np.zeros((12, 2, 3), np.uint8))
+    return scene
+
+
+def test_moving_bodies_come_first_and_are_numbered_in_order(tmp_path: Path, store: AssetStore) -> None:
+    made = full_scene(tmp_path).build(store)
+    spec = made.spec
+    assert decode_scene(store.get(made.scene_hash)) == spec
+    assert made.moving == ("ball", "part", *made.articulations["arm"].bodies)
+    moving = spec.bodies[1 : len(made.moving) + 1]
+    assert [body.id for body in spec.bodies] == list(range(len(spec.bodies)))
+    assert tuple(body.name for body in moving) == made.moving
+    assert all(body.moving and body.parent == 0 for body in moving)
+    assert made.poses == tuple(body.T_world_body for body in moving)
+    assert made.poses[0] == Pose((1.0, 2.0, 3.0), IDENTITY.q)
+    assert made.poses[2] == Pose((0.0, 0.0, 0.8), IDENTITY.q)
+    assert not any(body.moving for body in spec.bodies[len(moving) + 1 :])
+    assert [visual.id for visual in spec.visuals] == list(range(len(spec.visuals)))
+    on_ball = [visual.geometry.kind for visual in spec.visuals if visual.body == 1]
+    assert on_ball == ["sphere", "capsule"]
+    assert spec.bodies[spec.cameras[0].body].name == "arm/link5"
+    assert all(store.get(address) for address in made.addresses)
+    assert spec.textures[spec.environment.skybox].kind == "skybox"
+    assert spec.textures[spec.environment.skybox].height == 2
+
+
+def test_every_process_makes_the_same_scene(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from iris_session.scene import AssetStore; "
+        "from tests.scene.test_builder import full_scene; folder = Path(sys.argv[1]); folder.mkdir(); "
+        "print(full_scene(folder).build(AssetStore(folder / 'store'), threads=3).scene_hash)"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "12345", "PYTHONPATH": str(Path(__file__).parents[2])}
+    other = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "other")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (tmp_path / "here").mkdir()
+    here = full_scene(tmp_path / "here").build(AssetStore(tmp_path / "store"))
+    assert other.stdout.strip() == here.scene_hash
+    # and from the store that knows it all
+    again = full_scene_again(tmp_path / "here").build(AssetStore(tmp_path / "store"))
+    assert again.scene_hash == here.scene_hash
+    assert again.built == 0
+    assert again.recalled == here.built + here.recalled
+
+
+def full_scene_again(folder: Path) -> SceneBuilder:
+    """The same from files that are there."""
+    (folder / "arm_description").rename(folder / "before")
+    return full_scene(folder)
+
+
+def test_shapes_are_mujocos(store: AssetStore) -> None:
+    """The same shapes by MJCF and by hand."""
+    scene = SceneBuilder()
+    turned = (HALF, HALF, 0.0, 0.0)
+    scene.add_plane(half_size=(3, 4))
+    scene.add_sphere(radius=0.1, position=(1, 0, 0), rgba=(1, 0, 0, 1))
+    scene.add_capsule(radius=0.1, half_length=0.3, quaternion=turned)
+    scene.add_ellipsoid(half_size=(0.1, 0.2, 0.3))
+    scene.add_cylinder(radius=0.2, half_length=0.4)
+    scene.add_box(half_size=(0.1, 0.2, 0.3), rgba=(0, 0.25, 1, 0.5))
+    ours = scene.build(store).spec
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+        <geom type="plane" size="3 4 1"/><geom type="sphere" size=".1" pos="1 0 0" rgba="1 0 0 1"/>
+        <geom type="capsule" size=".1 .3" quat="1 1 0 0"/><geom type="ellipsoid" size=".1 .2 .3"/>
+        <geom type="cylinder" size=".2 .4"/><geom type="box" size=".1 .2 .3" rgba="0 .25 1 .5"/>
+        </worldbody></mujoco>"""
+    )
+    theirs = parse_mujoco(model, store).spec
+    for a, b in zip(ours.visuals, theirs.visuals, strict=True):
+        assert a.geometry == b.geometry
+        np.testing.assert_allclose(a.T_body_visual.q, b.T_body_visual.q, atol=1e-12)
+        np.testing.assert_allclose(a.rgba, b.rgba, atol=1e-6)
+
+
+def test_looks(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_sphere(radius=1, rgba=(1, 1, 0))
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    scene.add_sphere(radius=1, metallic=1.0, roughness=0.25)
+    picture = np.zeros((2, 2, 4), np.uint8)
+    scene.add_box(half_size=(1, 1, 1), texture=picture, repeat=(2, 3), uniform=True)
+    scene.add_box(half_size=(1, 1, 1), texture=picture.copy(), rgba=(1, 0, 0))
+    spec = scene.build(store).spec
+    assert spec.visuals[0].material == -1
+    assert spec.visuals[1].material == spec.visuals[2].material
+    material = spec.materials[spec.visuals[1].material]
+    assert (material.metallic, material.roughness, material.shininess) == (1.0, 0.25, 0.75)
+    assert len(spec.textures) == 1
+    first, second = (spec.materials[visual.material] for visual in spec.visuals[3:])
+    assert (first.repeat, first.uniform, first.rgba) == ((2.0, 3.0), True, (1.0, 1.0, 1.0, 1.0))
+    assert second.texture("rgba") == 0
+    assert second.rgba == (1.0, 0.0, 0.0, 1.0)
+
+
+def test_meshes_given_as_arrays(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    picture = np.zeros((2, 2, 3), np.uint8)
+    colors = np.uint8([[1, 2, 3], [4, 5, 6], [7, 8, 9], [10, 11, 12]])
+    uvs = SQUARE[:, :2]
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, uvs=uvs, texture=picture)
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, uvs=uvs)
+    scene.add_mesh(vertices=SQUARE, triangles=TRIANGLES, colors=colors, normals=np.tile([0, 0, -2.0], (4, 1)))
+    spec = scene.build(store).spec
+    painted, plain, colored = (decode_mesh(store.get(mesh.levels[0].address)) for mesh in spec.meshes)
+    assert painted.uv is not None
+    np.testing.assert_array_equal(painted.uv, painted.position[:, :2])
+    np.testing.assert_array_equal(painted.normal, np.tile(np.float32([0, 0, 1]), (4, 1)))
+    assert plain.uv is None  # without a texture they say nothing
+    assert colored.color is not None
+    assert colored.color.tolist() == [[*color, 255] for color in colors.tolist()]
+    np.testing.assert_array_equal(colored.normal, np.tile(np.float32([0, 0, -1]), (4, 1)))
+    assert spec.visuals[2].rgba == (1.0, 1.0, 1.0, 1.0)
+    assert spec.visuals[1].rgba == (0.5, 0.5, 0.5, 1.0)
+
+
+def test_deformables_fit_their_stream(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    scene.add_deformable("cloth", SQUARE, TRIANGLES, rgba=(0, 1, 0, 1), radius=0.002)
+    scene.add_deformable("rope", SQUARE, edges=[[0, 1], [1, 2]])
+    made = scene.build(store)
+    for name, entry in zip(("cloth", "rope"), made.spec.deformables, strict=True):
+        source = made.deformables[name]
+        assert (entry.name, entry.stream) == (name, source.stream)
+        arrays = decode_arrays(store.get(entry.address), "deformable")
+        assert bytes(arrays["plan"]) == source.topology.to_bytes()
+        np.testing.assert_array_equal(arrays["position"], source.vertices)
+        assert DeformableEncoder(source.topology, 0.0005).encode(source.vertices.astype(np.float64)) is not None
+        assert not source.vertices.flags.writeable
+    assert [entry.dim for entry in made.spec.deformables] == [2, 1]
+    assert made.spec.deformables[0].rgba == (0.0, 1.0, 0.0, 1.0)
+    assert made.spec.environment.center == (0.5, 0.5, 1.0)
+
+
+def test_surroundings(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    assert scene.build(store).spec.environment == Environment()
+    scene.add_box(half_size=(30, 40, 1), position=(1, 2, 3))
+    found = scene.build(store).spec.environment
+    assert found.center == (1.0, 2.0, 3.0)
+    assert found.extent == pytest.approx(np.linalg.norm([30, 40, 1]))
+    assert found.zfar == pytest.approx(10 * found.extent)
+    scene.environment = Environment(extent=2.0)
+    assert scene.build(store).spec.environment == Environment(extent=2.0)
+
+
+BOX = {"half_size": (1, 1, 1)}
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "text"),
+    [
+        ("add_box", {**BOX, "name": "cup", "movable": True}, "'cup' already"),
+        ("add_box", {**BOX, "movable": True}, "name is '': what moves needs one of 1 to 64 characters"),
+        ("add_box", {**BOX, "name": "world", "movable": True}, "the frame that all is in, give name= another one"),
+        ("add_box", {**BOX, "name": None}, "name is None: text is expected, '' for no name"),
+        ("add_box", {**BOX, "name": "x" * 65, "movable": True}, "1 to 64 characters"),
+        ("add_box", {**BOX, "name": "b", "movable": True, "on": "cup"}, "one of both"),
+        ("add_box", {**BOX, "on": "cap"}, "Movable: cup"),
+        ("add_box", {"half_size": (1, 1)}, "3 finite numbers"),
+        ("add_box", {"half_size": (1, 1, 0)}, "greater than 0"),
+        ("add_box", {**BOX, "name": 3, "movable": True}, "name is 3: text is expected"),
+        ("add_box", {"half_size": "123"}, "3 numbers"),
+        ("add_box", {**BOX, "position": (0, 0)}, r"\(x, y, z\) \[m\]"),
+        ("add_box", {**BOX, "position": "123"}, r"\(x, y, z\) \[m\]"),
+        ("add_box", {**BOX, "quaternion": (0, 0, 0, 0)}, r"length 0: .*\(1, 0, 0, 0\) turns nothing"),
+        ("add_box", {**BOX, "quaternion": (1.7e308, 0, 0, 1.7e308)}, "length inf"),
+        ("add_box", {**BOX, "quaternion": (1, 0, 0)}, r"\(w, x, y, z\) are needed"),
+        ("add_box", {**BOX, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
+        ("add_box", {**BOX, "name": "b", "movable": True, "rgba": (2, 0, 0, 1)}, "from 0 to 1"),
+        ("add_box", {**BOX, "rgba": (1, 0)}, r"\(1, 0, 0, 1\) is red"),
+        ("add_box", {**BOX, "rgba": "red"}, r"'red': red, green, blue, alpha from 0 to 1"),
+        ("add_box", {**BOX, "rgba": None}, "from 0 to 1"),
+        ("add_box", {**BOX, "texture": [[0, 1], [0]]}, "no array"),
+        ("add_box", {**BOX, "name": "\ud800", "movable": True}, "what moves needs one of"),
+        ("add_box", {**BOX, "texture": np.zeros((2, 2, 3))}, "uint8"),
+        ("add_box", {**BOX, "texture": "/lost.png"}, "no such file"),
+        ("add_sphere", {"radius": float("inf")}, "finite"),
+        ("add_plane", {"half_size": (-1, 0)}, "half_size of a plane"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1, 4]]}, "numbers go from 0 to 3"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1]]}, r"shape \(m, 3\)"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": [[0, 1], [0, 1, 2]]}, "no array"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": [[0, 1], [0]]}, "no array"),
+        ("add_mesh", {"vertices": SQUARE * np.nan, "triangles": TRIANGLES}, "finite"),
+        ("add_mesh", {"vertices": SQUARE * 1e300, "triangles": TRIANGLES}, r"finite numbers of shape \(n, 3\)"),
+        ("add_mesh", {"vertices": [["1", "2", "3"]], "triangles": TRIANGLES}, r"texts of shape \(1, 3\): finite"),
+        ("add_mesh", {"vertices": [[1, 2], [3]], "triangles": TRIANGLES}, "rows that are no array: finite"),
+        ("add_mesh", {"vertices": [[1j, 0, 0]], "triangles": TRIANGLES}, r"complex128 of shape \(1, 3\): finite"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "uvs": SQUARE[:2, :2]}, "one each"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "colors": SQUARE}, "uint8"),
+        ("add_deformable", {"name": "cup", "vertices": SQUARE, "triangles": TRIANGLES}, "'cup' already"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE}, "one of them"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "radius": 0}, "greater than 0"),
+        ("add_deformable", {"name": "d", "vertices": SQUARE, "edges": TRIANGLES}, r"shape \(m, 2\)"),
+        ("add_box", {"half_size": ("1", "1", "1")}, "3 numbers are needed"),
+        ("add_sphere", {"radius": 1, "roughness": 5}, "roughness is 5: from 0 to 1"),
+        ("add_sphere", {"radius": 1, "metallic": -0.5}, "metallic is -0.5: from 0 to 1"),
+        ("add_sphere", {"radius": 1, "emission": -1}, "emission is -1: 0 or more"),
+        ("add_light", {"kind": "laser"}, "directional, spot or point"),
+        ("add_light", {"kind": ["spot"]}, "directional, spot or point"),
+        ("add_light", {"diffuse": "red"}, "diffuse is 'red'"),
+        ("add_light", {"direction": (0, 0, 0)}, "direction"),
+        ("add_camera", {"fovy": 0}, "fovy"),
+        ("add_camera", {"fovy": 180}, "below 180"),
+        ("set_skybox", {"pixels": np.zeros((5, 2, 3), np.uint8)}, "six squares"),
+        ("add_file", {"path": "/lost.glb"}, "no such file"),
+        ("add_file", {"path": None}, "path is None: the path of a file"),
+        ("add_urdf", {"path": 3}, "path is 3: the path of a file"),
+        ("add_urdf", {"path": "/lost.urdf"}, "no such file"),
+        ("add_urdf", {"path": "/lost.urdf", "name": "cup"}, "'cup' already"),
+    ],
+)
+def test_refusals_say_what_would_be_right(
+    store: AssetStore, method: str, arguments: dict[str, object], text: str
+) -> None:
+    scene = SceneBuilder()
+    scene.add_box("cup", half_size=(1, 1, 1), movable=True)
+    before = scene.build(store).scene_hash
+    with pytest.raises(SceneBuildError, match=text):
+        getattr(scene, method)(**arguments)
+    assert scene.build(store).scene_hash == before  # what was refused left nothing behind
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "text"),
+    [
+        ("add_box", {**BOX, "color": (1, 0, 0)}, r"add_box\(\) has no keyword color: rgba is meant"),
+        ("add_box", {**BOX, "moveable": True}, "no keyword moveable: movable is meant"),
+        ("add_box", {**BOX, "pos": (0, 0, 1)}, "no keyword pos: position is meant"),
+        ("add_box", {**BOX, "quat": (1, 0, 0, 0)}, "no keyword quat: quaternion is meant"),
+        ("add_box", {**BOX, "frobnicate": 1}, "there are emission, half_size, .*, uniform"),
+        ("add_sphere", {"radius": 0.1, "metalic": 1.0}, "metallic is meant"),
+        ("add_sphere", {"radius": 0.1, "size": 1.0}, "there are emission, "),
+        ("add_file", {"path": "/lost.stl", "translation": (1, 0, 0)}, "position is meant"),
+        ("add_file", {"path": "/lost.stl", "package_dir": "x"}, "package_dirs is meant"),
+        ("add_mesh", {"vertices": SQUARE, "triangles": TRIANGLES, "pose": 1}, "no keyword pose: "),
+        (
+            "add_deformable",
+            {"name": "d", "vertices": SQUARE, "triangles": TRIANGLES, "position": (0, 0, 1)},
+            r"add_deformable\(\) has no keyword position: there are edges, ",
+        ),
+        (
+            "add_urdf",
+            {"path": "/lost.urdf", "movable": True},
+            r"add_urdf\(\) has no keyword movable: there are collisions, ",
+        ),
+        ("add_urdf", {"path": "/lost.urdf", "package_dir": "x"}, "package_dirs is meant"),
+        ("add_light", {"pos": (0, 0, 1)}, "position is meant"),
+        ("add_camera", {"fov": 60}, "fovy is meant"),
+    ],
+)
+def test_keywords_that_a_method_does_not_have_are_refused(method: str, arguments: dict[str, object], text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        getattr(SceneBuilder(), method)(**arguments)
+
+
+def test_keywords_are_listed_for_help() -> None:
+    named = inspect.signature(SceneBuilder.add_box).parameters
+    assert list(named)[:3] == ["self", "name", "half_size"]
+    assert {"rgba", "texture", "position", "quaternion", "movable", "on"} < set(named)
+    assert str(named["metallic"]) == "metallic: 'float' = ..."
+    assert "movable" not in inspect.signature(SceneBuilder.add_deformable).parameters
+
+
+def test_what_clients_would_not_read_is_refused(store: AssetStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(scene: SceneBuilder, text: str) -> None:
+        with pytest.raises(SceneBuildError, match=text):
+            scene.build(store)
+
+    scene = SceneBuilder()
+    scene.add_camera(resolution="big")  # type: ignore[arg-type]
+    refused(scene, "cannot be drawn: Expected `array`.*resolution")
+    scene = SceneBuilder()
+    scene.environment = Environment(fog_end=float("inf"))
+    refused(scene, "cannot be drawn: Expected `float`.*fog_end")
+    scene.environment = Environment(skybox=7)
+    refused(scene, "texture 7")
+    scene = SceneBuilder()
+    scene.add_mesh(vertices=SQUARE * 2e6, triangles=TRIANGLES)
+    refused(scene, "scale it to metres")
+    scene = SceneBuilder()
+    scene.add_box(half_size=(1, 1, 1))
+    monkeypatch.setattr("iris_session.protocol.scene.MAX_SCENE_BYTES", 100)
+    refused(scene, "1 visuals, 1 bodies.*join what stands still")
+
+
+def test_no_more_deformables_than_there_are_streams(store: AssetStore) -> None:
+    scene = SceneBuilder()
+    for k in range(MAX_STREAMS):
+        scene.add_deformable(f"cloth {k}", SQUARE, TRIANGLES)
+    with pytest.raises(SceneBuildError, match="16 are streamed"):
+        scene.add_deformable("one more", SQUARE, TRIANGLES)
+    assert len(scene.build(store).deformables) == MAX_STREAMS
+
+
+def test_a_deformable_that_no_stream_takes_is_refused_where_it_is_added() -> None:
+    many = np.zeros((2**18 + 1, 3), np.float32)
+    scene = SceneBuilder()
+    with pytest.raises(SceneBuildError, match="deformable 'cloth' has 262,145 vertices, at most 262,144: make it"):
+        scene.add_deformable("cloth", many, TRIANGLES)
+    scene.add_deformable("cloth", many[1:], TRIANGLES)  # the name is free
+
+
+def test_public_names() -> None:
+    assert iris_session.SceneBuilder is SceneBuilder
+    assert iris_session.SceneBuildError is SceneBuildError
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda s: s.add_sphere(radius="100"), "radius is '100': a number is needed"),
+        (lambda s: s.add_sphere(radius=-1), "radius is -1: a number greater than 0 is needed"),
+        (lambda s: s.add_mesh("x", vertices=[[0, 0]], triangles=[[0, 1, 2]]), "vertices of mesh 'x': an array"),
+        (lambda s: s.add_mesh("x", vertices=np.eye(3), triangles=[[0, 1, 3]]), "triangles of mesh 'x': vertex 3 of 3"),
+        (lambda s: s.add_mesh("x", vertices=np.eye(3), triangles=[[0, 1, 2]], uvs=[[0, 0]]), "uvs of mesh 'x': 1 rows"),
+        (lambda s: s.add_deformable("c", np.eye(3), edges=[[0, 9]]), "edges of deformable 'c': vertex 9 of 3"),
+        (lambda s: s.add_box(half_size=(1, 1, 1), texture="/tmp"), "texture is '/tmp', a folder"),
+        (lambda s: s.add_file("https://x/a.glb"), "a.glb: files are read, not addresses: download it first"),
+        (lambda s: s.set_skybox("/no.png"), "/no.png: no such file"),
+    ],
+)
+def test_refusals_name_what_was_given(wrong: Callable[[SceneBuilder], object], says: str) -> None:
+    with pytest.raises(SceneBuildError, match=re.escape(says)):
+        wrong(SceneBuilder())
+
+
+def test_a_scale_that_is_text_and_a_skybox_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    scene = SceneBuilder()
+    with pytest.raises(SceneBuildError, match="scale is 'mm': a number, or three, is needed"):
+        scene.add_file(tmp_path / "a.off", scale="mm")  # type: ignore[arg-type]
+    Image.new("RGB", (8, 48), (9, 8, 7)).save(tmp_path / "sky.png")
+    scene.set_skybox(tmp_path / "sky.png")
+    made = scene.build(AssetStore(tmp_path / "assets"))
+    assert made.spec.environment.skybox == 0

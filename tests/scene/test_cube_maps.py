@@ -1,0 +1,274 @@
+"""Exported GLB files, drawn by casting rays, against MuJoCo's picture: cube and 2d textures on every shape."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from iris_session.protocol.scene import Geometry, SceneSpec
+from iris_session.scene import AssetStore, EncodeOptions
+from iris_session.scene.cube_maps import Cube, Cubes, _cube_of, baked
+from iris_session.scene.glb import write_glb
+from iris_session.scene.meshes import MeshArrays
+from iris_session.scene.mujoco_scene import parse_mujoco
+from iris_session.scene.report import not_in_glb
+from iris_session.scene.shapes import primitive
+from tests.scene.models import QUAD, SHAPES, WEDGE
+from tests.scene.pictures import Artist, graphics
+from tests.scene.rays import draw, rays
+from tests.scene.rebuild import FACES, png
+from tests.scene.test_fidelity import MEAN_DIFFERENCE, VISIBLE, VISIBLE_SHARE
+from tests.scene.test_shapes import document
+
+#: Azimuth and elevation [degrees]: together they see all faces, but what looks down; planes are seen from above.
+VIEWS = ((30.0, -25.0), (155.0, -32.0), (260.0, -40.0))
+FROM_BELOW = (70.0, 40.0)
+CLOTH = """<flexcomp name="cloth" type="grid" dim="2" count="5 4 1" spacing=".15 .15 .15" radius=".001" material="m">
+<edge equality="true"/></flexcomp>"""
+#: Mean difference of 255 where three colours are multiplied: linear ones in glTF, as they are in MuJoCo.
+GLOW_DIFFERENCE = 1.5
+#: Nothing but what materials emit: colours as they are, without light.
+DARK = '<visual><headlight ambient="0 0 0" diffuse="0 0 0" specular="0 0 0"/></visual>'
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> AssetStore:
+    return AssetStore(tmp_path / "store")
+
+
+def painted(shape: str, texture: str, look: str = "", side: int = 16, cloth: str = "") -> mujoco.MjModel:
+    """One shape. `texture`: `cube` or `2d`; each face has a colour and a dark corner, which tells how it is turned."""
+    rng = np.random.default_rng(4)
+    pictures = {}
+    for face in FACES:
+        pixels = np.full((side, side, 3), rng.integers(60, 255, 3), np.uint8)
+        pixels[: side // 4, : side // 2] = 0
+        pictures[f"{face}.png"] = png(pixels)
+    files = 'file="right.png"' if texture == "2d" else " ".join(f'file{face}="{face}.png"' for face in FACES)
+    hills = " ".join(f"{v:.3f}" for v in rng.uniform(0, 1, 30))
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><statistic center="0 0 0" extent="1"/>{DARK}<asset>
+        <texture name="t" type="{texture}" {files}/><material name="m" texture="t" emission="1" specular="0" {look}/>
+        <mesh name="wedge" vertex="{WEDGE}"/><mesh name="quad" file="quad.obj" inertia="shell"/>
+        <hfield name="hills" nrow="5" ncol="6" size=".35 .3 .2 .05" elevation="{hills}"/>
+        </asset><worldbody><geom {shape} material="m"/>{cloth}</worldbody></mujoco>""",
+        {**pictures, "quad.obj": QUAD.encode()},
+    )
+
+
+def views(model: mujoco.MjModel, angles: Iterable[tuple[float, float]]) -> list[mujoco.MjvCamera]:
+    found = []
+    for azimuth, elevation in angles:
+        camera = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(model, camera)
+        camera.azimuth, camera.elevation, camera.distance = azimuth, elevation, 1.1
+        found.append(camera)
+    return found
+
+
+def check(model: mujoco.MjModel, store: AssetStore, path: Path, *, emitted: bool = False) -> None:
+    """That MuJoCo's picture and the drawing of the exported file agree."""
+    write_glb(parse_mujoco(model, store).spec, store, path)
+    flat = int(model.geom_type[0]) == int(mujoco.mjtGeom.mjGEOM_PLANE)
+    with graphics():
+        artist = Artist(model)
+        for camera in views(model, VIEWS if flat else (*VIEWS, FROM_BELOW)):
+            exact = artist.colour(camera)
+            drawn, shown = draw(path, *rays(model, camera), emitted=emitted)
+            assert np.mean(shown >= 0) > 0.02  # there is something to see
+            difference = np.abs(drawn[:, :, :3] - exact)
+            assert difference.mean() <= (GLOW_DIFFERENCE if emitted else MEAN_DIFFERENCE)
+            assert np.mean(difference.max(axis=2) > VISIBLE) <= VISIBLE_SHARE
+        artist.close()
+
+
+@pytest.mark.parametrize("uniform", ["false", "true"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_cube_is_drawn_as_mujoco_draws_it(tmp_path: Path, store: AssetStore, shape: str, uniform: str) -> None:
+    model = painted(SHAPES[shape], "cube", f'texuniform="{uniform}" rgba="1 .9 .8 1"')
+    check(model, store, tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("uniform", ["false", "true"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_picture_is_repeated_as_mujoco_repeats_it(
+    tmp_path: Path, store: AssetStore, shape: str, uniform: str
+) -> None:
+    model = painted(SHAPES[shape], "2d", f'texrepeat="1.5 1" texuniform="{uniform}"')
+    check(model, store, tmp_path / "a.glb")
+
+
+def test_a_cloth_repeats_its_picture(tmp_path: Path, store: AssetStore) -> None:
+    model = painted("size='.01' rgba='0 0 0 0'", "2d", 'texrepeat="1.5 2"', side=8, cloth=CLOTH)
+    check(model, store, tmp_path / "a.glb")
+
+
+def test_what_has_no_coordinates_wears_no_picture(tmp_path: Path, store: AssetStore) -> None:
+    flex = """<deformable><flex name="f" dim="2" body="b" radius=".001" material="m" element="0 1 2"
+        vertex="-.3 -.3 0  .3 -.3 .1  .3 .3 .2"/></deformable>"""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><texture name="t" type="2d" builtin="checker" width="8" height="8" rgb1="1 0 0"/>
+        <material name="m" texture="t"/></asset>
+        <worldbody><body name="b"><geom size=".1" material="m"/></body></worldbody>{flex}</mujoco>"""
+    )
+    write_glb(parse_mujoco(model, store).spec, store, tmp_path / "a.glb")
+    found = document(tmp_path / "a.glb")
+    for mesh in found["meshes"]:
+        (one,) = mesh["primitives"]
+        picture = "baseColorTexture" in found["materials"][one["material"]]["pbrMetallicRoughness"]
+        assert picture == ("TEXCOORD_0" in one["attributes"])
+    assert len(found["materials"]) == 2
+
+
+@pytest.mark.parametrize("texture", ["cube", "2d"])
+def test_what_glows_glows_in_its_texture(tmp_path: Path, store: AssetStore, texture: str) -> None:
+    model = painted(SHAPES["box"], texture, 'rgba="1 .9 .8 1"')
+    model.mat_emission[0] = 0.4
+    check(model, store, tmp_path / "a.glb", emitted=True)
+
+
+def test_a_cube_may_be_seen_through(tmp_path: Path, store: AssetStore) -> None:
+    spec = parse_mujoco(painted(SHAPES["sphere"], "cube", 'rgba="1 1 1 .4"'), store).spec
+    write_glb(spec, store, tmp_path / "a.glb")
+    (material,) = document(tmp_path / "a.glb")["materials"]
+    assert material["alphaMode"] == "BLEND"
+    assert material["pbrMetallicRoughness"]["baseColorFactor"] == pytest.approx([1, 1, 1, 0.4])
+    assert "baseColorTexture" in material["pbrMetallicRoughness"]
+
+
+def images(path: Path) -> list[Image.Image]:
+    """The pictures of a GLB."""
+    data, found = path.read_bytes(), document(path)
+    start = 20 + struct.unpack_from("<I", data, 12)[0] + 8
+    pictures = []
+    for image in found.get("images", ()):
+        view = found["bufferViews"][image["bufferView"]]
+        at = start + view["byteOffset"]
+        pictures.append(Image.open(io.BytesIO(data[at : at + view["byteLength"]])))
+    return pictures
+
+
+def many() -> mujoco.MjModel:
+    """Three balls of two sizes in two colours, and cubes with the same content twice, of one colour, of six."""
+    checker = 'type="cube" builtin="checker" rgb1="1 0 0" rgb2="0 0 1" width="64" height="64"'
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><texture name="a" {checker}/><texture name="b" {checker}/>
+        <texture name="one" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="1 .5 0" width="64" height="64"/>
+        <texture name="six" type="cube" builtin="flat" rgb1="1 .5 0" rgb2="0 0 1" width="64" height="64"/>
+        <material name="a" texture="a"/><material name="b" texture="b" rgba="1 0 0 1"/>
+        <material name="one" texture="one" rgba=".5 1 1 1"/><material name="six" texture="six"/></asset><worldbody>
+        <geom size=".1" material="a"/><geom size=".1" material="b"/><geom size=".2" material="a"/>
+        <geom size=".1" material="one"/><geom size=".1" material="six"/></worldbody></mujoco>"""
+    )
+
+
+def test_what_is_the_same_is_in_the_file_once(tmp_path: Path, store: AssetStore) -> None:
+    write_glb(parse_mujoco(many(), store).spec, store, tmp_path / "a.glb")
+    found = document(tmp_path / "a.glb")
+    assert [picture.size for picture in images(tmp_path / "a.glb")] == [(3 * 72, 2 * 72), (15, 10)]
+    corners = [mesh["primitives"][0]["attributes"]["POSITION"] for mesh in found["meshes"]]
+    assert corners[0] == corners[1]  # of one size, in two colours
+    assert len(set(corners)) == 4
+    counts = {k: found["accessors"][corner]["count"] for k, corner in enumerate(corners)}
+    assert counts[4] < counts[0]  # cut at edges of faces, but not split: there is nothing on them to be in place
+
+
+def test_a_cube_of_one_colour_needs_no_picture(tmp_path: Path, store: AssetStore) -> None:
+    write_glb(parse_mujoco(many(), store).spec, store, tmp_path / "a.glb")
+    (look,) = (m for m in document(tmp_path / "a.glb")["materials"] if m["name"] == "one")
+    factor = np.array(look["pbrMetallicRoughness"]["baseColorFactor"])
+    seen = np.array([0.5, 128 / 255, 0.0])
+    linear = np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(factor, [*linear, 1.0], atol=5e-3)
+    assert "baseColorTexture" not in look["pbrMetallicRoughness"]
+
+
+@pytest.mark.parametrize("levels", [False, True])
+def test_large_cubes_are_made_smaller_and_jpeg_stays(
+    tmp_path: Path, store: AssetStore, monkeypatch: pytest.MonkeyPatch, *, levels: bool
+) -> None:
+    monkeypatch.setattr("iris_session.scene.glb.CUBE_SIDE", 32)
+    monkeypatch.setattr("iris_session.scene.report.CUBE_SIDE", 32)
+    options = EncodeOptions(texture_encoding="jpeg", levels=levels)
+    spec = parse_mujoco(painted(SHAPES["box"], "cube", side=64), store, options=options).spec
+    write_glb(spec, store, tmp_path / "a.glb")
+    (picture,) = images(tmp_path / "a.glb")
+    assert (picture.size, picture.format) == ((3 * 36, 2 * 36), "JPEG")
+    assert not_in_glb(spec) == ("1 cube textures of more than 32 pixels a face: they are there in a smaller size",)
+
+
+def test_a_cube_that_just_fits_is_taken_as_it_is(store: AssetStore) -> None:
+    spec = parse_mujoco(painted(SHAPES["box"], "cube", side=512), store).spec
+    visual = spec.visuals[0]
+    sides = []
+    for most in (512, 511):
+        cube = Cubes(spec, store, most).worn(visual.material, visual.geometry)
+        assert cube is not None
+        assert cube.atlas is not None
+        sides.append(cube.atlas.side)
+    assert sides == [512, 256]
+
+
+@pytest.mark.parametrize(("alpha", "pictured"), [(128, True), (255, False)])
+def test_one_colour_that_is_seen_through_needs_a_picture(alpha: int, *, pictured: bool) -> None:
+    faces = np.full((6, 8, 8, 4), (200, 100, 0, alpha), np.uint8)
+    found = _cube_of(Cube("", "png"), faces, 64)
+    assert (found.atlas is not None) == pictured
+    assert (found.tint != (1.0, 1.0, 1.0)) != pictured
+
+
+def ball(store: AssetStore) -> tuple[SceneSpec, MeshArrays, MeshArrays]:
+    """A scene with a painted ball, its shape, and that with a cube."""
+    spec = parse_mujoco(painted(SHAPES["sphere"], "cube"), store).spec
+    geometry = spec.visuals[0].geometry
+    cube = Cubes(spec, store, 2_048).worn(spec.visuals[0].material, geometry)
+    before = primitive(geometry)
+    assert cube is not None
+    assert cube.atlas is not None
+    assert before is not None
+    return spec, before, baked(before, geometry, (1.0, 1.0, 1.0), cube.atlas)
+
+
+def edges(mesh: MeshArrays) -> list[tuple[Any, ...]]:
+    corner = [tuple(p) for p in (mesh.position.round(7) + np.float32(0.0)).tolist()]  # -0 is 0, as at poles
+    return [(corner[t[k]], corner[t[(k + 1) % 3]]) for t in mesh.index for k in range(3)]
+
+
+def test_what_is_cut_and_split_has_no_gaps(store: AssetStore) -> None:
+    """Every edge runs once each way, to the bit, and the surface is the one that it was."""
+    _, before, after = ball(store)
+    there = edges(after)
+    assert len(set(there)) == len(there)
+    assert {(b, a) for a, b in there} == set(there)
+
+    def area(mesh: MeshArrays) -> float:
+        corners: NDArray[np.float64] = mesh.position[mesh.index].astype(np.float64)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.einsum("fkc,fc->fk", mesh.normal[mesh.index], across).min() > -1e-9
+        return float(np.linalg.norm(across, axis=1).sum() / 2)
+
+    assert area(after) == pytest.approx(area(before), rel=1e-6)
+
+
+def test_colours_at_corners_are_kept(store: AssetStore) -> None:
+    """Cut edges have what lies between their ends."""
+    spec, before, _ = ball(store)
+    cube = Cubes(spec, store, 2_048).worn(0, spec.visuals[0].geometry)
+    assert cube is not None
+    assert cube.atlas is not None
+    color = np.rint(127.5 + 127.5 * np.pad(before.position / 0.3, ((0, 0), (0, 1)))).astype(np.uint8)
+    dyed = MeshArrays(before.position, before.normal, None, before.index, color)
+    after = baked(dyed, Geometry("mesh", (0.3, 0.3, 0.3)), (1.0, 1.0, 1.0), cube.atlas)
+    assert after.color is not None
+    expected = 127.5 + 127.5 * np.pad(after.position / 0.3, ((0, 0), (0, 1)))
+    assert np.abs(after.color - expected).max() < 2
+    np.testing.assert_allclose(np.linalg.norm(after.normal, axis=1), 1.0, atol=1e-6)
